@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -79,16 +79,13 @@ def _dump(component: Component) -> dict[str, object]:
     return {"name": component.name, **component.settings.model_dump()}
 
 
-def _validator(kind: str) -> Callable[[object], Component]:
-    return partial(make_component, kind)
-
-
-DataManagerNode = Annotated[Component, PlainValidator(_validator("datamanagers")), PlainSerializer(_dump)]
-FieldNode = Annotated[Component, PlainValidator(_validator("fields")), PlainSerializer(_dump)]
-GeometryHeadNode = Annotated[Component, PlainValidator(_validator("geometry_heads")), PlainSerializer(_dump)]
-AppearanceHeadNode = Annotated[Component, PlainValidator(_validator("appearance_heads")), PlainSerializer(_dump)]
-RendererNode = Annotated[Component, PlainValidator(_validator("renderers")), PlainSerializer(_dump)]
-ModuleNode = Annotated[Component, PlainValidator(_validator("modules")), PlainSerializer(_dump)]
-SamplerNode = Annotated[Component, PlainValidator(_validator("samplers")), PlainSerializer(_dump)]
-StrategyNode = Annotated[Component, PlainValidator(_validator("strategies")), PlainSerializer(_dump)]
-LossNode = Annotated[Component, PlainValidator(_validator("losses")), PlainSerializer(_dump)]
+_DUMP = PlainSerializer(_dump)
+DataManagerNode = Annotated[Component, PlainValidator(partial(make_component, "datamanagers")), _DUMP]
+FieldNode = Annotated[Component, PlainValidator(partial(make_component, "fields")), _DUMP]
+GeometryHeadNode = Annotated[Component, PlainValidator(partial(make_component, "geometry_heads")), _DUMP]
+AppearanceHeadNode = Annotated[Component, PlainValidator(partial(make_component, "appearance_heads")), _DUMP]
+RendererNode = Annotated[Component, PlainValidator(partial(make_component, "renderers")), _DUMP]
+ModuleNode = Annotated[Component, PlainValidator(partial(make_component, "modules")), _DUMP]
+SamplerNode = Annotated[Component, PlainValidator(partial(make_component, "samplers")), _DUMP]
+StrategyNode = Annotated[Component, PlainValidator(partial(make_component, "strategies")), _DUMP]
+LossNode = Annotated[Component, PlainValidator(partial(make_component, "losses")), _DUMP]

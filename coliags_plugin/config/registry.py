@@ -145,8 +145,18 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
     return found
 
 
-datamanagers = Registry(
+#: All kinds by their names.
+REGISTRIES: dict[str, Registry] = {}
+
+
+def _built_in(kind: str, noun: str, targets: Mapping[str, object]) -> Registry:
+    REGISTRIES[kind] = Registry(kind, targets, noun)
+    return REGISTRIES[kind]
+
+
+datamanagers = _built_in(
     "datamanagers",
+    "data manager",
     {
         "auto": Resolver(
             "coliags_plugin.datamanagers.scene_settings:SceneSettings",
@@ -161,10 +171,10 @@ datamanagers = Registry(
         "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",
         "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.reader:RotateColonDataManager",
     },
-    noun="data manager",
 )
-fields = Registry(
+fields = _built_in(
     "fields",
+    "field",
     {
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
@@ -172,28 +182,28 @@ fields = Registry(
         "surfels": "coliags_plugin.fields.explicit_gaussians:Surfels",
         "reim-nerf": "coliags_plugin.fields.reim_nerf:ReimNerf",
     },
-    noun="field",
 )
-geometry_heads = Registry(
+geometry_heads = _built_in(
     "geometry_heads",
+    "geometry head",
     {
         "plain": "coliags_plugin.fields.geometry_heads:PlainGeometryHead",
         "imve": "coliags_plugin.fields.geometry_heads:IMVEGeometryHead",
     },
-    noun="geometry head",
 )
-appearance_heads = Registry(
+appearance_heads = _built_in(
     "appearance_heads",
+    "appearance head",
     {
         "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
         "imia-glints": "coliags_plugin.fields.appearance_heads:GlintAppearanceHead",
         "attenuated": "coliags_plugin.fields.attenuation:AttenuatedAppearanceHead",
     },
-    noun="appearance head",
 )
-renderers = Registry(
+renderers = _built_in(
     "renderers",
+    "renderer",
     {
         "auto": Resolver(
             "coliags_plugin.renderers.splatting:AutoSettings",
@@ -204,33 +214,33 @@ renderers = Registry(
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
         "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",
     },
-    noun="renderer",
 )
-modules = Registry(
+modules = _built_in(
     "modules",
+    "view module",
     {
         "gain": "coliags_plugin.modules.gain:FrameGain",
         "response": "coliags_plugin.modules.response:CameraResponse",
         "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
     },
-    noun="view module",
 )
-samplers = Registry(
+samplers = _built_in(
     "samplers",
+    "sampler",
     {"frames": "coliags_plugin.engine.samplers:FrameSampler", "pixels": "coliags_plugin.engine.samplers:PixelSampler"},
-    noun="sampler",
 )
-strategies = Registry(
+strategies = _built_in(
     "strategies",
+    "strategy",
     {
         "adaptive-density": "coliags_plugin.strategies.adaptive_density:AdaptiveDensity",
         "none": "coliags_plugin.strategies.none:NoStrategy",
         "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
     },
-    noun="strategy",
 )
-losses = Registry(
+losses = _built_in(
     "losses",
+    "loss",
     {
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
@@ -249,10 +259,10 @@ losses = Registry(
         "normal-consistency": "coliags_plugin.losses.regularization:NormalConsistencyLoss",
         "distortion": "coliags_plugin.losses.regularization:DistortionLoss",
     },
-    noun="loss",
 )
-metrics = Registry(
+metrics = _built_in(
     "metrics",
+    "metric",
     {
         "psnr": "coliags_plugin.metrics.image:PSNR",
         "ssim": "coliags_plugin.metrics.image:SSIM",
@@ -265,18 +275,18 @@ metrics = Registry(
         "sparse_depth": "coliags_plugin.metrics.depth:SparseDepthError",
         "depth_abs_rel": "coliags_plugin.metrics.depth:DepthAbsRel",
     },
-    noun="metric",
 )
-protocols = Registry(
+protocols = _built_in(
     "protocols",
+    "protocol",
     {
         "paper": "coliags_plugin.metrics.protocols:PaperProtocol",
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
-    noun="protocol",
 )
-pose_formats = Registry(
+pose_formats = _built_in(
     "pose_formats",
+    "pose format",
     {
         "c3vd": "coliags_plugin.geometry.poses.c3vd:FORMAT",
         "colmap": "coliags_plugin.geometry.poses.colmap:FORMAT",
@@ -286,10 +296,10 @@ pose_formats = Registry(
         "nerfstudio": "coliags_plugin.geometry.poses.nerfstudio:FORMAT",
         "tum": "coliags_plugin.geometry.poses.tum:FORMAT",
     },
-    noun="pose format",
 )
-phantom_layouts = Registry(
+phantom_layouts = _built_in(
     "phantom_layouts",
+    "phantom layout",
     {
         "c3vd": "coliags_plugin.phantom.layouts.c3vd:C3VDLayout",
         "c3vd-raw": "coliags_plugin.phantom.layouts.c3vd:C3VDRawLayout",
@@ -302,24 +312,4 @@ phantom_layouts = Registry(
         "rgbd": "coliags_plugin.phantom.layouts.rgbd:RGBDLayout",
         "rotatecolon": "coliags_plugin.phantom.layouts.rotatecolon:RotateColonLayout",
     },
-    noun="phantom layout",
 )
-
-REGISTRIES: dict[str, Registry] = {
-    registry.kind: registry
-    for registry in (
-        datamanagers,
-        fields,
-        geometry_heads,
-        appearance_heads,
-        renderers,
-        modules,
-        samplers,
-        strategies,
-        losses,
-        metrics,
-        protocols,
-        pose_formats,
-        phantom_layouts,
-    )
-}

@@ -50,6 +50,7 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
                     _fetch(url, part, sha256, progress, otherwise)
                     os.replace(part, target)
             finally:
+                # Nothing of the download is touched from here on, and filelock grants no lock of an unlinked file.
                 with suppress(OSError):  # on Windows a locked file
                     lock.unlink()
     except OSError as error:

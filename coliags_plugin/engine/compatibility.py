@@ -50,20 +50,18 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
             "a renderer of radiance fields",
             "Set --set sampler=frames",
         )
-    for key, loss in losses.items():
-        if loss.whole_image:
-            raise InputError(
-                f"loss term '{key}' needs whole images, and sampler '{config.sampler.name}' gives single pixels",
-                "losses of single pixels",
-                f"Remove it with --set losses.{key}=null, or set --set sampler=frames",
-            )
-    for name, node in config.modules.items():
-        if node.target.whole_image:
-            raise InputError(
-                f"module '{name}' needs whole images, and sampler '{config.sampler.name}' gives single pixels",
-                "modules that shade single pixels",
-                f"Remove it with --set modules.{name}=null, or set --set sampler=frames",
-            )
+    whole = [(f"loss term '{key}'", "losses of", f"losses.{key}") for key, loss in losses.items() if loss.whole_image]
+    whole += [
+        (f"module '{name}'", "modules that shade", f"modules.{name}")
+        for name, node in config.modules.items()
+        if node.target.whole_image
+    ]
+    for what, others, option in whole:
+        raise InputError(
+            f"{what} needs whole images, and sampler '{config.sampler.name}' gives single pixels",
+            f"{others} single pixels",
+            f"Remove it with --set {option}=null, or set --set sampler=frames",
+        )
 
 
 def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:

@@ -15,7 +15,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
-from coliags_plugin.engine.depth_pictures import EXPECTED_DEPTH, write_depth_pictures
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
 from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.model import Model
@@ -24,14 +23,23 @@ from coliags_plugin.engine.run_result import run_result
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
-from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
-from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
+from coliags_plugin.outputs.colormaps import (
+    DEPTH_ERROR_LIMIT_MM,
+    color_bar,
+    colorize_depth,
+    colorize_depth_error,
+    common_limits,
+)
+from coliags_plugin.outputs.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.light import LIGHT_FILE
 from coliags_plugin.results.reading import RESULT_FILE, write_result
 from coliags_plugin.results.summaries import means_summary
 from coliags_plugin.results.tables import per_frame_table
 
 logger = logging.getLogger(__name__)
+
+#: Folder of an evaluation's expected depth, NaN where pixels are nearly transparent.
+EXPECTED_DEPTH = "expected_depth"
 
 
 def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None) -> Path:
@@ -73,14 +81,14 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
                 done += 1
                 progress.update(done)
-        write_depth_pictures(scratch, scene.length_unit)
+        _write_depth_pictures(scratch, scene.length_unit)
         result = run_result(trained, scorer, evaluated, meter, truth)
         _warn_of_bounds(trained.model.learned)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
         if (light := light_map(trained)) is not None:
-            write_json(scratch / LIGHT_FILE, light.record)
+            write_json(scratch / LIGHT_FILE, light)
     return target
 
 
@@ -111,3 +119,15 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
     errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
     write_png(folder / "errors" / f"{name}.png", errors)
+
+
+def _write_depth_pictures(evaluation: Path, unit: str) -> None:
+    """Colour the depth maps of ``expected_depth/SET/`` as ``depth_pictures/SET/``, beside their scale."""
+    files = sorted((evaluation / EXPECTED_DEPTH).glob("*/*.tiff"))
+    if not files:
+        return
+    limits = common_limits(read_depth_tiff(file) for file in files)
+    for file in files:
+        picture = evaluation / "depth_pictures" / file.parent.name / f"{file.stem}.png"
+        write_png(picture, colorize_depth(read_depth_tiff(file), limits, hatched=True))
+    write_png(evaluation / "depth_pictures" / "scale.png", color_bar(limits, unit, "depth"))

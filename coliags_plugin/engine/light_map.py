@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,50 +100,15 @@ def find_true_light(scene: Path) -> TrueLight | None:
         raise InputError(f"{file}: {error!r}", "the light of a phantom, with gain.csv beside it") from error
 
 
-@dataclass(frozen=True)
-class LightMap:
-    """Curves and numbers of the light of a run.
-
-    Attributes:
-        distances: On the optical axis, scene units. [P]
-        angles: To the optical axis at ``reference``, degrees. [P]
-        by_distance: Factor on encoded colours relative to the axis at ``reference``; None without a law. [P, C]
-        by_angle: The same over the angle. [P, C]
-        true_by_distance, true_by_angle: Of a phantom's direct light; None of other scenes. [P]
-        times: Indices of the training frames, in order; empty without gains.
-        gains: Encoded, with a geometric mean of 1. [F, C]
-        true_gains: Of a phantom, likewise. [F, 3]
-        colors: Before the response curve. [P]
-        response: Pixel values of ``colors``; None without a curve. [P]
-        true_response: Of a phantom, likewise. [P]
-        numbers: What was learned, and how far it is from the truth.
-    """
-
-    distances: Float[Tensor, "P"]
-    angles: Float[Tensor, "P"]
-    by_distance: Float[Tensor, "P C"] | None
-    by_angle: Float[Tensor, "P C"] | None
-    true_by_distance: Float[Tensor, "P"] | None
-    true_by_angle: Float[Tensor, "P"] | None
-    times: Sequence[float]
-    gains: Float[Tensor, "F C"] | None
-    true_gains: Float[Tensor, "F 3"] | None
-    colors: Float[Tensor, "P"]
-    response: Float[Tensor, "P"] | None
-    true_response: Float[Tensor, "P"] | None
-    numbers: JsonObject
-
-    @property
-    def record(self) -> JsonObject:
-        """Plain values, for ``light.json``."""
-        curves = {name: value for name, value in vars(self).items() if name not in ("times", "numbers")}
-        plain = {name: None if values is None else values.tolist() for name, values in curves.items()}
-        return self.numbers | {"times": list(self.times), "curves": plain}
-
-
 @torch.no_grad()
-def light_map(trained: TrainedRun) -> LightMap | None:
-    """Light that a run has learned, beside a phantom's; None where it has learned none, or no points are in view."""
+def light_map(trained: TrainedRun) -> JsonObject | None:
+    """Light that a run has learned, beside a phantom's; None where it has learned none, or no points are in view.
+
+    What was learned, how far it is from the truth, and ``curves``: of factors on encoded colours, relative to the
+    optical axis at ``reference_distance``, over scene units on the axis and over degrees at that distance; of encoded
+    gains with a geometric mean of 1 at ``times``, the indices of the training frames; and of the pixel values of
+    ``colors``. Each curve is None where nothing was learned, or where the scene is no phantom.
+    """
     model, scene = trained.model, trained.scene
     parts = model.view_modules.values()
     gain = next((part for part in parts if isinstance(part, GainModule)), None)
@@ -180,34 +145,33 @@ def light_map(trained: TrainedRun) -> LightMap | None:
         numbers["gain_error_rms"] = errors.square().mean(0).sqrt().tolist()
     by_distance, by_angle = learned or (None, None)
     true_by_distance, true_by_angle = true or (None, None)
-    return LightMap(
-        distances=distances,
-        angles=angles,
-        by_distance=by_distance,
-        by_angle=by_angle,
-        true_by_distance=true_by_distance,
-        true_by_angle=true_by_angle,
-        times=() if gain is None else gain.times,
-        gains=gains,
-        true_gains=true_gains,
-        colors=colors,
-        response=None if curve is None else curve.curve(colors.float().to(trained.device)).cpu().double(),
-        true_response=None if truth is None or curve is None else truth.response(colors),
-        numbers=numbers,
-    )
+    curves = {
+        "distances": distances,
+        "angles": angles,
+        "by_distance": by_distance,
+        "by_angle": by_angle,
+        "true_by_distance": true_by_distance,
+        "true_by_angle": true_by_angle,
+        "gains": gains,
+        "true_gains": true_gains,
+        "colors": colors,
+        "response": None if curve is None else curve.curve(colors.float().to(trained.device)).cpu().double(),
+        "true_response": None if truth is None or curve is None else truth.response(colors),
+    }
+    plain = {name: None if values is None else values.tolist() for name, values in curves.items()}
+    return numbers | {"times": [] if gain is None else list(gain.times), "curves": plain}
 
 
 def write_light_map(trained: TrainedRun, folder: Path) -> None:
     """Write ``light.json``, and ``light.html`` with charts of law, gains and response, into a folder."""
-    found = light_map(trained)
-    if found is None:
+    record = light_map(trained)
+    if record is None:
         raise InputError(
             f"a light map of method '{trained.method}', which has learned no law of attenuation, gains or "
             "response curve, or has no points in view",
             "a method with appearance head 'attenuated', or with module 'gain' or 'response', such as coliags-plus, "
             "and initial points",
         )
-    record = found.record
     write_json(folder / LIGHT_FILE, record)
     facts = [Fact("method", trained.method), Fact("scene", trained.scene.name), Fact("step", trained.step)]
     charts = Section("Curves", [Figures(light_charts(record))])

@@ -1,18 +1,116 @@
-"""Progress reports of long jobs."""
+"""Progress reports of long jobs: a bar on a terminal, one line in a notebook, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from coliags_plugin.engine.progress_displays import PLAIN_LINE_EVERY, Display, open_display
+from coliags_plugin.reporting.numbers import duration
+
+#: Between plain lines, seconds.
+PLAIN_LINE_EVERY = 10.0
+#: Between changes of a notebook's line, seconds.
+NOTEBOOK_LINE_EVERY = 0.5
+
+
+class Display(Protocol):
+    """Protocol of what shows the progress towards a total."""
+
+    def update(self, done: int, facts: str) -> None:
+        """Show how much is done, with facts."""
+
+    def close(self) -> None:
+        """Leave what was shown last."""
+
+
+def open_display(
+    console: Console, title: str, total: int, start: int, plain_every: float = PLAIN_LINE_EVERY
+) -> Display:
+    """The display that fits where the console writes to; plain lines come every ``plain_every`` seconds."""
+    if console.is_terminal:
+        return TerminalBar(console, title, total, start)
+    if console.is_jupyter:
+        return TextDisplay(title, total, start, NOTEBOOK_LINE_EVERY, NotebookLine().show, at_once=True)
+    return TextDisplay(title, total, start, plain_every, lambda text: console.print(text, highlight=False))
+
+
+class TerminalBar:
+    """A bar with the remaining time."""
+
+    def __init__(self, console: Console, title: str, total: int, start: int) -> None:
+        columns = [
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[facts]}"),
+        ]
+        self._bar = Progress(*columns, console=console)
+        self._bar.start()
+        self._task = self._bar.add_task(title, total=total, completed=start, facts="")
+
+    def update(self, done: int, facts: str) -> None:
+        """See :class:`Display`."""
+        self._bar.update(self._task, completed=done, facts=facts)
+
+    def close(self) -> None:
+        """See :class:`Display`."""
+        self._bar.stop()
+
+
+class TextDisplay:
+    """A line of text every so many seconds, the first one at once or not, and one at the end."""
+
+    def __init__(
+        self, title: str, total: int, start: int, every: float, show: Callable[[str], None], at_once: bool = False
+    ) -> None:
+        self._title, self._total, self._start, self._every, self._show = title, total, start, every, show
+        self._began = time.monotonic()
+        self._last = -math.inf if at_once else self._began
+
+    def update(self, done: int, facts: str) -> None:
+        """See :class:`Display`."""
+        now = time.monotonic()
+        if now - self._last >= self._every or done == self._total:
+            self._last = now
+            self._show(self._line(done, facts, now - self._began))
+
+    def close(self) -> None:
+        """See :class:`Display`."""
+
+    def _line(self, done: int, facts: str, seconds: float) -> str:
+        """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
+        left = seconds / max(1, done - self._start) * (self._total - done)
+        timing = f"took {duration(seconds)}" if done == self._total else f"{duration(left)} to go"
+        return f"{self._title} {done}/{self._total}, {timing}  {facts}".rstrip()
+
+
+class NotebookLine:
+    """Text in the output of a notebook's cell that can be replaced."""
+
+    def __init__(self) -> None:
+        self._shown: Any = None
+
+    def show(self, text: str) -> None:
+        """Show a text instead of the one before."""
+        if self._shown is None:
+            from IPython import display
+
+            show: Any = display.display  # which has no types
+            self._shown = show({"text/plain": text}, raw=True, display_id=True)
+        else:
+            self._shown.update({"text/plain": text}, raw=True)
 
 
 class ProgressReport:

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from coliags_plugin._version import __version__
-from coliags_plugin.contracts import Metric
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import checkpoint_folder
@@ -41,6 +40,9 @@ def run_result(
     config = plain_config(trained.config.model_dump())
     data = trained.scene if truth is None else truth.scene
     sets = {name: part.record(scorer.metrics) for name, part in evaluated.items()}
+    deviations = _deviations(trained.step, config["schedule"]["steps"], provenance)
+    if truth is not None:
+        deviations["truth"] = data.provenance.get("fingerprint")
     return Result(
         key=result_key(
             config,
@@ -49,7 +51,7 @@ def run_result(
             __version__,
             protocol.name,
             protocol.version,
-            _deviations(trained.step, config["schedule"]["steps"], provenance) | _fingerprint_of(truth),
+            deviations,
         ),
         method=trained.method,
         scene=scene_record(data),
@@ -72,18 +74,12 @@ def run_result(
     )
 
 
-def _fingerprint_of(truth: Truth | None) -> JsonObject:
-    return {} if truth is None else {"truth": truth.scene.provenance.get("fingerprint")}
-
-
 def _described(truth: Truth, own: Scene) -> JsonObject:
+    trained_on = {key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")}
     return {
         "scene": truth.scene.name,
         "matched_by": truth.matched_by,
-        "trained_on": {
-            "name": own.name,
-            **{key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")},
-        },
+        "trained_on": {"name": own.name, **trained_on},
     }
 
 
@@ -104,16 +100,14 @@ def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -
     seen = {name for part in evaluated.values() for name in part.seen_metrics}
     optional = {name for part in evaluated.values() for name in part.optional_metrics}
     metrics = scorer.metrics | {name: metric for name, metric in scorer.optional_metrics.items() if name in optional}
-    records = {name: _metric(metric, unit) for name, metric in metrics.items()}
+    records = {
+        name: MetricRecord(
+            unit=metric.unit.replace("mm", unit), direction="higher" if metric.higher_is_better else "lower"
+        )
+        for name, metric in metrics.items()
+    }
     over_seen = {name + SEEN_SUFFIX: records[name] for name in SEEN_METRICS if name + SEEN_SUFFIX in seen}
     return records | over_seen
-
-
-def _metric(metric: Metric, unit: str) -> MetricRecord:
-    """What a metric's values mean, lengths in the scene's unit."""
-    return MetricRecord(
-        unit=metric.unit.replace("mm", unit), direction="higher" if metric.higher_is_better else "lower"
-    )
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

@@ -52,24 +52,22 @@ def test_the_true_law_is_encoded_inverse_square_with_spread_and_vignetting():
 
 def test_curves_and_numbers_beside_the_truth(trained):
     found = light_map(trained.load())
-    middle = found.numbers["reference_distance"]
-    assert found.numbers["truth"]["lamp_offset"] == [0.0, 0.0, -3.0]
-    assert found.numbers["truth"]["distance_exponent"] == -1.0
-    assert found.true_by_distance is not None
-    expected = (found.distances + 3.0).reciprocal() * (middle + 3.0)
-    torch.testing.assert_close(found.true_by_distance, expected, rtol=1e-4, atol=0.0)
-    assert found.by_distance.shape == found.by_angle.shape == (len(found.distances), 3)
-    truth = torch.tensor([0.05 * time for time in found.times], dtype=torch.float64)
-    torch.testing.assert_close(found.true_gains[:, 0].log(), truth - truth.mean())
-    errors = (found.gains.log() - found.true_gains.log()).square().mean(0).sqrt()
-    assert found.numbers["gain_error_rms"] == pytest.approx(errors.tolist())
-    low = found.colors <= 0.5
-    torch.testing.assert_close(found.response[low], found.colors[low])
-    assert float((found.response - found.colors)[~low].abs().max()) > 0
-    expected = torch.where(
-        found.colors < 0.8, found.colors, (1 - 0.36 * ((0.64 - found.colors**2) / 0.36).exp()).sqrt()
-    )
-    torch.testing.assert_close(found.true_response, expected)
+    curves = {name: torch.tensor(values, dtype=torch.float64) for name, values in found["curves"].items()}
+    distances, colors = curves["distances"], curves["colors"]
+    assert found["truth"]["lamp_offset"] == [0.0, 0.0, -3.0]
+    assert found["truth"]["distance_exponent"] == -1.0
+    expected = (distances + 3.0).reciprocal() * (found["reference_distance"] + 3.0)
+    torch.testing.assert_close(curves["true_by_distance"], expected, rtol=1e-4, atol=0.0)
+    assert curves["by_distance"].shape == curves["by_angle"].shape == (len(distances), 3)
+    truth = torch.tensor([0.05 * time for time in found["times"]], dtype=torch.float64)
+    torch.testing.assert_close(curves["true_gains"][:, 0].log(), truth - truth.mean())
+    errors = (curves["gains"].log() - curves["true_gains"].log()).square().mean(0).sqrt()
+    assert found["gain_error_rms"] == pytest.approx(errors.tolist())
+    low = colors <= 0.5
+    torch.testing.assert_close(curves["response"][low], colors[low])
+    assert float((curves["response"] - colors)[~low].abs().max()) > 0
+    expected = torch.where(colors < 0.8, colors, (1 - 0.36 * ((0.64 - colors**2) / 0.36).exp()).sqrt())
+    torch.testing.assert_close(curves["true_response"], expected)
 
 
 def test_reports_show_the_light_of_runs_that_learn_it(trained, tmp_path):

@@ -8,8 +8,7 @@ from rich.console import Console
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
 from coliags_plugin.engine.data_formats import load_scene
-from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.engine.progress_displays import open_display
+from coliags_plugin.engine.progress import open_display, progress_callback
 from tests.scenes import write_wall
 
 
