@@ -28,24 +28,11 @@ _COLORS = ("red", "green", "blue")
 def fuse_depth(
     frames: Sequence[Frame], count: int, generator: np.random.Generator, progress: Progress | None = None
 ) -> PointCloud:
-    """Surface points back-projected from a uniform sample of the frames' valid depth pixels.
+    """Surface points back-projected from a uniform sample of the frames' valid depth pixels, in frame order.
 
-    Of estimated depth, only pixels of confidence 0.5 or more count, in frames that have any.
-
-    Pixels are sampled without replacement over all frames; all are used if there are at most ``count``. Rays use the
-    true principal point (the authors' code: the image centre, docs/methods.md 6).
-
-    Args:
-        frames: Frames with z-depth, mm, NaN where unknown.
-        count: Number of points.
-        generator: Random generator of the sampling.
-        progress: Progress callback.
-
-    Returns:
-        World positions, float32, and the pixels' colours, in frame order.
-
-    Raises:
-        InputError: No frame has a valid depth.
+    Of estimated depth, only pixels of confidence 0.5 or more count, in frames that have any. ``count`` pixels are
+    sampled without replacement over all frames. Rays use the true principal point (the authors' code: the image centre,
+    docs/methods.md 6).
     """
     # Two passes over the frames, since the pixels of a long video may not fit into memory.
     available = np.array(parallel_map(_count_usable, frames, "count depth pixels", progress))
@@ -72,7 +59,7 @@ def _count_usable(frame: Frame) -> int:
 
 
 def _usable(depth: Tensor | None, mask: Tensor | None, confidence: Tensor | None) -> np.ndarray:
-    """Flat indices of unmasked pixels with known depth, if possible of those that are trusted. [N]"""
+    """Flat indices of unmasked pixels with known depth, if possible of those that are trusted."""
     if depth is None:
         return np.zeros(0, np.int64)
     known = np.isfinite(depth.numpy())
@@ -84,7 +71,7 @@ def _usable(depth: Tensor | None, mask: Tensor | None, confidence: Tensor | None
 
 
 def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """World positions, computed in float64, and colours of chosen usable pixels. [N, 3], [N, 3]"""
+    """World positions, computed in float64, and colours of chosen usable pixels."""
     frame, chosen = wanted[0].to("cpu"), wanted[1]
     if frame.depth is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -100,20 +87,12 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_points(path: Path, count: int, generator: np.random.Generator) -> PointCloud:
-    """Read at most ``count`` points from a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``).
-
-    Raises:
-        InputError: The file is missing or holds no points.
-    """
+    """At most ``count`` points of a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``)."""
     return subsampled(load_points(path), count, generator, path)
 
 
 def load_points(path: Path) -> PointCloud:
-    """Read all points of a PLY or NPZ file.
-
-    Raises:
-        InputError: The file is missing or has another format.
-    """
+    """All points of a PLY or NPZ file."""
     if not path.is_file():
         raise InputError(f"no file {path}", "a PLY or NPZ file of points in the world of the poses", "Check the path")
     if path.suffix.lower() == ".npz":
@@ -128,11 +107,7 @@ def load_points(path: Path) -> PointCloud:
 
 
 def subsampled(points: PointCloud, count: int, generator: np.random.Generator, source: Path | None) -> PointCloud:
-    """Sample at most ``count`` usable points without replacement: finite, and not absurdly far away.
-
-    Raises:
-        InputError: No point is usable.
-    """
+    """At most ``count`` usable points, sampled without replacement: finite, and not absurdly far away."""
     usable = np.flatnonzero((points.positions.abs() <= bounds.LENGTH).all(dim=1).numpy())  # NaN is not
     if len(usable) < len(points):
         log.warning(

@@ -8,6 +8,7 @@ from pathlib import Path
 from coliags_plugin.config import registry
 from coliags_plugin.config.auto import candidates
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.files import inventory
 
 log = logging.getLogger(__name__)
 
@@ -18,18 +19,13 @@ def formats() -> list[str]:
 
 
 def find_format(path: Path) -> str:
-    """The name of the data manager that recognises a folder.
-
-    Raises:
-        InputError: The folder is missing, or none or several do.
-    """
+    """The name of the one data manager that recognises a folder."""
     known = ", ".join(formats())
     if not path.exists():
         raise InputError(f"no folder {path}", f"a scene in one of the formats {known}", "Check the path")
     found = recognised(path)
     if not found:
-        shown = sorted(item.name + "/" * item.is_dir() for item in path.iterdir()) if path.is_dir() else []
-        holds = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "") or "nothing"
+        holds = inventory(path) if path.is_dir() else "nothing"
         raise InputError(
             f"{path} holds {holds}, which none of the formats {known} recognises",
             "a scene's own folder",

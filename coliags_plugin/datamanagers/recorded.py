@@ -75,18 +75,7 @@ class RecordedDataManager(DataManager):
         return manager
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
-        """Read the scene.
-
-        Args:
-            path: The scene's folder.
-            progress: Progress callback ``(what, done, total)``.
-
-        Returns:
-            Frames of the working size, in the dataset's world frame and units.
-
-        Raises:
-            InputError: The folder is missing, or its contents are invalid.
-        """
+        """Read the scene at the working size, in the dataset's world frame and units; see :class:`DataManager`."""
         path, settings = Path(path), self.settings
         recording = self.open(path)
         for doubt in dict.fromkeys(shot.rectification.doubt() for shot in recording.shots):
@@ -136,16 +125,11 @@ class RecordedDataManager(DataManager):
         if self.settings.size is not None:
             return
         for rectification in (shot.rectification for shot in recording.shots):
-            if (rectification.width, rectification.height) != (rectification.source_width, rectification.source_height):
-                log.info(
-                    "%s: images stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
-                    "another size",
-                    path,
-                    rectification.source_width,
-                    rectification.source_height,
-                    rectification.width,
-                    rectification.height,
-                )
+            stored = rectification.source_width, rectification.source_height
+            used = rectification.width, rectification.height
+            if used != stored:
+                change = "datamanager.width and datamanager.height set another size"
+                log.info("%s: images stored at %d x %d are used at %d x %d; %s", path, *stored, *used, change)
                 return
 
     def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[Frame]:

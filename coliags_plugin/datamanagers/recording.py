@@ -56,17 +56,7 @@ def make_shots(
     seen: Mapping[int, Path],
     prefix: str = "",
 ) -> list[Shot]:
-    """Frames of one camera, named by their image files.
-
-    Args:
-        images: In video order.
-        rectification: Of all images.
-        camera_to_world: Rigid, OpenCV axes, scene units. [N, 4, 4]
-        depths: Depth files of the same frames; None if there are none.
-        depth_format: Of the depth files.
-        seen: Seen masks by frame index.
-        prefix: Of the names.
-    """
+    """Frames of one camera, named by their image files behind ``prefix``; ``seen`` are seen masks by frame index."""
     return [
         Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=seen.get(index))
         for index, (image, pose, depth) in enumerate(
@@ -105,11 +95,7 @@ _BLOCK = 1 << 20
 
 
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
-    """SHA-256 of the names and sizes of large files and the contents of small ones.
-
-    Raises:
-        InputError: A file cannot be read.
-    """
+    """SHA-256 of the names and sizes of large files and the contents of small ones."""
     digest = hashlib.sha256()
     for path in filter(None, large):
         name = path.relative_to(folder) if path.is_relative_to(folder) else path.name

@@ -36,13 +36,7 @@ _KEPT = 8
 
 
 def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int, int]:
-    """The largest size that fits another, keeps the aspect ratio and enlarges nothing, pixels.
-
-    Args:
-        width: Of the stored images, pixels.
-        height: Likewise.
-        within: Width and height to fit, pixels; None: none, and the stored size is kept.
-    """
+    """The largest size within another, pixels, that keeps the aspect ratio and enlarges nothing; None: as it is."""
     scale = 1.0 if within is None else min(1.0, within[0] / width, within[1] / height)
     if scale == 1.0:
         return width, height
@@ -88,7 +82,7 @@ class Rectification:
             described_by: The file that describes the lens or its size.
             size: Working width and height, pixels.
             focal_scale: Factor on the nominal focal length.
-            shows: Stored pixels with image content; None for all. [H, W]
+            shows: Stored pixels with image content; None for all.
         """
         pinhole = undistorted_camera(lens, size, focal_scale)
         undistortion = Undistortion(lens, pinhole, shows)
@@ -160,11 +154,7 @@ class Rectification:
         }
 
     def checked(self, path: Path, image: np.ndarray) -> np.ndarray:
-        """A stored image, unchanged, after a check of its size.
-
-        Raises:
-            InputError: It is of another size.
-        """
+        """A stored image, unchanged, after a check of its size."""
         height, width = image.shape[:2]
         if (width, height) != (self.source_width, self.source_height):
             raise InputError(
@@ -185,12 +175,6 @@ def rectifications(
     """Rectifications of images from many lenses, some of them pinholes, without keeping the maps of all.
 
     Undistortion maps take some 10 MB each, and COLMAP models often have one camera per image.
-
-    Args:
-        lenses: Of the stored images.
-        described_by: The file that describes them.
-        working_size: Working width and height for a stored width and height, pixels.
-        focal_scale: Factor on the nominal focal length of undistorted images.
     """
     undistort = lru_cache(maxsize=_KEPT)(Undistortion)
 
@@ -212,11 +196,7 @@ def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) ->
 
 
 def whole_frame(lens: Lens, image: Path) -> Lens:
-    """The lens at the size of an image that shows the whole calibrated frame.
-
-    Raises:
-        InputError: The image is a crop, so that the calibration does not apply to it.
-    """
+    """The lens at the size of an image of the whole calibrated frame; InputError for crops."""
     height, width = read_rgb(image).shape[:2]
     if abs((width / height) / (lens.width / lens.height) - 1.0) > ASPECT_TOLERANCE:
         raise InputError(

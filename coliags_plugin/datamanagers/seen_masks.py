@@ -19,16 +19,10 @@ ROTATION = "rotation"
 
 
 def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, Path]:
-    """Find seen masks ``seen/NNNN_seen.png``, by frame index; :func:`with_valid_seen_masks` checks the split.
+    """Seen masks ``seen/NNNN_seen.png`` in ``path``, by frame index; :func:`with_valid_seen_masks` checks the split.
 
-    Args:
-        path: Parent of the folder ``seen``.
-        count: Number of frames.
-        complete: Whether the frames are all images of the dataset. Masks are numbered by image, so that they do not
-            match frames where images are left out.
-
-    Raises:
-        InputError: A mask has no frame.
+    ``complete`` tells whether the frames are all images of the dataset. Masks are numbered by image, so that they do
+    not match frames where images are left out.
     """
     folder = path / "seen"
     if not complete:

@@ -16,15 +16,9 @@ EVERY = 8
 def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) -> Bool[np.ndarray, "N"]:
     """Mask of the test frames among ``count`` frames in video order.
 
-    Args:
-        split: ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM,
-            PR-Endo; docs/data.md 3); ``block``: one contiguous block without training frames, so that test views are
-            not between neighbouring training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
-        count: Number of frames.
-        block: Start and end of the block, as fractions of the video.
-
-    Returns:
-        True for test frames. [N]
+    ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM, PR-Endo;
+    docs/data.md 3); ``block``: one contiguous block, given by fractions of the video, so that test views are not
+    between neighbouring training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
     """
     index = np.arange(count)
     if split == "every-8th":
@@ -42,13 +36,10 @@ def divide(
     own: Mapping[str, Sequence[int]] | None = None,
     block: tuple[float, float] = (0.4, 0.6),
 ) -> tuple[list[int], list[int]]:
-    """Training and test indices among the used frames of a video.
+    """Training and test indices among the used frames of a video, given in video order.
 
-    Args:
-        split: As for :func:`held_out`.
-        indices: Indices of the used frames, in video order.
-        own: The dataset's split, ``{"train": ..., "test": ...}``; required for split ``own``.
-        block: As for :func:`held_out`.
+    ``own`` is the dataset's split, ``{"train": ..., "test": ...}``, for split ``own``; the others are as for
+    :func:`held_out`.
     """
     if split == "own":
         if own is None:

@@ -147,11 +147,7 @@ class StoredFrame(Frame):
 
 
 def read_in_parallel(frames: Sequence[Frame], progress: Progress | None = None) -> None:
-    """Read the pixels of frames into their caches, in parallel.
-
-    Raises:
-        InputError: The first invalid frame's error.
-    """
+    """Read the pixels of frames into their caches, in parallel."""
     parallel_map(lambda frame: frame.image.numel(), frames, "read images", progress)
 
 

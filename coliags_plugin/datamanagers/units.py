@@ -17,14 +17,7 @@ UNIT_FILE = "unit.txt"
 
 
 def read_unit(folder: Path) -> Unit:
-    """The unit of a scene's poses and depth.
-
-    Args:
-        folder: The scene's folder.
-
-    Raises:
-        InputError: The file holds something else than one of the units.
-    """
+    """The unit of the poses and depth of the scene in a folder."""
     path = folder / UNIT_FILE
     if not path.is_file():
         return "mm"
@@ -35,22 +28,10 @@ def read_unit(folder: Path) -> Unit:
 
 
 def printed_unit(folder: Path) -> str:
-    """The unit of a scene as it is printed: ``mm``, or ``units`` where it is unknown.
-
-    Args:
-        folder: The scene's folder.
-
-    Raises:
-        InputError: See :func:`read_unit`.
-    """
+    """The unit of a scene as it is printed: ``mm``, or ``units`` where it is unknown."""
     return "mm" if read_unit(folder) == "mm" else "units"
 
 
 def write_unit(folder: Path, unit: Unit) -> None:
-    """State the unit of a scene.
-
-    Args:
-        folder: The scene's folder.
-        unit: Of its poses and depth.
-    """
+    """State the unit of a scene's poses and depth."""
     atomic_write(folder / UNIT_FILE, unit + "\n")

@@ -49,19 +49,11 @@ class SequenceDataManager(RecordedDataManager):
 
     @abstractmethod
     def find(self, folder: Path) -> SequenceFiles:
-        """Find the files of the sequence in a folder.
-
-        Raises:
-            InputError: They are missing or do not pair up.
-        """
+        """Find the files of the sequence in a folder."""
 
     @abstractmethod
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        """The rectification of a sequence's images, and its provenance.
-
-        Raises:
-            InputError: The camera file cannot be read, or does not match the images.
-        """
+        """The rectification of a sequence's images, and its provenance."""
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -84,11 +76,7 @@ class SequenceDataManager(RecordedDataManager):
         )
 
     def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
-        """The rectification of raw frames like ``image``, optionally masked outside the octagon.
-
-        Raises:
-            InputError: The image is a crop, to which the lens calibration does not apply.
-        """
+        """The rectification of raw frames like ``image``, optionally masked outside the octagon."""
         lens = whole_frame(lens, image)
         shows = octagon_mask(lens.width, lens.height) if mask else None
         size = self.working_size(lens.width, lens.height)

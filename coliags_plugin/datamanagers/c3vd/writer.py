@@ -27,21 +27,14 @@ _STEPS_PER_MM = 65535.0 / 100.0
 def write_frame(
     folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"] | None
 ) -> None:
-    """Write a frame of an undistorted scene (docs/layouts/c3vd.md 3).
-
-    Args:
-        folder: Folder of the scene.
-        index: Index of the frame, from 0.
-        image: RGB. [H, W, 3]
-        z_depth: mm, as for :func:`depth_steps`; None where there is none. [H, W]
-    """
+    """Write a frame of an undistorted scene (docs/layouts/c3vd.md 3); ``z_depth`` in mm, as for :func:`depth_steps`."""
     write_image(folder / "images" / f"{index:04d}_color.png", image)
     if z_depth is not None:
         write_image(folder / "depths" / f"{index:04d}_depth.png", depth_steps(z_depth))
 
 
 def write_poses(path: Path, camera_to_world: Float[np.ndarray, "N 4 4"]) -> None:
-    """Write a pose file with the release's nine digits; OpenCV axes, mm. [N, 4, 4]"""
+    """Write a pose file with the release's nine digits; OpenCV axes, mm."""
     atomic_write(path, matrix_lines(camera_to_world, digits=9))
 
 
@@ -85,14 +78,14 @@ def write_c3vd_scene(
 
 
 def depth_steps(z_depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
-    """z-depth, mm, in C3VD's encoding: 65535 / 100 steps per mm, 0 where unknown, 65535 from 100 mm on. [H, W]"""
+    """z-depth, mm, in C3VD's encoding: 65535 / 100 steps per mm, 0 where unknown, 65535 from 100 mm on."""
     known = np.isfinite(z_depth) & (z_depth > 0.0)
     steps = np.rint(np.where(known, z_depth, 0.0) * _STEPS_PER_MM)
     return np.where(known, np.clip(steps, 1, C3VD_DEPTH.far), 0).astype(np.uint16)
 
 
 def normal_steps(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
-    """Unit normals, camera axes, in C3VD's encoding: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays. [H, W, 3]"""
+    """Unit normals, camera axes, in C3VD's encoding: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays."""
     encoded = np.rint((normals + 1.0) * (0.5 * 65535.0)).clip(0.0, 65535.0).astype(np.uint16)
     encoded[~normals.any(axis=-1)] = 0
     return encoded

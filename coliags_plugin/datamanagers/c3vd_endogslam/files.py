@@ -54,11 +54,7 @@ def recognise(folder: Path) -> str | None:
 
 
 def scene_folder(path: Path) -> Path:
-    """The sequence's folder: ``path`` itself, or the only scene of PR-Endo's release in it.
-
-    Raises:
-        InputError: ``path`` is missing, or holds several scenes.
-    """
+    """The sequence's folder: ``path`` itself, or the only scene of PR-Endo's release in it."""
     require_folder(path, LAYOUT)
     scenes = [] if (path / "color").is_dir() else _release(path)
     if len(scenes) > 1:
@@ -67,15 +63,10 @@ def scene_folder(path: Path) -> Path:
 
 
 def find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
-    """Find the files of a sequence.
+    """Find the files of the sequence in the folder that contains ``color``.
 
-    Args:
-        folder: Folder that contains ``color``.
-        params_file: EndoGSLAM's result, relative to the folder or absolute; None: search in the folder and in PR-Endo's
-            release.
-
-    Raises:
-        InputError: The folder has another layout, its files do not pair up, or ``params_file`` does not exist.
+    ``params_file`` is EndoGSLAM's result, relative to the folder or absolute; None: search in the folder and in
+    PR-Endo's release.
     """
     images = numbered_images(folder / "color", "color", LAYOUT, "C3VD/cecum_t1_b")
     depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES)

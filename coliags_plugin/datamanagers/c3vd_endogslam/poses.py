@@ -64,16 +64,10 @@ class _Slam:
 
 
 def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> SequencePoses:
-    """Load the poses of a sequence's images.
+    """Load the poses of a sequence's images; ``params`` are the contents of ``files.params``.
 
-    Args:
-        files: Files of the sequence.
-        params: Contents of ``files.params``, or None.
-        source: ``slam``: EndoGSLAM's poses, in its world; images it did not track get their true poses, transformed
-            to it. ``ground-truth``: the true poses, in the world of pose.txt, or without it of the first camera.
-
-    Raises:
-        InputError: Poses and images do not match, or the requested poses are missing.
+    ``slam``: EndoGSLAM's poses, in its world; images it did not track get their true poses, transformed to it.
+    ``ground-truth``: the true poses, in the world of pose.txt, or without it of the first camera.
     """
     count = len(files.images)
     file = None if files.poses is None else read_poses(files.poses)

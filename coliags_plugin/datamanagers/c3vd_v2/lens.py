@@ -40,9 +40,6 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     The file's format is not published. Two unambiguous ones are accepted: named numbers (``cx = 677.7``), or twelve
     bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). The centre must be near
     the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
-
-    Raises:
-        InputError: The file has neither format, or its values are implausible.
     """
     text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
     named, bare = _NAMED.findall(text), _bare(text)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.colmap.lens import ColmapLens
+from coliags_plugin.geometry.lenses.models import Array
+from coliags_plugin.geometry.lenses.tabulated import MappedLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 from coliags_plugin.geometry.poses.colmap_files import (
     ColmapCamera,
@@ -20,11 +23,48 @@ from coliags_plugin.geometry.poses.colmap_files import (
     read_points,
 )
 
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Camera models without distortion.
+PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 #: Folders that may hold a model; numbered sub-folders come before the folder itself.
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
 _PARTS = ("cameras", "images", "points3D")
 #: Panoramic camera models, which cannot be undistorted to a pinhole image.
 _PANORAMIC = frozenset({"EQUIRECTANGULAR"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapLens(MappedLens):
+    """A camera of a COLMAP model, projected by pycolmap.
+
+    Attributes:
+        model: Its name, for instance ``OPENCV_FISHEYE``.
+        params: As COLMAP orders them; pixels, centres at integers + 0.5.
+    """
+
+    model: str
+    params: tuple[float, ...]
+
+    @cached_property
+    def _camera(self) -> pycolmap.Camera:
+        import pycolmap
+
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Along columns and rows, pixels."""
+        return self._camera.focal_length_x, self._camera.focal_length_y
+
+    @property
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        return *self.focal_lengths, self._camera.principal_point_x, self._camera.principal_point_y
+
+    def _bent(self, tangents: Array) -> Array:
+        points = np.concatenate([tangents, np.ones((len(tangents), 1))], axis=1)
+        return np.asarray(self._camera.img_from_cam(points), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +126,7 @@ def find_models(scene: Path) -> list[Path]:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read a binary or text model; binary if both exist.
-
-    Raises:
-        InputError: The folder holds none; a file is damaged; poses are invalid (see
-            :func:`coliags_plugin.geometry.poses.colmap.read`); or a camera cannot be undistorted to a pinhole.
-    """
+    """Read a binary or text model; binary if both exist. It must be possible to undistort its images to a pinhole."""
     suffix = model_suffix(folder, _PARTS)
     if suffix is None:
         raise InputError(

@@ -12,8 +12,14 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.files import RegisteredImage, SparseModel, find_models, read_model, sidecar_file
-from coliags_plugin.datamanagers.colmap.lens import PINHOLES
+from coliags_plugin.datamanagers.colmap.files import (
+    PINHOLES,
+    RegisteredImage,
+    SparseModel,
+    find_models,
+    read_model,
+    sidecar_file,
+)
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import (
     first_few,

@@ -31,14 +31,7 @@ class SeenPoints(NamedTuple):
 def write_image_and_mask(
     folder: Path, name: str, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> None:
-    """Write an image and its optional mask.
-
-    Args:
-        folder: Folder of the scene.
-        name: The image's file name, ending in ``.png``.
-        image: RGB. [H, W, 3]
-        mask: True where a pixel counts. [H, W]
-    """
+    """Write an image and its optional mask, True where a pixel counts; ``name`` ends in ``.png``."""
     write_image(folder / "images" / name, image)
     if mask is not None:
         write_mask(folder / "masks" / name, mask)
@@ -51,14 +44,10 @@ def add_points(
     colors: UInt8[np.ndarray, "N 3"],
     errors: Float[np.ndarray, "N"] | None = None,
 ) -> None:
-    """Add points to a model of posed images; point k gets COLMAP's ID k + 1.
+    """Add points, in scene units, to a model of posed images; point k gets COLMAP's ID k + 1.
 
-    Args:
-        model: Model in which image i has ID i + 1.
-        seen: Observations of each image.
-        positions: World, scene units. [N, 3]
-        colors: RGB. [N, 3]
-        errors: Mean reprojection errors, pixels; None: computed. [N]
+    ``seen`` are the observations of each image; image i has ID i + 1. ``errors`` are mean reprojection errors, pixels,
+    computed where they are None.
     """
     import pycolmap
 

@@ -28,14 +28,8 @@ def camera_of(
 ) -> Lens:
     """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
 
-    Args:
-        values: Keys of the file, overlaid with those of the frame.
-        where: Name of the frame in messages.
-        pixel_centers: Where ``cx`` and ``cy`` count pixel centres.
-        stored_size: Returns width and height of the image; called only if the file has no size.
-
-    Raises:
-        InputError: The model is unknown, or a value is missing, not a number, or not a parameter of the model.
+    ``values`` are the keys of the file, overlaid with those of the frame; ``where`` names the frame in messages.
+    ``stored_size`` returns width and height of the image; it is called only if the file has no size.
     """
     model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(model, str) or model not in _MODELS:

@@ -35,14 +35,9 @@ class FrameFiles:
 
 
 class Transforms:
-    """Contents of a ``transforms.json``.
+    """Contents of a ``transforms.json`` whose poses have been read before, so that its structure is valid.
 
-    Args:
-        path: The file; its poses have been read before, so that its structure is valid.
-        outside: Whether it may name files outside of its folder.
-
-    Raises:
-        InputError: The file cannot be read.
+    ``outside`` tells whether it may name files outside of its folder.
     """
 
     def __init__(self, path: Path, outside: bool = False) -> None:
@@ -51,12 +46,7 @@ class Transforms:
         self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
 
     def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[FrameFiles]:
-        """Frame entries by name.
-
-        Raises:
-            InputError: Files are missing, only some frames have depth or confidence, there is confidence without depth,
-                or a camera is unsupported or incomplete.
-        """
+        """Frame entries by name; depth and confidence are there for all frames or for none."""
         images = self._images(names)
         depths = self._for_all_or_none(names, "depth_file_path", "depth")
         confidences = self._for_all_or_none(names, "confidence_file_path", "confidence")
@@ -83,11 +73,7 @@ class Transforms:
         ]
 
     def points_file(self) -> Path | None:
-        """The file of ``ply_file_path``; None if there is none.
-
-        Raises:
-            InputError: The file does not exist.
-        """
+        """The file of ``ply_file_path``; None if there is none."""
         name = self.content.get("ply_file_path")
         if name is None:
             return None
@@ -106,9 +92,6 @@ class Transforms:
         """Indices of training and test frames among ``names``; None if the file has no split.
 
         Test frames are those of ``test_filenames`` or, if empty, of ``val_filenames``.
-
-        Raises:
-            InputError: A listed name is not a frame, or a training frame is a test frame.
         """
         listed = {part: self.content.get(f"{part}_filenames") for part in ("train", "val", "test")}
         if not listed["train"]:

@@ -21,9 +21,7 @@ _POINTS = "points.ply"
 class EstimatedSceneWriter:
     """Writes the frames of a scene one by one, then ``transforms.json`` and the points.
 
-    Args:
-        folder: Folder of the scene.
-        depth_unit: Scene units per 16-bit step of depth.
+    ``depth_unit`` is in scene units per 16-bit step.
     """
 
     def __init__(self, folder: Path, depth_unit: float) -> None:
@@ -44,10 +42,10 @@ class EstimatedSceneWriter:
         Args:
             name: Unique; the stem of its files.
             camera: Pinhole of the image, posed.
-            image: RGB. [H, W, 3]
-            mask: False where a pixel is to be ignored; None: nowhere. [H, W]
-            depth: z-depth, scene units; not positive where unknown. [H, W]
-            confidence: 0 to 1. [H, W]
+            image: RGB.
+            mask: False where a pixel is to be ignored; None: nowhere.
+            depth: z-depth, scene units; not positive where unknown.
+            confidence: 0 to 1.
         """
         file = f"{name}.png"
         steps = np.clip(np.rint(depth / self.depth_unit), 0, 65535).astype(np.uint16)
@@ -76,13 +74,7 @@ class EstimatedSceneWriter:
         colors: UInt8[np.ndarray, "N 3"],
         split: tuple[Sequence[str], Sequence[str]] | None,
     ) -> None:
-        """Write the points and ``transforms.json``.
-
-        Args:
-            positions: Initial points, world. [N, 3]
-            colors: RGB. [N, 3]
-            split: Names of the training and the test frames, where the source has a split of its own.
-        """
+        """Write the initial points and ``transforms.json``; ``split`` names training and test frames."""
         write_ply(self.folder / _POINTS, point_properties(positions, colors))
         lists = {}
         if split is not None:

@@ -11,11 +11,7 @@ from coliags_plugin.core.json_files import image_size, read_json, read_number
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """The intrinsics of a ``camera.json``.
-
-    Raises:
-        InputError: It is not JSON, or keys are missing, or their values are not sizes and focal lengths.
-    """
+    """The intrinsics of a ``camera.json``."""
     data = read_json(path, "a JSON object")
     keys = ("fx", "fy", "cx", "cy", "w", "h")
     if not isinstance(data, dict) or any(key not in data for key in keys):
@@ -31,12 +27,6 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def write_camera_json(path: Path, intrinsics: Intrinsics, **more: float) -> None:
-    """Write a ``camera.json``.
-
-    Args:
-        path: Where to.
-        intrinsics: Of all images.
-        more: ``w`` and ``h``, the image size in pixels, and other values of a format, in this order.
-    """
+    """Write a ``camera.json``; ``more`` are ``w`` and ``h``, pixels, and other values of a format, in this order."""
     k = intrinsics
     write_json(path, {"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5, **more})

@@ -19,11 +19,7 @@ class DepthFormat(ABC):
 
     @abstractmethod
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """Read the stored values of a file.
-
-        Raises:
-            InputError: The file is damaged or has another format.
-        """
+        """Read the stored values of a file."""
 
     @abstractmethod
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:

@@ -26,13 +26,7 @@ def require_folder(folder: Path, expected: str) -> None:
 
 
 def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
-    """Files ``<number>_<what>`` by number, padded or not; ``<number>`` alone if ``what`` is empty.
-
-    None if the folder is missing.
-
-    Raises:
-        InputError: Two files have the same number.
-    """
+    """Files ``<number>_<what>`` by number, padded or not, or ``<number>`` if ``what`` is empty; none without folder."""
     files: dict[int, Path] = {}
     pattern = rf"(\d+)_{what}" if what else r"(\d+)"
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -47,17 +41,7 @@ def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Pat
 
 
 def numbered_images(folder: Path, what: str, expected: str, example: str) -> dict[int, Path]:
-    """PNG images by number, at least one; see :func:`numbered`.
-
-    Args:
-        folder: Folder of the images, a part of the sequence's own.
-        what: See :func:`numbered`.
-        expected: The layout, for the error.
-        example: A sequence's own folder, for the error.
-
-    Raises:
-        InputError: There is none, or two have the same number.
-    """
+    """PNG images by number, at least one; see :func:`numbered`. Errors name the layout and an example of a folder."""
     images = numbered(folder, what, frozenset({".png"}))
     if not images:
         searched = folder if folder.is_dir() else folder.parent
@@ -71,13 +55,7 @@ def paired(
 ) -> tuple[tuple[Path, ...], tuple[Path, ...] | None]:
     """Image files and, if any, depth files in frame order.
 
-    Args:
-        folder: Folder of the sequence, for errors.
-        images: Images by number; at least one.
-        depths: Depth files by number; none, or one for every image.
-
-    Raises:
-        InputError: Numbers do not run from 0 without gaps, or images and depth files do not pair up.
+    Numbers must run from 0 without gaps, and there must be depth for every image or for none.
     """
     count = len(images)
     gap = next((index for index in range(count) if index not in images), None)
@@ -115,9 +93,6 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
         name: As it stands.
         said: Where, for the message.
         outside: Whether it may lie outside of the folder. Links within the folder may always lead anywhere.
-
-    Raises:
-        InputError: It lies outside, and must not; or no file can have this name.
     """
     path = folder / name
     within = Path(posixpath.normpath(folder.absolute()))
@@ -142,9 +117,6 @@ def short_names(paths: Sequence[str]) -> list[str]:
 
     Common parent folders are removed and the remaining ones joined by a dash; suffixes are dropped if names stay
     unique.
-
-    Raises:
-        InputError: Two names would be equal.
     """
     whole = [PurePosixPath(posixpath.normpath(path)) for path in paths]
     common = len(PurePosixPath(os.path.commonpath([path.parent for path in whole])).parts)
@@ -158,12 +130,7 @@ def short_names(paths: Sequence[str]) -> list[str]:
 
 
 def unposed_images(used: Sequence[Path], excluded: Iterable[Path | None] = ()) -> list[Path]:
-    """Images without a pose in the folders of those with one.
-
-    Args:
-        used: Images with a pose.
-        excluded: Other files in these folders: depth, masks.
-    """
+    """Images without a pose in the folders of those with one, except other files there (depth, masks)."""
     known = {*used, *excluded}
     suffixes = {path.suffix.lower() for path in used}
     return [

@@ -12,16 +12,7 @@ from coliags_plugin.core.images import decode_image, kind_of
 
 
 def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]:
-    """Read a one-channel image of 8 or 16 bits, as stored.
-
-    Args:
-        path: The image.
-        bits: Bits per pixel.
-        expected: The expected kind of file, for the error.
-
-    Raises:
-        InputError: The file is damaged or has another format.
-    """
+    """Read a one-channel image of 8 or 16 bits, as stored; ``expected`` is the kind of file, for errors."""
     image = decode_image(path)
     _check_gray(path, image, bits, expected)
     return image
@@ -38,30 +29,18 @@ def _check_gray(path: Path, image: np.ndarray, bits: int, expected: str) -> None
 
 
 def bits_of(path: Path) -> int:
-    """Bits per channel of an image file.
-
-    Raises:
-        InputError: The image cannot be read completely.
-    """
+    """Bits per channel of an image file."""
     return 8 * decode_image(path).itemsize
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, pixels.
-
-    Raises:
-        InputError: The image cannot be read completely.
-    """
+    """Width and height of an image file, pixels."""
     height, width = decode_image(path).shape[:2]
     return width, height
 
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
-    """Read an 8-bit mask, of one channel or of three equal ones: True where it is not black. [H, W]
-
-    Raises:
-        InputError: The file is damaged or has another format.
-    """
+    """Read an 8-bit mask, of one channel or of three equal ones: True where it is not black."""
     image = decode_image(path)
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         if not (image == image[..., :1]).all():

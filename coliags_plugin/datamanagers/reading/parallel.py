@@ -23,17 +23,10 @@ def parallel_map(
     progress: Progress | None = None,
     threads: int | None = None,
 ) -> list[_Result]:
-    """Apply a function to every item in a thread pool and return the results in order.
+    """Apply a function to every item in a thread pool and return the results in order; they are all held in memory.
 
-    Args:
-        function: Function of one item; its result should be small, as all are held in memory.
-        items: Items.
-        what: Name of the task, for ``progress``.
-        progress: Progress callback.
-        threads: Number of threads. None: as many as read files fastest.
-
-    Raises:
-        Exception: The exception of the first item that failed; the remaining items are cancelled.
+    ``what`` names the task for ``progress``. ``threads`` is by default what reads files fastest. The exception of the
+    first item that fails is raised, and the remaining items are cancelled.
     """
     results = []
     with ThreadPoolExecutor(threads or min(_READERS, os.cpu_count() or 1)) as pool:

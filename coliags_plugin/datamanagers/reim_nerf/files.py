@@ -109,7 +109,7 @@ class RayDistance(DepthFormat):
     def _is_clipped(
         self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Pixels clipped in the distance map or in the original depth, with one step for rounding. [h, w]"""
+        """Pixels clipped in the distance map or in the original depth, with one step for rounding."""
         return np.asarray((stored == 65535) | (depth >= C3VD_RANGE - self.size))
 
 
@@ -126,15 +126,9 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
 
 
 def read_sequence(folder: Path, outside: bool = False) -> ReimNerfSequence:
-    """Read and combine the JSON files of a folder.
+    """Read and combine the JSON files of a folder; they must not contradict each other.
 
-    Args:
-        folder: Of the scene.
-        outside: Whether files may be named outside of it.
-
-    Raises:
-        InputError: The folder or ``transforms_train.json`` is missing; a file is invalid (the message names the frame);
-            or two files contradict each other.
+    ``outside`` tells whether files may be named outside of it.
     """
     require_folder(folder, EXPECTED)
     files = {part: folder / f"transforms_{part}.json" for part in PARTS}

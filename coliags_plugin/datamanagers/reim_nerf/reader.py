@@ -13,7 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.files import unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, ReimNerfSequence, ray_cosines, read_sequence
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
@@ -56,7 +56,7 @@ class ReimNerfDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        sequence = read_sequence(path, self.settings.outside_files)
+        sequence = read_sequence(path, settings.outside_files)
         if settings.split == "own" and "true_test" not in sequence.parts:
             raise InputError(
                 f"{path} has no transforms_true_test.json",
@@ -72,20 +72,12 @@ class ReimNerfDataManager(RecordedDataManager):
         size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
         form = RayDistance(size, rectification.nearest(ray_cosines(lens)))
         seen = find_seen_masks(path / "truth", len(sequence.frames))
-        shots = [
-            Shot(
-                frame.image.stem,
-                frame.image,
-                rectification,
-                frame.camera_to_world,
-                frame.distances,
-                form,
-                seen=seen.get(index),
-            )
-            for index, frame in enumerate(sequence.frames)
-        ]
-        large = [file for frame in sequence.frames for file in (frame.image, frame.distances)]
-        warn_of_unposed(path, unposed_images([frame.image for frame in sequence.frames], large))
+        images = [frame.image for frame in sequence.frames]
+        distances = [frame.distances for frame in sequence.frames]
+        poses = np.stack([frame.camera_to_world for frame in sequence.frames])
+        shots = make_shots(images, rectification, poses, distances, form, seen)
+        warn_of_unposed(path, unposed_images(images, distances))
+        large = [file for pair in zip(images, distances, strict=True) for file in pair]
         parts = sequence.parts
         return Recording(
             kind="REIM-NeRF layout",

@@ -65,11 +65,7 @@ def recognise(folder: Path) -> str | None:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The colour images, unordered.
-
-    Raises:
-        InputError: There is no folder of images, or more than one, or it is empty.
-    """
+    """The colour images, unordered; there must be one folder of them."""
     require_folder(folder, EXPECTED)
     image_folder = _only(folder, IMAGE_FOLDERS)
     if image_folder is None:
@@ -81,26 +77,15 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def find_depths(folder: Path) -> list[Path]:
-    """The depth files, unordered; empty without a folder of them.
-
-    Raises:
-        InputError: There is more than one such folder.
-    """
+    """The depth files, unordered; empty without a folder of them."""
     depths = _only(folder, DEPTH_FOLDERS)
     return [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
 
 
 def files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
-    """Files of images, such as masks, by the stem of their image; empty without a folder of them.
+    """Files of images, such as masks, by the stem of their image; empty without a folder of one of the ``names``.
 
-    Args:
-        folder: Folder of the scene.
-        names: Names that the folder of the files may have.
-        images: The images.
-        what: What the files are, for the error.
-
-    Raises:
-        InputError: There is more than one such folder, or an image has no file in it.
+    Such a folder must have one for every image; ``what`` they are is for the error.
     """
     file_folder = _only(folder, names)
     if file_folder is None:
@@ -128,15 +113,7 @@ def lacks_trajectory(folder: Path) -> bool:
 
 
 def find_trajectory(folder: Path, named: str | None) -> Path:
-    """The trajectory file.
-
-    Args:
-        folder: Folder of the scene.
-        named: File name given by the user, relative to the folder or absolute; None: search for it.
-
-    Raises:
-        InputError: There is none, or there are several and none is given.
-    """
+    """The trajectory file: the one the user names, relative to the folder or absolute, or the only one there is."""
     if named is not None:
         if not (folder / named).is_file():
             raise InputError(f"no file {folder / named}", "a TUM trajectory", "Correct the option trajectory")
@@ -160,12 +137,7 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
 def find_camera(folder: Path, image: Path) -> CameraFile:
     """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
 
-    Args:
-        folder: Folder of the scene.
-        image: One of its images, for the size if the file has none.
-
-    Raises:
-        InputError: There is no such file, or it is invalid.
+    ``image`` is one of the scene's, for the size if the file has none.
     """
     for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
         if (folder / name).is_file():
@@ -267,20 +239,12 @@ def is_time(name: str) -> bool:
 
 
 def times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:
-    """Timestamps from file names, seconds; integers are accepted too. [N]
-
-    Raises:
-        InputError: A name is not a number.
-    """
+    """Timestamps from file names, seconds; integers are accepted too."""
     return np.array([_time(path) for path in paths])
 
 
 def by_number(paths: Sequence[Path]) -> dict[tuple[int, ...], Path]:
-    """Files in natural order, 2 before 10, by all integers in their names, which tell the frame whatever the padding.
-
-    Raises:
-        InputError: A name has no number, or two have the same.
-    """
+    """Files in natural order, 2 before 10, by all integers in their names, whatever their padding."""
     files: dict[tuple[int, ...], Path] = {}
     for index in natural_order([path.name for path in paths]):
         path = paths[index]

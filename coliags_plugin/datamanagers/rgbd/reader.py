@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,6 @@ from pydantic import Field
 
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
@@ -170,7 +170,9 @@ class RGBDDataManager(RecordedDataManager):
             fingerprint=fingerprint(
                 path, (*frames.images, *frames.depths, *masks.values(), *confidences.values()), (file, camera.path)
             ),
-            own_points=(lambda: _points(points)) if points is not None else None,
+            own_points=None
+            if points is None
+            else partial(read_obj_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
         )
 
@@ -301,10 +303,6 @@ class RGBDDataManager(RecordedDataManager):
                 "Set it, for instance --set datamanager.depth_scale=5000, or set depth: none if depth is relative",
             )
         return scale
-
-
-def _points(path: Path) -> PointCloud:
-    return read_obj_points(path) if path.suffix == ".obj" else load_points(path)
 
 
 class UnposedRGBDDataManager(RGBDDataManager):

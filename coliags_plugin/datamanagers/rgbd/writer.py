@@ -31,15 +31,10 @@ def write_frame(
     scale: float,
     mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> None:
-    """Write an image, its depth and its optional mask under the same file name.
+    """Write an image, its depth and its optional mask (True where a pixel counts) under the same file name.
 
-    Args:
-        folder: Folder of the scene.
-        name: File name, a timestamp in seconds or a number.
-        image: RGB. [H, W, 3]
-        z_depth: As for :func:`depth_steps`. [H, W]
-        scale: Steps per unit of length.
-        mask: True where a pixel counts. [H, W]
+    The name is a timestamp in seconds or a number. ``z_depth`` is as for :func:`depth_steps`; ``scale`` in steps per
+    unit of length.
     """
     write_image(folder / "rgb" / name, image)
     write_image(folder / "depth" / name, depth_steps(z_depth, scale))
@@ -107,7 +102,7 @@ def depth_scale(farthest: float) -> float:
 
 
 def depth_steps(depth: Float[np.ndarray, "H W"], scale: float) -> UInt16[np.ndarray, "H W"]:
-    """z-depth in 16-bit steps; 0 where unknown or out of range. [H, W]"""
+    """z-depth in 16-bit steps; 0 where unknown or out of range."""
     known = np.isfinite(depth) & (depth > 0.0)
     steps = np.maximum(np.rint(np.where(known, depth, 0.0) * scale), 1)
     return np.where(known & (steps <= _LARGEST), steps, 0).astype(np.uint16)

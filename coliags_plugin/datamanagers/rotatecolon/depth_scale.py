@@ -38,17 +38,9 @@ class ScaleFit:
 
 
 def fit_scale(shots: Sequence[Shot], points: Float[np.ndarray, "N 3"]) -> ScaleFit | None:
-    """Fit the scale of the depth of a few frames to points of the surface, by nearest-neighbour distances.
+    """Fit the scale of the depth of a few pinhole frames to points of the surface, by nearest-neighbour distances.
 
-    Args:
-        shots: Frames of pinhole images; some may have no depth.
-        points: World of the poses. [N, 3]
-
-    Returns:
-        The fit; None where there is no depth or no points.
-
-    Raises:
-        InputError: A depth file cannot be read.
+    Points are in the world of the poses. None where there is no depth or no points.
     """
     from scipy.spatial import cKDTree
 

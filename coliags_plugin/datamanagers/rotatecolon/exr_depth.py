@@ -41,11 +41,7 @@ class ExrDepth(DepthFormat):
 
 
 def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
-    """Read a channel of an EXR file by its full name, from any part.
-
-    Raises:
-        InputError: The file is damaged or has no such channel; the message names its channels.
-    """
+    """Read a channel of an EXR file by its full name, from any part."""
     import OpenEXR
 
     if not path.is_file():
@@ -68,11 +64,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
 
 
 def write_exr_channels(path: Path, channels: Mapping[str, np.ndarray]) -> None:
-    """Write float channels [H, W] by their full names.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """Write float channels [H, W] by their full names."""
     import OpenEXR
 
     make_folder(path.parent)

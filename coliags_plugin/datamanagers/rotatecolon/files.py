@@ -48,9 +48,7 @@ class ViewFiles:
 def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
     """Find the images and depth files of the poses in a JSON file.
 
-    Raises:
-        InputError: The JSON cannot be read, or a pose is not rigid; a frame has no number, is repeated or has no
-            image; or only some frames have a depth file.
+    There must be an image for every pose; others are counted. Either all frames have a depth file, or none.
     """
     trajectory = read_transforms(transforms)
     expected = "the horizontal field of view, radians, between 0 and pi"
