@@ -116,7 +116,8 @@ class StoredFrame(Frame):
         # If two threads read at the same time, the second overwrites the cache with equal data.
         if self._pixels is not None:
             return self._pixels
-        pixels = _read_pixels(self._shot)
+        shot, mask = self._shot, _mask(self._shot)
+        pixels = _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot), _confidence(shot))
         if self._keep:
             object.__setattr__(self, "_pixels", pixels)
         return pixels
@@ -149,11 +150,6 @@ class StoredFrame(Frame):
 def read_in_parallel(frames: Sequence[Frame], progress: Progress | None = None) -> None:
     """Read the pixels of frames into their caches, in parallel."""
     parallel_map(lambda frame: frame.image.numel(), frames, "read images", progress)
-
-
-def _read_pixels(shot: Shot) -> _Pixels:
-    mask = _mask(shot)
-    return _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot), _confidence(shot))
 
 
 def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:

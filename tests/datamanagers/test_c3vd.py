@@ -68,14 +68,6 @@ def color_errors(frame: Frame) -> np.ndarray:
     return np.abs(frame.image.numpy()[keep].astype(int) - colors(points)[keep])
 
 
-def worst_color(frame: Frame) -> int:
-    return int(color_errors(frame).max())
-
-
-def mean_color_error(frame: Frame) -> float:
-    return float(color_errors(frame).mean())
-
-
 class TestScene:
     def test_frames_are_what_was_written(self, undistorted):
         scene = small(undistorted)
@@ -92,7 +84,7 @@ class TestScene:
         assert frame.mask is None
         assert frame.seen is None
         assert worst_off_wall(frame) < 0.002
-        assert worst_color(frame) <= 1
+        assert color_errors(frame).max() <= 1
 
     def test_initial_points_lie_on_the_wall_and_carry_its_colours(self, undistorted):
         points = small(undistorted).points
@@ -123,7 +115,7 @@ class TestScene:
         assert frame.camera.cx == pytest.approx(33.5 * size[0] / 64)
         # Nearest depth lies up to half a stored pixel beside its ray: on this slope a few tenths of a millimetre.
         assert worst_off_wall(frame) < 0.3
-        assert worst_color(frame) < 12
+        assert color_errors(frame).max() < 12
 
     @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files through /proc")
     def test_no_file_stays_open(self, undistorted):
@@ -144,7 +136,7 @@ class TestRaw:
         assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
         assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy))
         assert worst_off_wall(frame) < 0.2
-        assert worst_color(frame) < 12
+        assert color_errors(frame).max() < 12
         assert off_wall(scene.points.positions.double().numpy()).max() < 0.2
         assert scene.provenance["lens"] == name
 
@@ -157,7 +149,7 @@ class TestRaw:
         assert 0.5 < frame.mask.float().mean() < 0.99
         assert torch.isnan(frame.depth[~frame.mask]).all()
         assert frame.image[frame.mask].amax(dim=-1).min() > 0
-        assert mean_color_error(frame) < 3.0
+        assert color_errors(frame).mean() < 3.0
         assert load(raw, width=90, height=72).train[0].mask is None
 
     def test_the_octagon_can_be_left_in(self, raw):
@@ -182,18 +174,10 @@ class TestRaw:
 
 
 class TestSplit:
-    def test_endogslam(self, undistorted):
-        assert [frame.index for frame in small(undistorted, split="endogslam").test_sets["test"]] == [7]
-
     def test_block(self, undistorted):
         scene = small(undistorted, split="block", block=(0.5, 0.8))
         assert [frame.index for frame in scene.test_sets["test"]] == [4, 5, 6]
         assert scene.provenance["split"]["block"] == [0.5, 0.8]
-
-    def test_all_train(self, undistorted):
-        scene = small(undistorted, split="all-train")
-        assert len(scene.train) == 9
-        assert scene.test_sets == {}
 
     def test_subsampling_comes_before_the_split(self, undistorted):
         scene = small(undistorted, frame_step=2, max_frames=4)
@@ -218,9 +202,6 @@ class TestExtras:
         seen = np.zeros((48, 64), np.uint8)
         seen[:, 32:] = 255
         cv2.imwrite(str(mine / "rotation" / "seen" / "0001_seen.png"), seen)
-        (mine / "truth" / "seen").mkdir(parents=True)
-        for index in (0, 1, 8):
-            cv2.imwrite(str(mine / "truth" / "seen" / f"{index:04d}_seen.png"), seen)
         return mine
 
     def test_rotation_is_a_test_set(self, with_rotation):
@@ -234,14 +215,6 @@ class TestExtras:
         assert len(set(names(everything))) == len(everything)
         assert scene.provenance["frames"] == {"in_sequence": 9, "train": 7, "test": 2, "rotation": 3}
         assert scene.provenance["rotation"]["layout"] == "undistorted"
-
-    def test_what_training_sees_belongs_to_the_papers_split(self, with_rotation):
-        scene = small(with_rotation)
-        assert all(frame.seen is not None for frame in scene.test_sets["test"])
-        assert all(frame.seen is None for frame in scene.train)
-        for options in ({"split": "block"}, {"frame_step": 2}, {"split": "all-train"}):
-            scene = small(with_rotation, **options)
-            assert all(frame.seen is None for frames in (scene.train, *scene.test_sets.values()) for frame in frames)
 
     def test_marks_of_frames_that_do_not_exist(self, with_rotation):
         shutil.copy(with_rotation / "rotation/seen/0001_seen.png", with_rotation / "rotation/seen/0007_seen.png")

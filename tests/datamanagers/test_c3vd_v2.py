@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -164,23 +165,15 @@ class TestIntrinsicsFile:
         with pytest.raises(InputError, match="is ambiguous or implausible") as refused:
             read_camera_intrinsics(tmp_path / "camera_intrinsics.txt")
         assert seen in str(refused.value)
-        assert "camera_intrinsics.txt" in str(refused.value) and "lens: v2" in str(refused.value)
-
-    def test_the_scene_is_refused_with_it(self, mine):
-        (mine / "camera_intrinsics.txt").write_text("767.7 677.7 543.1")
-        with pytest.raises(
-            InputError, match=r"camera_intrinsics.txt is ambiguous or implausible.*set lens: v2.*or lens: v1"
-        ):
-            load(mine)
+        assert re.search(r"camera_intrinsics\.txt .*set lens: v2.*or lens: v1", str(refused.value))
 
 
-class TestVideosWithoutDepth:
-    def test_images_and_poses_are_enough_where_points_are_given(self, mine):
-        shutil.rmtree(mine / "depth")
-        write_ply(mine / "points3D.ply", point_properties(torch.rand(50, 3).numpy()))
-        scene = load(mine)
-        assert scene.train[0].depth is None
-        assert len(scene.points) == 50
+def test_images_and_poses_are_enough_where_points_are_given(mine):
+    shutil.rmtree(mine / "depth")
+    write_ply(mine / "points3D.ply", point_properties(torch.rand(50, 3).numpy()))
+    scene = load(mine)
+    assert scene.train[0].depth is None
+    assert len(scene.points) == 50
 
 
 def test_other_files_of_the_release_are_left_alone(mine):

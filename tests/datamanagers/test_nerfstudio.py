@@ -304,7 +304,6 @@ def test_the_fingerprint_sees_the_file(folder):
             {"train_filenames": ["images/frame_00001.png"], "test_filenames": ["images/frame_00001.png"]},
             "is in train_filenames and test_filenames",
         ),
-        ({"frames": []}, "has no frames"),
         ({"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "applied_transform"),
     ],
 )

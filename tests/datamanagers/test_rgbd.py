@@ -254,16 +254,6 @@ class TestOrder:
 
 
 class TestDepthScale:
-    def without_scale(self, folder: Path) -> Path:
-        camera = json.loads((folder / "camera.json").read_text())
-        del camera["depth_scale"]
-        (folder / "camera.json").write_text(json.dumps(camera))
-        return folder
-
-    def test_from_the_option(self, mine):
-        scene = load(self.without_scale(mine), depth_scale=SCALE)
-        assert worst(scene.train[0])[0] < 0.001
-
     def test_two_that_differ(self, mine):
         with pytest.raises(InputError, match=r"depth_scale = 1000, but the option depth_scale is 5000"):
             load(mine, depth_scale=5000.0)

@@ -107,7 +107,8 @@ def test_a_scene_without_masks_says_nothing_of_them(folders, tmp_path, caplog):
 
 
 def test_nothing_is_left_out_where_nothing_is_tested(folders, caplog):
-    assert load(folders("colmap"), split="all-train").test_sets == {}
+    scene = load(folders("colmap"), split="all-train")
+    assert scene.test_sets == {} and len(scene.train) == 9
     assert not warnings(caplog)
 
 

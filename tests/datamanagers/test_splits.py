@@ -10,21 +10,18 @@ from hypothesis import strategies as st
 from coliags_plugin.datamanagers.splits import held_out
 
 
-def test_every_8th_begins_with_the_first():
-    assert np.flatnonzero(held_out("every-8th", 25)).tolist() == [0, 8, 16, 24]
-
-
-def test_endogslam_begins_with_the_eighth():
-    assert np.flatnonzero(held_out("endogslam", 25)).tolist() == [7, 15, 23]
-
-
-def test_block_is_the_middle_fifth():
-    assert np.flatnonzero(held_out("block", 20)).tolist() == [8, 9, 10, 11]
-    assert np.flatnonzero(held_out("block", 10, (0.0, 0.3))).tolist() == [0, 1, 2]
-
-
-def test_all_train_holds_none_out():
-    assert not held_out("all-train", 5).any()
+@pytest.mark.parametrize(
+    ("arguments", "test"),
+    [
+        (("every-8th", 25), [0, 8, 16, 24]),
+        (("endogslam", 25), [7, 15, 23]),
+        (("block", 20), [8, 9, 10, 11]),
+        (("block", 10, (0.0, 0.3)), [0, 1, 2]),
+        (("all-train", 5), []),
+    ],
+)
+def test_frames_that_are_held_out(arguments, test):
+    assert np.flatnonzero(held_out(*arguments)).tolist() == test
 
 
 @pytest.mark.parametrize(

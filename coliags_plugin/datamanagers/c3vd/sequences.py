@@ -21,16 +21,7 @@ from coliags_plugin.geometry.poses.c3vd import read_poses
 
 @dataclass(frozen=True)
 class SequenceFiles:
-    """The files of one sequence.
-
-    Attributes:
-        kind: Layout, for provenance.
-        folder: Folder of the sequence.
-        images: Colour images, frame 0 first.
-        depths: Depth images of the same frames; None if there are none.
-        poses: The pose file.
-        camera: The camera file, if any.
-    """
+    """The files of one sequence in the layout ``kind``, frame 0 first; depth of all frames or None."""
 
     kind: str
     folder: Path

@@ -21,15 +21,9 @@ OPTIMIZED = "_endogslam_optimized"
 
 @dataclass(frozen=True)
 class PreparedFiles:
-    """The files of one sequence.
+    """The files of one sequence, frame 0 first.
 
-    Attributes:
-        folder: Folder of the sequence.
-        images: Colour images, frame 0 first.
-        depths: Depth images of the same frames, or None.
-        poses: ``pose.txt``, or None.
-        params: EndoGSLAM's result, or None.
-        cloud: The optimised Gaussians of PR-Endo's release, or None.
+    ``params`` is EndoGSLAM's result, ``cloud`` the optimised Gaussians of PR-Endo's release.
     """
 
     folder: Path

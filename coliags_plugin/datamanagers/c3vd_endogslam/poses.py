@@ -32,13 +32,9 @@ LOST = 0.2
 
 @dataclass(frozen=True)
 class SequencePoses:
-    """The poses of a sequence in one world.
+    """The poses of a sequence in one world. Rigid, OpenCV axes, mm.
 
-    Attributes:
-        camera_to_world: Pose of every image. Rigid, OpenCV axes, mm. [N, 4, 4]
-        from_slam: Transform from EndoGSLAM's world; None without params.npz. [4, 4]
-        from_file: Transform from the world of pose.txt; None without it. [4, 4]
-        facts: Provenance.
+    ``from_slam`` and ``from_file`` transform from EndoGSLAM's world and from that of pose.txt; None without the file.
     """
 
     camera_to_world: Float[np.ndarray, "N 4 4"]
@@ -51,9 +47,8 @@ class SequencePoses:
 class _Slam:
     """EndoGSLAM's trajectory aligned with the true one.
 
-    Attributes:
-        indices: The image index of each of its F poses. [F]
-        from_true: Transform from the true poses, relative to their first camera, to EndoGSLAM's world. [4, 4]
+    ``indices`` are the image indices of its F poses; ``from_true`` transforms from the true poses, relative to their
+    first camera, to EndoGSLAM's world.
     """
 
     params: EndoGslamParams

@@ -37,11 +37,9 @@ _PANORAMIC = frozenset({"EQUIRECTANGULAR"})
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapLens(MappedLens):
-    """A camera of a COLMAP model, projected by pycolmap.
+    """A camera of a COLMAP model, for instance ``OPENCV_FISHEYE``, projected by pycolmap.
 
-    Attributes:
-        model: Its name, for instance ``OPENCV_FISHEYE``.
-        params: As COLMAP orders them; pixels, centres at integers + 0.5.
+    ``params`` are as COLMAP orders them; pixels, centres at integers + 0.5.
     """
 
     model: str
@@ -69,13 +67,10 @@ class ColmapLens(MappedLens):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """A registered image and its observations.
+    """A registered image, its name relative to the folder of images, and COLMAP's ID of its camera.
 
-    Attributes:
-        name: Path relative to the folder of images.
-        camera: COLMAP's camera ID.
-        observed: Observed keypoints, pixels, centres at integers + 0.5. [K, 2]
-        points: Their points: rows of :attr:`SparseModel.positions`. [K]
+    ``observed`` are keypoints, pixels, centres at integers + 0.5; ``points`` their rows of
+    :attr:`SparseModel.positions`.
     """
 
     name: str
@@ -86,17 +81,10 @@ class RegisteredImage:
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """A sparse model, in its own world frame and unit.
+    """A sparse model, in its own world frame and unit: poses with OpenCV axes, RGB colours.
 
-    Attributes:
-        folder: Folder of the model.
-        files: Its files.
-        images: Registered images in natural order of their names, 2 before 10.
-        camera_to_world: Their poses, OpenCV axes. [N, 4, 4]
-        cameras: Cameras by COLMAP's ID.
-        positions: Sparse points. [P, 3]
-        colors: Their colours, RGB. [P, 3]
-        track_lengths: Number of observations of each point. [P]
+    Images are in natural order of their names, 2 before 10; cameras by COLMAP's ID; ``track_lengths`` count
+    observations.
     """
 
     folder: Path

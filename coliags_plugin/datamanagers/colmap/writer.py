@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 class SeenPoints(NamedTuple):
-    """Observations of a model's points in one image.
-
-    Attributes:
-        pixels: Column and row, pixel centres at integers + 0.5. [K, 2]
-        points: Point indices, from 0. [K]
-    """
+    """Observations of a model's points, by index from 0, in one image; pixel centres at integers + 0.5."""
 
     pixels: Float[np.ndarray, "K 2"]
     points: Int[np.ndarray, "K"]

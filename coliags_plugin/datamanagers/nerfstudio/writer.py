@@ -50,11 +50,11 @@ class EstimatedSceneWriter:
         file = f"{name}.png"
         steps = np.clip(np.rint(depth / self.depth_unit), 0, 65535).astype(np.uint16)
         write_image(self.folder / "images" / file, image)
-        write_image(self.folder / "depth" / file, steps if mask is None else np.where(mask, steps, 0).astype(np.uint16))
         grey = np.rint(255.0 * confidence).astype(np.uint8)
-        write_image(
-            self.folder / "confidence" / file, grey if mask is None else np.where(mask, grey, 0).astype(np.uint8)
-        )
+        for part, values in (("depth", steps), ("confidence", grey)):
+            if mask is not None:
+                values[~mask] = 0
+            write_image(self.folder / part / file, values)
         entry: dict[str, Any] = {
             "file_path": f"images/{file}",
             "depth_file_path": f"depth/{file}",

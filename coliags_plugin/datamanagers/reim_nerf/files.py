@@ -37,13 +37,7 @@ _SHARED = (
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """A frame of the JSON files.
-
-    Attributes:
-        image: The image file.
-        distances: Its distance map, if any.
-        camera_to_world: OpenCV axes, mm. [4, 4]
-    """
+    """A frame of the JSON files: its image, its distance map, if any, and its pose, OpenCV axes, mm."""
 
     image: Path
     distances: Path | None
@@ -52,16 +46,10 @@ class FrameEntry:
 
 @dataclass(frozen=True)
 class ReimNerfSequence:
-    """Combined contents of a folder's JSON files.
+    """Combined contents of a folder's JSON files; frames in video order, ``parts`` are indices into them.
 
-    Attributes:
-        files: The JSON files, by part.
-        lens: Lens of the images, which are distorted.
-        scene_scale: Normalised units per mm.
-        scene_shift: Offset added to positions in mm before scaling. [3]
-        distmap_scale: Normalised distance of the stored value 65535.
-        frames: Frames in video order.
-        parts: Indices into ``frames``, by part.
+    The images are distorted by ``lens``. ``scene_scale`` is in normalised units per mm, ``scene_shift`` is added to
+    positions in mm before scaling, and ``distmap_scale`` is the normalised distance of the stored value 65535.
     """
 
     files: Mapping[str, Path]

@@ -42,13 +42,7 @@ _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Contents of a camera file.
-
-    Attributes:
-        path: The file.
-        intrinsics: Of the images.
-        depth_scale: Depth steps per scene unit; None if not given.
-    """
+    """Contents of a camera file; ``depth_scale`` in depth steps per scene unit, None if not given."""
 
     path: Path
     intrinsics: Intrinsics

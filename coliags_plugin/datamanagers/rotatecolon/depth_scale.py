@@ -19,12 +19,10 @@ _ROUNDS = ((3.0, 31), (1.08, 17), (1.01, 11))
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """Fit of back-projected depth to points of the same surface.
+    """Fit of back-projected depth to points of the same surface: the best factor on depth.
 
-    Attributes:
-        factor: Scale of depth that minimises the distance to the points.
-        distance: Median distance of back-projected pixels to their nearest point, relative to z-depth, at scale 1.
-        distance_at_best: The same at scale ``factor``.
+    The distances are the median distance of back-projected pixels to their nearest point, relative to z-depth, at scale
+    1 and at the best scale.
     """
 
     factor: float

@@ -21,9 +21,7 @@ BACKGROUND = 1e6
 class ExrDepth(DepthFormat):
     """One channel proportional to z-depth; unknown where not finite, not positive or at least ``BACKGROUND``.
 
-    Attributes:
-        channel: Full name of the channel.
-        divisor: Divisor from stored values to scene units.
+    ``divisor`` turns stored values into scene units.
     """
 
     channel: str

@@ -26,15 +26,10 @@ POINTS = "init_point_cloud.ply"
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """Images, depth files and poses of one JSON file.
+    """Images, in order of their numbers, depth files, if any, and poses of one JSON file.
 
-    Attributes:
-        transforms: The JSON file.
-        images: Image files in order of their numbers.
-        depths: Their depth files; None if there are none.
-        camera_to_world: Rigid, OpenCV axes, the data's units. [N, 4, 4]
-        angle: Horizontal field of view, radians.
-        unposed: Number of images without a pose.
+    Poses are rigid, with OpenCV axes, in the data's units; ``angle`` is the horizontal field of view, radians;
+    ``unposed`` the number of images without a pose.
     """
 
     transforms: Path
