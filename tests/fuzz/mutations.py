@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import shutil
 import struct
@@ -46,19 +45,7 @@ BYTES = (
 ARRAYS = ("nan", "inf", "1e308", "1e30", "zeros", "negative", "text", "empty", "flat", "transposed", "first", "complex")
 #: What images become.
 IMAGES = (
-    "gray",
-    "rgba",
-    "16-bit",
-    "half",
-    "pixel",
-    "strip",
-    "float",
-    "nan",
-    "1e38",
-    "inf",
-    "negative",
-    "black",
-    "jpeg",
+    *("gray", "rgba", "16-bit", "half", "pixel", "strip", "float", "nan", "1e38", "inf", "negative", "black", "jpeg"),
 )
 #: What becomes of a file as a whole.
 NODES = ("missing", "folder", "loop", "dangling", "empty", "unreadable")
@@ -77,37 +64,16 @@ _HEADERS = frozenset({".ply", ".safetensors", ".glb"})
 def _flip(data: bytes, at: int, bit: int) -> bytes:
     changed = bytearray(data)
     if changed:
-        changed[at % len(changed)] ^= 1 << bit
+        changed[at] ^= 1 << bit
     return bytes(changed)
 
 
 def _write(data: bytes, at: int, hex: str) -> bytes:
     new = bytes.fromhex(hex)
-    at %= len(data) or 1
     return (data[:at] + new + data[at + len(new) :])[: max(len(data), len(new))]
 
 
-def _cut(data: bytes, at: int) -> bytes:
-    return data[: at % (len(data) or 1)]
-
-
-def _drop(data: bytes, at: int, count: int) -> bytes:
-    at %= len(data) or 1
-    return data[:at] + data[at + count :]
-
-
-def _double(data: bytes, at: int, count: int) -> bytes:
-    at %= len(data) or 1
-    return data[: at + count] + data[at:]
-
-
-def _splice(data: bytes, at: int, source: int, count: int) -> bytes:
-    at, source = at % (len(data) or 1), source % (len(data) or 1)
-    return data[:at] + data[source : source + count] + data[at + count :]
-
-
 def _insert(data: bytes, at: int, text: str, times: int = 1) -> bytes:
-    at %= len(data) + 1
     return data[:at] + (text * times).encode("utf-8", "surrogatepass") + data[at:]
 
 
@@ -253,40 +219,39 @@ def _decoded(data: bytes) -> Any:
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
+#: Pixels of another kind.
+_PIXELS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "gray": lambda pixels: pixels[..., 0] if pixels.ndim == 3 else np.dstack([pixels] * 3),
+    "rgba": lambda pixels: np.dstack([*_channels(pixels)[:3], _channels(pixels)[0]]),
+    "16-bit": lambda pixels: (
+        pixels.astype(np.uint16) if pixels.dtype == np.uint8 else (pixels.astype(np.float64) % 256).astype(np.uint8)
+    ),
+    "half": lambda pixels: pixels[::2, ::2],
+    "pixel": lambda pixels: pixels[:1, :1],
+    "strip": lambda pixels: pixels[:1],
+    "black": np.zeros_like,
+    "jpeg": lambda pixels: np.clip(pixels, 0, 255).astype(np.uint8),
+    "float": lambda pixels: pixels.astype(np.float32),
+}
+
+
+def _channels(pixels: np.ndarray) -> list[np.ndarray]:
+    """The channels, of which one stands for three."""
+    return list(np.moveaxis(pixels, 2, 0)) if pixels.ndim == 3 else [pixels] * 3
+
+
 def _image(data: bytes, how: str) -> bytes:
     import cv2
 
     pixels = _decoded(data)
     if pixels is None:
         return data
-    suffix, floats = ".tiff" if data[:2] in (b"II", b"MM") else ".png", pixels.astype(np.float32)
-    middle = pixels.shape[0] // 2
-    if how in ("nan", "1e38", "inf", "negative"):
-        suffix = ".tiff"
-        floats[middle] = -floats[middle] if how == "negative" else float(how)
-        pixels = floats
-    elif how == "gray":
-        pixels = pixels[..., 0] if pixels.ndim == 3 else np.dstack([pixels] * 3)
-    elif how == "rgba":
-        pixels = np.dstack(
-            [pixels if pixels.ndim == 3 else np.dstack([pixels] * 3), pixels.reshape(*pixels.shape[:2], -1)[..., 0]]
-        )
-    elif how == "16-bit":
-        pixels = (
-            pixels.astype(np.uint16) if pixels.dtype == np.uint8 else (pixels.astype(np.float64) % 256).astype(np.uint8)
-        )
-    elif how == "half":
-        pixels = pixels[::2, ::2]
-    elif how == "pixel":
-        pixels = pixels[:1, :1]
-    elif how == "strip":
-        pixels = pixels[:1]
-    elif how == "black":
-        pixels = np.zeros_like(pixels)
-    elif how == "jpeg":
-        suffix, pixels = ".jpg", np.clip(pixels, 0, 255).astype(np.uint8)
+    if how in _PIXELS:
+        suffix = {"jpeg": ".jpg", "float": ".tiff"}.get(how, ".tiff" if data[:2] in (b"II", b"MM") else ".png")
+        pixels = _PIXELS[how](pixels)
     else:
-        suffix, pixels = ".tiff", floats
+        suffix, pixels, middle = ".tiff", pixels.astype(np.float32), pixels.shape[0] // 2
+        pixels[middle] = -pixels[middle] if how == "negative" else float(how)
     try:
         return bytes(cv2.imencode(suffix, np.ascontiguousarray(pixels))[1])
     except cv2.error:
@@ -296,10 +261,10 @@ def _image(data: bytes, how: str) -> bytes:
 EDITS: dict[str, Callable[..., bytes]] = {
     "flip": _flip,
     "write": _write,
-    "cut": _cut,
-    "drop": _drop,
-    "double": _double,
-    "splice": _splice,
+    "cut": lambda data, at: data[:at],
+    "drop": lambda data, at, count: data[:at] + data[at + count :],
+    "double": lambda data, at, count: data[: at + count] + data[at:],
+    "splice": lambda data, at, source, count: data[:at] + data[source : source + count] + data[at + count :],
     "insert": _insert,
     "token": _token,
     "header": _header_token,
@@ -320,6 +285,8 @@ def apply(folder: Path, edit: Edit) -> None:
         _node(path, options["how"])
     elif path.is_file():
         data = path.read_bytes()
+        places = len(data) + 1 if edit["op"] == "insert" else len(data) or 1
+        options |= {key: options[key] % places for key in ("at", "source") if key in options}
         with suppress(Exception):  # it is of another form after the edits before
             data = EDITS[edit["op"]](data, **options)
         path.unlink()
@@ -333,15 +300,12 @@ def _node(path: Path, how: str) -> None:
         path.unlink(missing_ok=True)
     if how == "folder":
         path.mkdir()
-    elif how == "loop":
-        path.symlink_to(path.name)
-    elif how == "dangling":
-        path.symlink_to("nowhere")
-    elif how == "empty":
+    elif how in ("loop", "dangling"):
+        path.symlink_to(path.name if how == "loop" else "nowhere")
+    elif how in ("empty", "unreadable"):
         path.write_bytes(b"")
-    elif how == "unreadable":
-        path.write_bytes(b"")
-        os.chmod(path, 0)
+        if how == "unreadable":
+            path.chmod(0)
 
 
 # Drawing
@@ -421,16 +385,13 @@ def _random_bytes(data: bytes, random: Random) -> Edit:
     at = random.randrange(size) if random.random() < 0.5 else random.randrange(min(size, 400))
     count = random.choice((1, 2, 4, 8, 30, 100, 1000, 5000))
     op = random.choice(("flip", "write", "write", "write", "cut", "drop", "double", "splice"))
-    if op == "flip":
-        return {"op": op, "at": at, "bit": random.randrange(8)}
     if op == "write":
         new = random.choice((*BYTES, random.randbytes(4), bytes(count)))
         return {"op": op, "at": at - at % 4 if random.random() < 0.7 else at, "hex": new.hex()}
-    if op == "cut":
-        return {"op": op, "at": at}
-    if op == "splice":
-        return {"op": op, "at": at, "source": random.randrange(size), "count": count}
-    return {"op": op, "at": at, "count": count}
+    if op == "flip":
+        return {"op": op, "at": at, "bit": random.randrange(8)}
+    more = {"source": random.randrange(size)} if op == "splice" else {}
+    return {"op": op, "at": at, **more, **({} if op == "cut" else {"count": count})}
 
 
 def _text(random: Random) -> dict[str, Any]:

@@ -33,31 +33,17 @@ class Target:
     weight: float = 1.0
 
 
-def _scene(name: str) -> Callable[[Path], None]:
-    kind = KINDS[name]
-
+def _scene(path: str, **settings: object) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         from coliags_plugin.api.scenes import load_scene
 
-        geometry.check_scene(load_scene(folder / kind.scene))
+        geometry.check_scene(load_scene(folder / path, settings=settings))
 
     return read
-
-
-def _rich(folder: Path) -> None:
-    from coliags_plugin.api.scenes import load_scene
-
-    geometry.check_scene(load_scene(folder))
 
 
 def _points(file: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        from coliags_plugin.api.scenes import load_scene
-
-        settings = {"initial_points": "file", "points_file": file, "points_count": 200}
-        geometry.check_scene(load_scene(folder, settings=settings))
-
-    return read
+    return _scene(".", initial_points="file", points_file=file, points_count=200)
 
 
 def _data_check(folder: Path) -> None:
@@ -211,7 +197,11 @@ def _video(folder: Path) -> None:
             break
 
 
-_IMAGES_AND = ("*", "sparse/0/*", "rotation/*.*", "truth/*.*")
+#: Files of a scene besides its images.
+_FILES = (
+    *("*.json", "*.txt", "*.npz", "*.ply", "*.png", "sparse/0/*"),
+    *("rotation/*.txt", "rotation/*.json", "*.yaml"),
+)
 
 TARGETS: dict[str, Target] = {
     **{
@@ -219,29 +209,16 @@ TARGETS: dict[str, Target] = {
             name,
             tuple(
                 f"{kind.scene}/{part}" if kind.scene != "." else part
-                for part in (
-                    *(
-                        "*.json",
-                        "*.txt",
-                        "*.npz",
-                        "*.ply",
-                        "*.png",
-                        "sparse/0/*",
-                        "rotation/*.txt",
-                        "rotation/*.json",
-                        "*.yaml",
-                    ),
-                    *dict.fromkeys((kind.images, kind.depths or kind.images, "truth/seen/*")),
-                )
+                for part in (*_FILES, *dict.fromkeys((kind.images, kind.depths or kind.images, "truth/seen/*")))
             )
             + (("C3VD_endogslam_optimized/**/*.*",) if name == "pr-endo" else ()),
-            _scene(name),
+            _scene(kind.scene),
             weight=2.0,
         )
         for name, kind in KINDS.items()
     },
     "nerfstudio-rich": Target(
-        "nerfstudio-rich", ("transforms.json", "transforms.json", "cloud.ply", "*/*.png"), _rich, weight=2.0
+        "nerfstudio-rich", ("transforms.json", "transforms.json", "cloud.ply", "*/*.png"), _scene("."), weight=2.0
     ),
     "points-npz": Target("points", ("cloud.npz",), _points("cloud.npz")),
     "points-ply": Target("points", ("cloud.ply",), _points("cloud.ply")),
