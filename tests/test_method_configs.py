@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from coliags_plugin.checks.method.check import CHECKS, check_method
-from coliags_plugin.config.auto import is_auto
+from coliags_plugin.config.components import is_auto
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_files, method_folder
 

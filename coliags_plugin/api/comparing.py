@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.assignments import assignments
 
 if TYPE_CHECKING:
-    from coliags_plugin.comparison.cells import Variant
     from coliags_plugin.comparison.compare import FinishedComparison
+    from coliags_plugin.comparison.named_files import Variant
 
 
 def compare(
@@ -55,10 +55,10 @@ def compare(
             too small; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
-    from coliags_plugin.comparison.cells import Variant
     from coliags_plugin.comparison.compare import carry_out, make_request
     from coliags_plugin.comparison.executors import ExecutionOptions
     from coliags_plugin.comparison.folder import ComparisonFolder
+    from coliags_plugin.comparison.named_files import Variant
 
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     scenes = [scenes] if isinstance(scenes, (str, Path)) else scenes
@@ -82,7 +82,7 @@ def ablate(
         InputError: See :func:`compare`; or there is no such file, or it is not valid.
         InterruptedRunError: See :func:`compare`.
     """
-    from coliags_plugin.comparison.ablations import load_ablation
+    from coliags_plugin.comparison.named_files import load_ablation
 
     return compare(load_ablation(str(file)), scenes, output, **options)
 
@@ -98,6 +98,6 @@ def variant(name: str, method: str, settings: Mapping[str, Any]) -> Variant:
     Raises:
         InputError: These are no settings.
     """
-    from coliags_plugin.comparison.cells import Variant
+    from coliags_plugin.comparison.named_files import Variant
 
     return Variant(name, method, assignments(settings))

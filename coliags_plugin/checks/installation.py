@@ -12,8 +12,7 @@ import torch
 from coliags_plugin._version import __version__
 from coliags_plugin.checks.results import CheckResult
 from coliags_plugin.config import registry
-from coliags_plugin.config.auto import is_auto
-from coliags_plugin.config.components import make_component
+from coliags_plugin.config.components import is_auto, make_component
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders

@@ -13,7 +13,7 @@ from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
 
 if TYPE_CHECKING:
-    from coliags_plugin.comparison.cells import Variant
+    from coliags_plugin.comparison.named_files import Variant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +106,6 @@ class AblateCommand(ComparisonArguments):
 
     def run(self) -> None:
         """Compare the variants and print a summary."""
-        from coliags_plugin.comparison.ablations import load_ablation
+        from coliags_plugin.comparison.named_files import load_ablation
 
         self.carry_out(load_ablation(self.file))

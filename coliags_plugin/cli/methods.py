@@ -28,9 +28,8 @@ class ListCommand:
 
     def run(self) -> None:
         """Print names by kind, with the source of those that are not built in."""
-        from coliags_plugin.comparison import named_files
-        from coliags_plugin.comparison.ablations import ABLATIONS
-        from coliags_plugin.config.method_files import method_descriptions
+        from coliags_plugin.comparison.named_files import ABLATIONS, shipped
+        from coliags_plugin.config.method_files import descriptions, method_files
         from coliags_plugin.config.registry import REGISTRIES
         from coliags_plugin.core.errors import InputError, did_you_mean
 
@@ -38,18 +37,16 @@ class ListCommand:
             named = {name: REGISTRIES[kind].source(name) for name in REGISTRIES[kind]}
             return {name: "" if source == "built in" else f"({source})" for name, source in named.items()}
 
-        descriptions: dict[str, Callable[[], dict[str, str]]] = {
-            "methods": method_descriptions,
-            "benchmarks": named_files.descriptions,
-            "ablations": partial(named_files.descriptions, ABLATIONS),
+        texts: dict[str, Callable[[], dict[str, str]]] = {
+            "methods": lambda: descriptions(method_files()),
+            "benchmarks": lambda: descriptions(shipped()),
+            "ablations": lambda: descriptions(shipped(ABLATIONS)),
             **{kind: partial(sources, kind) for kind in REGISTRIES},
         }
-        if self.kind not in ("all", *descriptions):
-            raise InputError(
-                f"no kind '{self.kind}'", f"one of {', '.join(descriptions)}", did_you_mean(self.kind, descriptions)
-            )
-        kinds = list(descriptions) if self.kind == "all" else [self.kind]
-        listed = {kind: descriptions[kind]() for kind in kinds}
+        if self.kind not in ("all", *texts):
+            raise InputError(f"no kind '{self.kind}'", f"one of {', '.join(texts)}", did_you_mean(self.kind, texts))
+        kinds = list(texts) if self.kind == "all" else [self.kind]
+        listed = {kind: texts[kind]() for kind in kinds}
         head, indent = ("{}:", "  ") if self.kind == "all" else ("", "")
         lines = []
         for kind, rows in listed.items():

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from coliags_plugin.comparison.cells import ComparisonCell, Variant
 from coliags_plugin.comparison.dry_run import DryRun, RunSizes, forecast
 from coliags_plugin.comparison.executors import ExecutionOptions, Executor, LocalExecutor
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.plan import Request, make_cells
+from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.ray_executor import RayExecutor
-from coliags_plugin.comparison.runner import run_cells
+from coliags_plugin.comparison.runner import CellQueue
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -37,19 +37,12 @@ COLUMNS = ("psnr", "ssim", "depth_mse")
 
 @dataclass(frozen=True)
 class FinishedComparison:
-    """What a comparison came to.
+    """What a comparison came to."""
 
-    Attributes:
-        folder: Where its plan, runs and results are.
-        cells: Everything that was asked for.
-        results: Of the cells that are done, in their order.
-        failures: Of those that are not.
-    """
-
-    folder: Path
-    cells: Sequence[ComparisonCell]
-    results: Sequence[Result]
-    failures: Sequence[FailureRecord]
+    folder: Path  # where its plan, runs and results are
+    cells: Sequence[ComparisonCell]  # everything that was asked for
+    results: Sequence[Result]  # of the cells that are done, in their order
+    failures: Sequence[FailureRecord]  # of those that are not
 
     def table(self, columns: Sequence[str] = COLUMNS) -> DisplayTable:
         """Mean of metrics over every method's finished cells, of their main test sets, with the reasons of failures.
@@ -120,7 +113,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
         if scenes:
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
-        failures = run_cells(folder, executor, options, cells, finished, sizes)
+        failures = CellQueue(folder, executor, options, cells, finished, sizes).run()
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
 

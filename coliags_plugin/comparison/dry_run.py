@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from coliags_plugin.comparison.cells import ComparisonCell, file_name
 from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
-from coliags_plugin.comparison.plan_file import RUNS
+from coliags_plugin.comparison.plan import ComparisonCell
+from coliags_plugin.comparison.plan_file import RUNS, file_name
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Column
 from coliags_plugin.reporting.numbers import file_size

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from coliags_plugin._version import __version__
-from coliags_plugin.comparison.cells import ComparisonCell
-from coliags_plugin.comparison.plan import Request
+from coliags_plugin.comparison.plan import ComparisonCell, Request
 from coliags_plugin.comparison.plan_file import (
     FAILURES,
     PLAN_FILE,

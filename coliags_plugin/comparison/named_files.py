@@ -1,53 +1,176 @@
-"""YAML files of benchmarks and ablations: shipped ones by name, a user's own by path."""
+"""Benchmarks and ablations: lists of scenes, and of variants of a method, in YAML files; shipped ones by name."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, field_validator, model_validator
+from typing_extensions import Self
 
-from coliags_plugin.config.method_files import BENCHMARKS, method_folder
-from coliags_plugin.config.yaml_tree import errors_with_origins, read_tree
+from coliags_plugin.config import registry
+from coliags_plugin.config.method_files import BENCHMARKS, is_path, method_folder
+from coliags_plugin.config.yaml_tree import dump_inline, errors_with_origins, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.phantom.settings import PhantomSettings, phantom_settings
+
+#: Folder of the shipped ablations, beside the benchmarks.
+ABLATIONS = "ablations"
+#: A scene's name is part of file names.
+_NAME = re.compile(r"[\w.-]*\w")
 
 _Settings = TypeVar("_Settings", bound=Settings)
 
 
 def shipped(folder: str = "") -> dict[str, Path]:
-    """Files of a folder beside the method configs, by name."""
+    """Files of benchmarks, or of the ablations in their folder, by name."""
     files = {path.stem: path for path in (method_folder() / BENCHMARKS / folder).glob("*.yaml")}
     return dict(sorted(files.items()))
 
 
-def is_path(name: str) -> bool:
-    """Whether this is the path of a YAML file, not a name."""
-    return name.endswith((".yaml", ".yml"))
-
-
-def find_file(name: str, files: dict[str, Path], noun: str) -> Path:
-    """The file of a name, or the path itself."""
-    if is_path(name):
-        return Path(name)
-    if name not in files:
+def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> tuple[Path, _Settings]:
+    """Path and validated content of a shipped file by its name, or of a user's own by its path."""
+    files = shipped(folder)
+    if not is_path(name) and name not in files:
         raise InputError(f"no {noun} '{name}'", f"one of {', '.join(files)}, or a YAML file", did_you_mean(name, files))
-    return files[name]
-
-
-def read_settings(path: Path, content: type[_Settings], noun: str) -> _Settings:
-    """Read and validate a file."""
+    path = Path(name) if is_path(name) else files[name]
     tree = read_tree(path)
     try:
-        return content.model_validate(tree.plain())
+        return path, content.model_validate(tree.plain())
     except ValidationError as error:
         raise InputError("\n".join(errors_with_origins(error, tree, noun))) from error
 
 
-def descriptions(folder: str = "") -> dict[str, str]:
-    """One line on every shipped file of a folder, by name."""
-    texts = {}
-    for name, path in shipped(folder).items():
-        description = read_tree(path).value.get("description")
-        texts[name] = "" if description is None else str(description.value)
-    return texts
+class BenchmarkScene(Settings):
+    """One scene of a benchmark: a folder of a dataset, or a phantom that is made when it is missing."""
+
+    folder: str | tuple[str, ...] = Field(
+        (), description="Folder in that of the benchmark's data, or names of which one is there; default: its name."
+    )
+    phantom: dict[str, Any] | None = Field(None, description="Settings of the phantom to make (docs/phantom.md 6).")
+    format: str | None = Field(None, description="Data manager; default: the benchmark's.")
+    options: dict[str, Any] = Field(default_factory=dict, description="Options of the data manager.")
+
+    @field_validator("phantom")
+    @classmethod
+    def _valid_phantom(cls, options: dict[str, Any] | None) -> dict[str, Any] | None:
+        if options is not None:
+            try:
+                phantom_settings(options)
+            except InputError as error:
+                raise ValueError(str(error)) from error
+        return options
+
+    def folders(self, name: str) -> tuple[str, ...]:
+        """Names that the scene's folder may have, the first being the usual one."""
+        return ((self.folder,) if isinstance(self.folder, str) else self.folder) or (name,)
+
+    @property
+    def phantom_settings(self) -> PhantomSettings | None:
+        """The phantom's settings; None for a scene of a dataset."""
+        return None if self.phantom is None else phantom_settings(self.phantom)
+
+
+class BenchmarkSettings(Settings):
+    """Content of a benchmark's file."""
+
+    description: str  # one line
+    format: str | None = None  # data manager of all scenes; null: recognised from the files
+    split: str | None = None  # of all scenes; null: the data manager's
+    options: dict[str, Any] = Field(default_factory=dict)  # options of the data manager, for all scenes
+    scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # by name
+
+    @field_validator("scenes", mode="before")
+    @classmethod
+    def _empty_entries(cls, scenes: Any) -> Any:
+        if not isinstance(scenes, dict):
+            return scenes
+        for name in scenes:
+            if not _NAME.fullmatch(name):
+                raise ValueError(f"scene name '{name}': expected letters, digits, dots, hyphens and underscores")
+        return {name: {} if entry is None else entry for name, entry in scenes.items()}
+
+    @field_validator("format")
+    @classmethod
+    def _known_format(cls, name: str | None) -> str | None:
+        if name is not None:
+            try:
+                registry.datamanagers.get(name)
+            except InputError as error:
+                raise ValueError(str(error)) from error
+        return name
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark by its name."""
+
+    name: str
+    settings: BenchmarkSettings
+
+    def overrides(self, scene: str) -> tuple[str, ...]:
+        """``key.path=value`` changes of a method config with which a scene is read."""
+        entry = self.settings.scenes[scene]
+        split = {} if self.settings.split is None else {"split": self.settings.split}
+        options = {**split, **self.settings.options, **entry.options}
+        return tuple(f"datamanager.{key}={dump_inline(value)}" for key, value in options.items())
+
+
+def load_benchmark(name: str) -> Benchmark:
+    """Read a shipped benchmark by its name, or a YAML file."""
+    path, settings = _read_file(name, "", BenchmarkSettings, "benchmark")
+    return Benchmark(path.stem, settings)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A column of the comparison: a method with changes, under a name."""
+
+    name: str  # in tables and file names
+    method: str  # its name, or the path of a method config
+    overrides: tuple[str, ...] = ()  # ``key.path=value`` changes of it
+
+
+class VariantEntry(Settings):
+    """One variant: a method, with changes."""
+
+    method: str | None = None  # name or path of a method config; null: the ablation's base
+    set: tuple[str, ...] = ()  # key.path=value changes of it
+
+
+class AblationSettings(Settings):
+    """Content of an ablation's file."""
+
+    description: str  # one line
+    base: str | None = None  # method of the variants that name none
+    variants: dict[str, VariantEntry] = Field(min_length=1)  # by name
+
+    @field_validator("variants", mode="before")
+    @classmethod
+    def _short_forms(cls, variants: Any) -> Any:
+        """A bare name is a method; a list is changes of the base; nothing is the base."""
+        if not isinstance(variants, dict):
+            return variants
+        keys: dict[type, str] = {str: "method", tuple: "set"}
+        full = {name: {} if entry is None else entry for name, entry in variants.items()}
+        return {name: {keys[type(entry)]: entry} if type(entry) in keys else entry for name, entry in full.items()}
+
+    @model_validator(mode="after")
+    def _base_where_needed(self) -> Self:
+        without = [name for name, entry in self.variants.items() if entry.method is None]
+        if self.base is None and without:
+            raise ValueError(f"variant '{without[0]}' names no method, and there is no base")
+        return self
+
+
+def load_ablation(name: str) -> list[Variant]:
+    """The variants of a shipped ablation, or of a YAML file, whose methods are names, or paths relative to it."""
+    path, settings = _read_file(name, ABLATIONS, AblationSettings, "ablation")
+    variants = []
+    for title, entry in settings.variants.items():
+        method = entry.method or settings.base or ""
+        variants.append(Variant(title, str((path.parent / method).resolve()) if is_path(method) else method, entry.set))
+    return variants

@@ -1,4 +1,4 @@
-"""Planning of a comparison: which cells it has, and what each of them is."""
+"""Cells of a comparison, each one method on one scene with one split and one seed, and which of them it has."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
+from pathlib import PurePosixPath
+from typing import Any
 
 from coliags_plugin._version import __version__
-from coliags_plugin.comparison.cells import CellKeys, ComparisonCell, Variant
+from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.plan_file import file_name
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
@@ -17,8 +20,79 @@ from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.engine.data_formats import data_manager, load_method_for
 from coliags_plugin.results.hashing import result_key, training_key
 
+#: Digits of a key in names of files.
+_SHORT = 8
 #: The fingerprint of a scene that is not there, as recorded when it was; None where it never was.
 RecordedFingerprint = Callable[[SceneSource], str | None]
+
+
+@dataclass(frozen=True)
+class CellKeys:
+    """Hashes that identify a cell's scene, run and result; see :mod:`coliags_plugin.results.hashing`."""
+
+    fingerprint: str
+    training: str
+    result: str
+
+
+@dataclass(frozen=True)
+class ComparisonCell:
+    """One run of the comparison and its evaluation."""
+
+    variant: Variant
+    scene: SceneSource
+    scene_label: str  # name of the scene; with that of the split where it is not the scene's own
+    seed: int
+    protocol: str
+    overrides: tuple[str, ...]  # of the scene, the split, the variant and the comparison
+    config: MethodConfig
+    keys: CellKeys | None  # None while the scene, a phantom, is not there
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """Scene, method, seed, protocol and key of its result, as records hold them."""
+        return {
+            "scene": self.scene_label,
+            "method": self.variant.name,
+            "seed": self.seed,
+            "protocol": self.protocol,
+            "key": self.known_keys.result,
+        }
+
+    @property
+    def identity(self) -> tuple[str, str, int, str]:
+        """What it is called: scene, method, seed, protocol."""
+        return self.scene_label, self.variant.name, self.seed, self.protocol
+
+    @property
+    def steps(self) -> int:
+        """Length of its training."""
+        return self.config.schedule.steps
+
+    @property
+    def title(self) -> str:
+        """For messages: scene, method and seed."""
+        return f"{self.scene_label} {self.variant.name} seed {self.seed}"
+
+    @property
+    def known_keys(self) -> CellKeys:
+        """Its keys."""
+        if self.keys is None:
+            raise ValueError(f"{self.title}: the scene is not there, so that it has no key")
+        return self.keys
+
+    @property
+    def run_path(self) -> PurePosixPath:
+        """Of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
+        return self._path(self.known_keys.training)
+
+    @property
+    def result_path(self) -> PurePosixPath:
+        """Of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
+        return self._path(self.known_keys.result)
+
+    def _path(self, key: str) -> PurePosixPath:
+        return PurePosixPath(self.scene_label, file_name(self.variant.name), f"s{self.seed}-{key[:_SHORT]}")
 
 
 @dataclass(frozen=True)
@@ -78,16 +152,13 @@ def _seeds(
 
 def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> MethodConfig:
     """The method as it would read the scene; of a phantom that is not there, as far as that can be told."""
-    data_format = scene.data_format if scene.is_there else _layout_format(scene)
+    data_format = scene.data_format
     if data_format is None and not scene.is_there:
-        return load_method(method, overrides).config
+        # The data manager that reads a phantom may have the name of its layout.
+        data_format = None if scene.phantom is None else scene.phantom.layout
+        if data_format not in registry.datamanagers.names():
+            return load_method(method, overrides).config
     return load_method_for(scene.path, method, overrides, data_format).config
-
-
-def _layout_format(scene: SceneSource) -> str | None:
-    """The data manager that reads a phantom, where it has the name of the phantom's layout."""
-    layout = None if scene.phantom is None else scene.phantom.layout
-    return scene.data_format or (layout if layout in registry.datamanagers.names() else None)
 
 
 def _split(config: MethodConfig) -> str | None:

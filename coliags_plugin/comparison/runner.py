@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from coliags_plugin.comparison.cells import ComparisonCell
 from coliags_plugin.comparison.dry_run import RunSizes
 from coliags_plugin.comparison.executors import ExecutionOptions, Executor
 from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
-from coliags_plugin.comparison.named_files import is_path
+from coliags_plugin.comparison.plan import ComparisonCell
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.tasks import Task, TaskOutcome
+from coliags_plugin.config.method_files import is_path
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.progress import ProgressReport, log_console
 from coliags_plugin.reporting.numbers import file_size
@@ -26,7 +26,7 @@ from coliags_plugin.results.reading import read_result
 
 log = logging.getLogger(__name__)
 
-Phase = Literal["waiting", "running", "done", "failed"]
+_Phase = Literal["waiting", "running", "done", "failed"]
 
 #: Between two reports of progress, seconds.
 POLL_INTERVAL_S = 1.0
@@ -34,44 +34,8 @@ POLL_INTERVAL_S = 1.0
 _PLAIN_LINE_EVERY_S = 60.0
 
 
-def run_cells(
-    folder: ComparisonFolder,
-    executor: Executor,
-    options: ExecutionOptions,
-    cells: Sequence[ComparisonCell],
-    finished: FinishedCells,
-    sizes: RunSizes,
-) -> list[FailureRecord]:
-    """Complete all cells, whose scenes are there, and add their results to the finished ones; returns the failures.
-
-    Raises:
-        InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
-    """
-    queue = _CellQueue(folder, executor, options, cells, finished, sizes)
-    total = sum(cell.steps for cell in cells)
-    with (
-        _sigterm_as_interrupt(),
-        ProgressReport("compare", total, queue.steps, _PLAIN_LINE_EVERY_S, log_console()) as progress,
-    ):
-        try:
-            while queue.start_next():
-                progress.update(queue.steps, queue.counts)
-                queue.handle_finished(executor.wait(POLL_INTERVAL_S))
-            progress.update(queue.steps, queue.counts)
-        except KeyboardInterrupt as error:
-            log.info("stopping: the runs are saved; Ctrl-C again to stop at once")
-            executor.stop()
-            raise InterruptedRunError(
-                f"stopped with {queue.count('done')} of {len(cells)} cells done; "
-                "the same command goes on where it stopped"
-            ) from error
-        finally:
-            executor.stop()
-    return queue.failures
-
-
-class _CellQueue:
-    """Cells to run, those that are running, and what became of the others.
+class CellQueue:
+    """Cells to run, whose scenes are there, those that are running, and what became of the others.
 
     Of cells with the same result key, one is run; the others are equal to it.
     """
@@ -88,12 +52,12 @@ class _CellQueue:
         self._folder, self._executor, self._options = folder, executor, options
         self._finished, self._sizes = finished, sizes
         self._cells = cells
-        self._phases: dict[tuple[str, str, int, str], Phase] = {cell.identity: "waiting" for cell in cells}
+        self._phases: dict[tuple[str, str, int, str], _Phase] = {cell.identity: "waiting" for cell in cells}
         self._equal: dict[str, list[ComparisonCell]] = {}
         self._attempts: Counter[str] = Counter()
         self._running: dict[str, ComparisonCell] = {}
         self._waiting: deque[ComparisonCell] = deque()
-        self.failures: list[FailureRecord] = []
+        self._failures: list[FailureRecord] = []
         for cell in cells:
             result = finished.of(cell)
             if result is not None:
@@ -105,27 +69,53 @@ class _CellQueue:
                 self._waiting.append(cell)
             equal.append(cell)
 
+    def run(self) -> list[FailureRecord]:
+        """Complete all cells, and add their results to the finished ones; returns the failures.
+
+        Raises:
+            InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
+        """
+        total = sum(cell.steps for cell in self._cells)
+        with (
+            _sigterm_as_interrupt(),
+            ProgressReport("compare", total, self._steps, _PLAIN_LINE_EVERY_S, log_console()) as progress,
+        ):
+            try:
+                while self._start_next():
+                    progress.update(self._steps, self._counts)
+                    self._handle_finished(self._executor.wait(POLL_INTERVAL_S))
+                progress.update(self._steps, self._counts)
+            except KeyboardInterrupt as error:
+                log.info("stopping: the runs are saved; Ctrl-C again to stop at once")
+                raise InterruptedRunError(
+                    f"stopped with {self._count('done')} of {len(self._cells)} cells done; "
+                    "the same command goes on where it stopped"
+                ) from error
+            finally:
+                self._executor.stop()
+        return self._failures
+
     @property
-    def steps(self) -> int:
+    def _steps(self) -> int:
         """Steps that are over in all cells: all of a failed cell, and the last one of a cell with its evaluation."""
         over = [cell.steps for cell in self._cells if self._phases[cell.identity] in ("done", "failed")]
         running = self._running.values()
         return sum(over) + sum(min(self._folder.run(cell).logged_step, cell.steps - 1) for cell in running)
 
     @property
-    def counts(self) -> str:
+    def _counts(self) -> str:
         return ", ".join(f"{count} {phase}" for phase, count in Counter(self._phases.values()).items())
 
-    def count(self, phase: Phase) -> int:
+    def _count(self, phase: _Phase) -> int:
         return sum(each == phase for each in self._phases.values())
 
-    def start_next(self) -> bool:
+    def _start_next(self) -> bool:
         """Start what can be started; whether there is anything left to wait for."""
         while self._waiting and len(self._running) < self._executor.slots:
             self._start(self._waiting.popleft())
         return bool(self._running)
 
-    def handle_finished(self, ended: Sequence[tuple[Task, TaskOutcome]]) -> None:
+    def _handle_finished(self, ended: Sequence[tuple[Task, TaskOutcome]]) -> None:
         """Take the results of workers that have ended; retry or fail the cells of the others."""
         for task, outcome in ended:
             cell = self._running.pop(task.result_key)
@@ -189,12 +179,12 @@ class _CellQueue:
     def _fail(self, cell: ComparisonCell, reason: str) -> None:
         key = cell.known_keys.result
         for equal in self._equal[key]:
-            self.failures.append(self._folder.fail(equal, reason, self._attempts[key]))
+            self._failures.append(self._folder.fail(equal, reason, self._attempts[key]))
             self._set(equal, "failed", f": {reason}")
 
-    def _set(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:
+    def _set(self, cell: ComparisonCell, phase: _Phase, reason: str = "") -> None:
         self._phases[cell.identity] = phase
-        ended = self.count("done") + self.count("failed")
+        ended = self._count("done") + self._count("failed")
         log.info("[%d/%d] %s: %s%s", ended, len(self._cells), cell.title, phase, reason)
 
 

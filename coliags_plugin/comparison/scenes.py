@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.comparison.benchmarks import Benchmark, load_benchmark
-from coliags_plugin.comparison.named_files import is_path, shipped
+from coliags_plugin.comparison.named_files import Benchmark, load_benchmark, shipped
+from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.json_files import json_text, parse_json

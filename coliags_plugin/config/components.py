@@ -1,8 +1,8 @@
-"""Component nodes of method configs: a registered name with validated settings."""
+"""Component nodes of method configs: a registered name, or ``auto`` for one of them, with validated settings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -10,24 +10,18 @@ from typing import Annotated, Any
 from pydantic import PlainSerializer, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
-from coliags_plugin.config.registry import REGISTRIES
+from coliags_plugin.config.registry import REGISTRIES, Resolver
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
 
 
 @dataclass(frozen=True)
 class Component:
-    """One validated node of a method config.
+    """One validated node of a method config."""
 
-    Attributes:
-        kind: The registry's kind.
-        name: The name in that registry.
-        settings: Validated options.
-    """
-
-    kind: str
-    name: str
-    settings: Settings
+    kind: str  # of registry
+    name: str  # in that registry
+    settings: Settings  # validated options
 
     @property
     def target(self) -> Any:
@@ -38,9 +32,7 @@ class Component:
 def make_component(kind: str, node: object) -> Component:
     """Validate ``{"name": ..., options...}``, or a bare name, into a component.
 
-    Raises:
-        PydanticCustomError: The name is missing or unknown.
-        pydantic.ValidationError: An option is unknown or of the wrong type.
+    PydanticCustomError where the name is missing or unknown, ValidationError where an option is.
     """
     if isinstance(node, Component):
         return node
@@ -73,6 +65,27 @@ def named_component(kind: str, node: Mapping[str, object], asking: str) -> Compo
     except ValidationError as error:
         key, message, _ = first_error(error)
         raise InputError(f"{asking}: option '{key}' of '{node['name']}': {message}") from error
+
+
+def is_auto(kind: str, name: object) -> bool:
+    """Whether a name in a config stands for whichever component is resolved."""
+    return isinstance(name, str) and name in REGISTRIES[kind] and isinstance(REGISTRIES[kind].get(name), Resolver)
+
+
+def candidates(kind: str) -> list[str]:
+    """Names of the components of a kind that ``auto`` may stand for."""
+    return [name for name in REGISTRIES[kind] if not is_auto(kind, name)]
+
+
+def resolved(component: Component, choose: Callable[[], str]) -> Component:
+    """A component, or the one that ``auto`` stands for, as ``choose`` says, with the options that were set."""
+    return with_options(component, choose()) if is_auto(component.kind, component.name) else component
+
+
+def with_options(auto: Component, name: str) -> Component:
+    """A candidate of ``auto`` with the options that were set for that."""
+    options = auto.settings.model_dump(include=auto.settings.model_fields_set - {"prefer"})
+    return named_component(auto.kind, {"name": name, **options}, f"{REGISTRIES[auto.kind].noun} {auto.name}, prefer")
 
 
 def _dump(component: Component) -> dict[str, object]:

@@ -21,8 +21,7 @@ from coliags_plugin.config.components import (
     SamplerNode,
     StrategyNode,
 )
-from coliags_plugin.config.method_files import method_files
-from coliags_plugin.config.moved_options import with_moved_options
+from coliags_plugin.config.method_files import is_path, method_files
 from coliags_plugin.config.yaml_tree import (
     Node,
     dump,
@@ -36,6 +35,8 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
+#: Sections whose former options ``near`` and ``near_plane`` are ``near_plane`` of the method.
+_HAD_NEAR_PLANE = ("renderer", "field")
 #: Of the run, neither its start nor its end.
 Share = Annotated[float, Field(gt=0, lt=1)]
 
@@ -88,11 +89,9 @@ class MethodConfig(Settings):
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod
     def _null_removes(cls, entries: object) -> object:
-        return (
-            {key: value for key, value in entries.items() if value is not None}
-            if isinstance(entries, dict)
-            else entries
-        )
+        if not isinstance(entries, dict):
+            return entries
+        return {key: value for key, value in entries.items() if value is not None}
 
     @field_validator("modules")
     @classmethod
@@ -129,15 +128,10 @@ class LoadedMethod:
 
 
 def load_method(method: str, overrides: Iterable[str] = (), data_format: str | None = None) -> LoadedMethod:
-    """Resolve a method config.
+    """Resolve a method config by its name (``coliags``, ``ablations/imia``), or the path of a YAML file.
 
-    Args:
-        method: A name (``coliags``, ``ablations/imia``), or the path of a YAML file.
-        overrides: ``key.path=value`` assignments, applied last.
-        data_format: Name of a data manager that takes the place of the method's, with all its options; None: none does.
-
-    Raises:
-        InputError: No such method, or it is not valid; names file, line and key.
+    ``key.path=value`` overrides are applied last. A data format is the name of a data manager that takes the place of
+    the method's, with all its options.
     """
     tree = method_tree(method, overrides)
     if data_format is not None:
@@ -159,27 +153,19 @@ def _with_data_format(tree: Node, data_format: str) -> Node:
 
 def method_name(method: str) -> str:
     """Name of a method, or of its file without the suffix."""
-    return Path(method).stem if _is_path(method) else method
+    return Path(method).stem if is_path(method) else method
 
 
 def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
-    """Merged config tree of a method with overrides applied, before validation, each value with its origin.
-
-    Raises:
-        InputError: No such method, or a file of it is not YAML.
-    """
+    """Merged config tree of a method with overrides applied, before validation, each value with its origin."""
     tree = _resolve(_find(method, Path.cwd()), ())
     for assignment in overrides:
-        tree = merge(tree, with_moved_options(parse_assignment(assignment)))
+        tree = merge(tree, _with_moved_options(parse_assignment(assignment)))
     return tree
 
 
-def _is_path(method: str) -> bool:
-    return method.endswith((".yaml", ".yml"))
-
-
 def _find(method: str, folder: Path) -> Path:
-    if _is_path(method):
+    if is_path(method):
         path = folder / method
         if not path.is_file():
             raise InputError(f"no file {path}", "a method config", "See `coliags list methods`")
@@ -198,7 +184,7 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     if path in seen:
         chain = " -> ".join(p.name for p in (*seen, path))
         raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
-    tree = with_moved_options(read_tree(path))
+    tree = _with_moved_options(read_tree(path))
     base = tree.value.get("base")
     if base is None:
         return tree
@@ -208,6 +194,37 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     inherited = {key: node for key, node in parent.value.items() if key != "description"}
     own = {key: node for key, node in tree.value.items() if key != "base"}
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
+
+
+def _with_moved_options(tree: Node) -> Node:
+    """A method config, as written in one file or assignment, with its near planes at their present place.
+
+    See "Renamed options" in the changelog.
+    """
+    if not tree.is_mapping:
+        return tree
+    top = dict(tree.value)
+    planes = {"near_plane": top["near_plane"]} if "near_plane" in top else {}
+    for section in _HAD_NEAR_PLANE:
+        node = top.get(section)
+        if node is None or not node.is_mapping:
+            continue
+        own = {f"{section}.{key}": node.value[key] for key in ("near", "near_plane") if key in node.value}
+        if own:
+            kept = {key: child for key, child in node.value.items() if f"{section}.{key}" not in own}
+            top[section] = Node(kept, node.origin)
+            planes |= own
+    if len({plane.value for plane in planes.values()}) > 1:
+        listed = " and ".join(f"{key} {plane.value} ({plane.origin})" for key, plane in planes.items())
+        raise InputError(
+            f"{listed}: earlier versions had several near planes, of which one is left",
+            "one near_plane",
+            "Leave one of them, or write near_plane: LENGTH at the top level",
+        )
+    for plane in planes.values():
+        # Of the volume renderer, null left the start of rays to the field.
+        top["near_plane"] = Node(0.0, plane.origin) if plane.value is None else plane
+    return Node(top, tree.origin)
 
 
 def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
@@ -220,6 +237,5 @@ def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
             lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
         else:
             origin = node.origin if node is not None else "default"
-            text = dump_inline(value)
-            lines.append(f"{indent}{key}: {text}  # {origin}")
+            lines.append(f"{indent}{key}: {dump_inline(value)}  # {origin}")
     return lines

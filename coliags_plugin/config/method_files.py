@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +22,7 @@ def method_names() -> list[str]:
 
 
 def method_files() -> dict[str, Path]:
-    """Files of all methods by name.
-
-    Raises:
-        InputError: Another package's file is missing, or its name is taken.
-    """
+    """Files of all methods by name."""
     root = method_folder()
     paths = [path.relative_to(root) for path in root.rglob("*.yaml")]
     files = {path.with_suffix("").as_posix(): root / path for path in paths if path.parts[0] != BENCHMARKS}
@@ -47,13 +44,15 @@ def method_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "method_configs"
 
 
-def method_descriptions() -> dict[str, str]:
-    """One line on every method, by name."""
-    found = {}
-    for name, path in sorted(method_files().items()):
-        description = read_tree(path).value.get("description")
-        found[name] = str(description.value) if description is not None else ""
-    return found
+def is_path(name: str) -> bool:
+    """Whether this is the path of a YAML file, not a name."""
+    return name.endswith((".yaml", ".yml"))
+
+
+def descriptions(files: Mapping[str, Path]) -> dict[str, str]:
+    """The description, one line, of every file by name, sorted."""
+    found = {name: read_tree(path).value.get("description") for name, path in sorted(files.items())}
+    return {name: "" if text is None else str(text.value) for name, text in found.items()}
 
 
 def _file_in(package: str, name: str) -> Path:

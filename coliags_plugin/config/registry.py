@@ -145,19 +145,9 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
     return found
 
 
-#: All kinds by their names.
-REGISTRIES: dict[str, Registry] = {}
-
-
-def _built_in(kind: str, noun: str, targets: Mapping[str, object]) -> Registry:
-    REGISTRIES[kind] = Registry(kind, targets, noun)
-    return REGISTRIES[kind]
-
-
-datamanagers = _built_in(
-    "datamanagers",
-    "data manager",
-    {
+#: Built-in components by kind and noun.
+_BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
+    ("datamanagers", "data manager"): {
         "auto": Resolver(
             "coliags_plugin.datamanagers.scene_settings:SceneSettings",
             "Reader of any scene, by the one data manager that recognises its folder (docs/data.md 1).",
@@ -171,40 +161,24 @@ datamanagers = _built_in(
         "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",
         "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.reader:RotateColonDataManager",
     },
-)
-fields = _built_in(
-    "fields",
-    "field",
-    {
+    ("fields", "field"): {
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
         "lit-gaussians": "coliags_plugin.fields.lit_gaussians:LitGaussians",
         "surfels": "coliags_plugin.fields.explicit_gaussians:Surfels",
         "reim-nerf": "coliags_plugin.fields.reim_nerf:ReimNerf",
     },
-)
-geometry_heads = _built_in(
-    "geometry_heads",
-    "geometry head",
-    {
+    ("geometry_heads", "geometry head"): {
         "plain": "coliags_plugin.fields.geometry_heads:PlainGeometryHead",
         "imve": "coliags_plugin.fields.geometry_heads:IMVEGeometryHead",
     },
-)
-appearance_heads = _built_in(
-    "appearance_heads",
-    "appearance head",
-    {
+    ("appearance_heads", "appearance head"): {
         "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
         "imia-glints": "coliags_plugin.fields.appearance_heads:GlintAppearanceHead",
         "attenuated": "coliags_plugin.fields.attenuation:AttenuatedAppearanceHead",
     },
-)
-renderers = _built_in(
-    "renderers",
-    "renderer",
-    {
+    ("renderers", "renderer"): {
         "auto": Resolver(
             "coliags_plugin.renderers.splatting:AutoSettings",
             "First renderer of ``prefer`` that can render the field; a run records which it is and why.",
@@ -214,34 +188,21 @@ renderers = _built_in(
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
         "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",
     },
-)
-modules = _built_in(
-    "modules",
-    "view module",
-    {
+    ("modules", "view module"): {
         "gain": "coliags_plugin.modules.gain:FrameGain",
         "response": "coliags_plugin.modules.response:CameraResponse",
         "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
     },
-)
-samplers = _built_in(
-    "samplers",
-    "sampler",
-    {"frames": "coliags_plugin.engine.samplers:FrameSampler", "pixels": "coliags_plugin.engine.samplers:PixelSampler"},
-)
-strategies = _built_in(
-    "strategies",
-    "strategy",
-    {
+    ("samplers", "sampler"): {
+        "frames": "coliags_plugin.engine.samplers:FrameSampler",
+        "pixels": "coliags_plugin.engine.samplers:PixelSampler",
+    },
+    ("strategies", "strategy"): {
         "adaptive-density": "coliags_plugin.strategies.adaptive_density:AdaptiveDensity",
         "none": "coliags_plugin.strategies.none:NoStrategy",
         "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
     },
-)
-losses = _built_in(
-    "losses",
-    "loss",
-    {
+    ("losses", "loss"): {
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "mse": "coliags_plugin.losses.photometric:MSELoss",
@@ -259,11 +220,7 @@ losses = _built_in(
         "normal-consistency": "coliags_plugin.losses.regularization:NormalConsistencyLoss",
         "distortion": "coliags_plugin.losses.regularization:DistortionLoss",
     },
-)
-metrics = _built_in(
-    "metrics",
-    "metric",
-    {
+    ("metrics", "metric"): {
         "psnr": "coliags_plugin.metrics.image:PSNR",
         "ssim": "coliags_plugin.metrics.image:SSIM",
         "lpips": "coliags_plugin.metrics.lpips:LPIPS",
@@ -275,19 +232,11 @@ metrics = _built_in(
         "sparse_depth": "coliags_plugin.metrics.depth:SparseDepthError",
         "depth_abs_rel": "coliags_plugin.metrics.depth:DepthAbsRel",
     },
-)
-protocols = _built_in(
-    "protocols",
-    "protocol",
-    {
+    ("protocols", "protocol"): {
         "paper": "coliags_plugin.metrics.protocols:PaperProtocol",
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
-)
-pose_formats = _built_in(
-    "pose_formats",
-    "pose format",
-    {
+    ("pose_formats", "pose format"): {
         "c3vd": "coliags_plugin.geometry.poses.c3vd:FORMAT",
         "colmap": "coliags_plugin.geometry.poses.colmap:FORMAT",
         "colmap-text": "coliags_plugin.geometry.poses.colmap:TEXT_FORMAT",
@@ -296,11 +245,7 @@ pose_formats = _built_in(
         "nerfstudio": "coliags_plugin.geometry.poses.nerfstudio:FORMAT",
         "tum": "coliags_plugin.geometry.poses.tum:FORMAT",
     },
-)
-phantom_layouts = _built_in(
-    "phantom_layouts",
-    "phantom layout",
-    {
+    ("phantom_layouts", "phantom layout"): {
         "c3vd": "coliags_plugin.phantom.layouts.c3vd:C3VDLayout",
         "c3vd-raw": "coliags_plugin.phantom.layouts.c3vd:C3VDRawLayout",
         "c3vd-v2": "coliags_plugin.phantom.layouts.c3vd:C3VDv2Layout",
@@ -312,4 +257,17 @@ phantom_layouts = _built_in(
         "rgbd": "coliags_plugin.phantom.layouts.rgbd:RGBDLayout",
         "rotatecolon": "coliags_plugin.phantom.layouts.rotatecolon:RotateColonLayout",
     },
-)
+}
+#: All kinds by their names.
+REGISTRIES = {kind: Registry(kind, targets, noun) for (kind, noun), targets in _BUILT_INS.items()}
+datamanagers = REGISTRIES["datamanagers"]
+fields = REGISTRIES["fields"]
+renderers = REGISTRIES["renderers"]
+modules = REGISTRIES["modules"]
+samplers = REGISTRIES["samplers"]
+strategies = REGISTRIES["strategies"]
+losses = REGISTRIES["losses"]
+metrics = REGISTRIES["metrics"]
+protocols = REGISTRIES["protocols"]
+pose_formats = REGISTRIES["pose_formats"]
+phantom_layouts = REGISTRIES["phantom_layouts"]

@@ -18,15 +18,10 @@ from coliags_plugin.core.text_files import whole_text
 
 @dataclass(frozen=True)
 class Node:
-    """A value with its origin: a mapping of nodes, or a plain scalar or tuple.
+    """A value with its origin."""
 
-    Attributes:
-        value: The value.
-        origin: ``file:line``, or the command-line option that set it.
-    """
-
-    value: Any
-    origin: str
+    value: Any  # a mapping of nodes, or a plain scalar or tuple
+    origin: str  # ``file:line``, or the command-line option that set it
 
     @property
     def is_mapping(self) -> bool:
@@ -250,17 +245,9 @@ def dump_inline(plain: object) -> str:
 
 def _dumped(plain: object, flow: bool | None, width: float) -> str:
     text: str = yaml.dump(
-        _lists(plain), Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=width
+        plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=width
     )
     return text
-
-
-def _lists(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _lists(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_lists(item) for item in value]
-    return value
 
 
 #: Errors of this package, with messages of their own.

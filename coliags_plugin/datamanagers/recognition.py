@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.auto import candidates
+from coliags_plugin.config.components import candidates
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.files import inventory
 

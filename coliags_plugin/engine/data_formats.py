@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.auto import is_auto, resolved
-from coliags_plugin.config.components import Component, make_component
+from coliags_plugin.config.components import Component, is_auto, make_component, resolved
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager

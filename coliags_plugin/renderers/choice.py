@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.auto import candidates, is_auto, with_options
-from coliags_plugin.config.components import Component
+from coliags_plugin.config.components import Component, candidates, is_auto, with_options
 from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 

@@ -28,12 +28,11 @@ BySeed = Mapping[str, Mapping[int, float]]
 class Spread:
     """Mean and spread of a method's metric.
 
-    Attributes:
-        over_seeds: Root mean square, over the scenes with two seeds or more, of the standard deviation (n - 1) over the
-            seeds of a scene; None where there is no such scene.
+    That over seeds is the root mean square, over the scenes with two seeds or more, of the standard deviation (n - 1)
+    over the seeds of a scene; None where there is no such scene.
     """
 
-    mean: float  # mean over scenes of the means over seeds
+    mean: float | None  # mean over scenes of the means over seeds; None without a scene
     over_scenes: float | None  # standard deviation (n - 1) of these means; None for a single scene
     over_seeds: float | None
     scenes: int
@@ -45,11 +44,11 @@ def scene_means(values: BySeed) -> dict[str, float]:
 
 
 def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
-    """Mean and spread over one or more scenes that all have a value."""
+    """Mean and spread over scenes that all have a value."""
     means = [float(np.mean([*values[scene].values()])) for scene in scenes]
     variances = [np.var([*values[scene].values()], ddof=1) for scene in scenes if len(values[scene]) > 1]
     return Spread(
-        mean=float(np.mean(means)),
+        mean=float(np.mean(means)) if means else None,
         over_scenes=float(np.std(means, ddof=1)) if len(means) > 1 else None,
         over_seeds=float(np.sqrt(np.mean(variances))) if variances else None,
         scenes=len(means),

@@ -14,10 +14,8 @@ from coliags_plugin.results.record import SetRecord
 
 #: Keys of a method config that do not change a trained model; the protocol has a place of its own in a result's key.
 _IGNORED = ("description", "protocol")
-#: Likewise of its data manager: what it allows to be read.
-_IGNORED_OF_DATA = ("outside_files",)
-#: Likewise of its schedule.
-_IGNORED_OF_SCHEDULE = ("log_every", "checkpoint_every")
+#: Likewise of its data manager, what it allows to be read, and of its schedule.
+_IGNORED_WITHIN = {"datamanager": ("outside_files",), "schedule": ("log_every", "checkpoint_every")}
 
 
 class ArraysHash:
@@ -63,12 +61,9 @@ def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
 def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a resolved method config that determine the trained model, as data of standard JSON."""
     relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
-    data = relevant.get("datamanager")
-    if isinstance(data, Mapping):
-        relevant["datamanager"] = {name: value for name, value in data.items() if name not in _IGNORED_OF_DATA}
-    schedule = relevant.get("schedule")
-    if isinstance(schedule, Mapping):
-        relevant["schedule"] = {name: value for name, value in schedule.items() if name not in _IGNORED_OF_SCHEDULE}
+    for section, ignored in _IGNORED_WITHIN.items():
+        if isinstance(relevant.get(section), Mapping):
+            relevant[section] = {name: value for name, value in relevant[section].items() if name not in ignored}
     return relevant
 
 

@@ -46,21 +46,13 @@ class ProtocolRecord(_Part):
 
 
 class SceneRecord(_Part):
-    """Data of a run.
-
-    Attributes:
-        name: Of the scene.
-        fingerprint: Hash of its files.
-        split: Name of the split.
-        train: Names of the training frames.
-        size: Width and height of the evaluated images, px.
-    """
+    """Data of a run."""
 
     name: str
-    fingerprint: str
-    split: str
-    train: tuple[str, ...]
-    size: tuple[int, int]
+    fingerprint: str  # hash of its files
+    split: str  # its name
+    train: tuple[str, ...]  # names of the training frames
+    size: tuple[int, int]  # width and height of the evaluated images, px
 
 
 class MetricRecord(_Part):
@@ -73,20 +65,14 @@ class MetricRecord(_Part):
 class ProfileRecord(_Part):
     """Errors of a test set by a property of the pixel: distance to the camera, or angle to the optical axis.
 
-    Attributes:
-        unit: Of the edges: ``mm`` or ``degrees``.
-        edges: Of the bins, ascending. [B + 1]
-        pixels: Pixels with known depth in each bin. [B]
-        rgb_mse: Mean squared colour error of those pixels, colours in [0, 1]; None where there are none, or where a
-            rendered one is not finite. [B]
-        depth_mse: Mean squared depth error of those pixels, mm^2; None likewise. [B]
+    Errors of a bin are None where it has no pixels, or where a rendered one is not finite.
     """
 
-    unit: str
-    edges: tuple[float, ...]
-    pixels: tuple[int, ...]
-    rgb_mse: tuple[float | None, ...]
-    depth_mse: tuple[float | None, ...]
+    unit: str  # of the edges: mm or degrees
+    edges: tuple[float, ...]  # of the bins, ascending. [B + 1]
+    pixels: tuple[int, ...]  # with known depth in each bin. [B]
+    rgb_mse: tuple[float | None, ...]  # mean squared colour error of those pixels, colours in [0, 1]. [B]
+    depth_mse: tuple[float | None, ...]  # mean squared depth error of those pixels, mm^2. [B]
 
     @model_validator(mode="after")
     def _one_number_per_bin(self) -> Self:
@@ -98,26 +84,15 @@ class ProfileRecord(_Part):
 
 
 class SetRecord(_Part):
-    """Evaluation of one test set.
+    """Evaluation of one test set."""
 
-    Attributes:
-        frames: Names, in video order. [F]
-        values: Raw values by metric, None where a frame has none. [F] each
-        reasons: Why values are missing, by metric.
-        predictions_sha256: Hash of the images and depths as rendered.
-        truth_sha256: Hash of those that they were compared with.
-        profiles: By property: ``distance``, ``angle``; empty without true depth.
-        transparent: Share of the pixels within the masks whose alpha is below 0.5, so that their depth means little;
-            None where it was not measured.
-    """
-
-    frames: tuple[str, ...]
-    values: dict[str, tuple[float | None, ...]]
-    reasons: dict[str, str] = {}
-    predictions_sha256: str
-    truth_sha256: str
-    profiles: dict[str, ProfileRecord] = {}
-    transparent: float | None = None
+    frames: tuple[str, ...]  # names, in video order. [F]
+    values: dict[str, tuple[float | None, ...]]  # raw values by metric, None where a frame has none. [F] each
+    reasons: dict[str, str] = {}  # why values are missing, by metric
+    predictions_sha256: str  # hash of the images and depths as rendered
+    truth_sha256: str  # hash of those that they were compared with
+    profiles: dict[str, ProfileRecord] = {}  # by property: distance, angle; empty without true depth
+    transparent: float | None = None  # share of the pixels within the masks with alpha below 0.5; None: not measured
 
     @model_validator(mode="after")
     def _one_value_per_frame(self) -> Self:
@@ -146,67 +121,40 @@ class SetRecord(_Part):
 class CostRecord(_Part):
     """What a run cost; comparable between runs on one device only. None: not measured.
 
-    Attributes:
-        device: Name of the processor or GPU it was trained on.
-        threads: CPU threads it was given.
-        train_seconds: Time of training, all resumptions together, without reading data and evaluation. Steps that a
-            kill made necessary twice count once.
-        processor_seconds: CPU time of the same, all threads together.
-        peak_memory_mib: Largest resident memory of the training process, or allocated memory of the GPU.
-        render_fps: Views of the test sets rendered in a second, at their size: 1 / the median time of a view, the
-            first one apart.
-        render_device: Name of the processor or GPU that rendered them.
-        render_threads: CPU threads that rendering was given.
-        gaussians: Mean number of Gaussians drawn in a test view; None for radiance fields.
-        checkpoint_bytes: Size of the last checkpoint.
-        seconds_to_psnr: Training seconds after which the logged PSNR, smoothed, first reached a mark in dB.
+    Times of training are of all resumptions together, without reading data and evaluation. Steps that a kill made
+    necessary twice count once.
     """
 
-    device: str
-    threads: int | None = None
+    device: str  # name of the processor or GPU it was trained on
+    threads: int | None = None  # CPU threads it was given
     train_seconds: float | None = None
-    processor_seconds: float | None = None
-    peak_memory_mib: float | None = None
-    render_fps: float | None = None
-    render_device: str | None = None
-    render_threads: int | None = None
-    gaussians: float | None = None
-    checkpoint_bytes: int | None = None
-    seconds_to_psnr: dict[str, float | None] = {}
+    processor_seconds: float | None = None  # CPU time of training, all threads together
+    peak_memory_mib: float | None = None  # resident memory of the training process, or allocated memory of the GPU
+    render_fps: float | None = None  # 1 / the median time of a test view at its size, the first one apart
+    render_device: str | None = None  # name of the processor or GPU that rendered the test views
+    render_threads: int | None = None  # CPU threads that rendering was given
+    gaussians: float | None = None  # mean number drawn in a test view; None for radiance fields
+    checkpoint_bytes: int | None = None  # size of the last checkpoint
+    seconds_to_psnr: dict[str, float | None] = {}  # training time until the logged PSNR, smoothed, reached a mark, dB
 
 
 class Result(_Part):
-    """One run, evaluated under one protocol.
-
-    Attributes:
-        format: Marks the file.
-        version: Of the schema.
-        key: Hash of everything that determines the result; see :mod:`coliags_plugin.results.hashing`.
-        metrics: Metrics by name, in the protocol's order; then those over seen pixels, ``<name>_seen``.
-        metrics_sha256: Hash of the raw values of all test sets.
-        steps: Training steps taken.
-        seed: Of all random generators of the run.
-        config: The resolved method config.
-        sets: Test sets by name; ``test`` is the split's own.
-        cost: What the run cost.
-        software: Versions of package, Python and libraries.
-        provenance: Further provenance of the run.
-    """
+    """One run, evaluated under one protocol."""
 
     format: Format = FORMAT
-    version: int = VERSION
-    key: str
+    version: int = VERSION  # of the schema
+    key: str  # hash of everything that determines the result, see results.hashing
     method: str
     scene: SceneRecord
     protocol: ProtocolRecord
-    seed: int
-    steps: int
-    metrics: dict[str, MetricRecord]
-    sets: dict[str, SetRecord]
-    metrics_sha256: str
+    seed: int  # of all random generators of the run
+    steps: int  # training steps taken
+    metrics: dict[str, MetricRecord]  # in the protocol's order; then those over seen pixels, <name>_seen
+    sets: dict[str, SetRecord]  # by name; ``test`` is the split's own
+    metrics_sha256: str  # hash of the raw values of all test sets
     cost: CostRecord
-    config: dict[str, Any]
-    software: dict[str, Any]
+    config: dict[str, Any]  # the resolved method config
+    software: dict[str, Any]  # versions of package, Python and libraries
     provenance: dict[str, Any] = {}
 
     @model_validator(mode="after")
@@ -225,11 +173,7 @@ class Result(_Part):
         return MAIN_SET if MAIN_SET in self.sets else next(iter(self.sets))
 
     def mean(self, metric: str, set_name: str | None = None) -> float | None:
-        """Mean of a metric over the frames of a test set that have it; None where none has.
-
-        Args:
-            metric: Its name.
-            set_name: Name of the test set; None: the main one.
+        """Mean of a metric over the frames of a test set, the main one by default, that have it; None where none has.
 
         Raises:
             InputError: There is no such metric or test set.

@@ -10,8 +10,8 @@ from collections import namedtuple
 
 import pytest
 
-from coliags_plugin.comparison.cells import Variant
 from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.tasks import TaskOutcome
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.evaluator import evaluate

@@ -8,18 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.comparison.ablations import ABLATIONS, load_ablation
-from coliags_plugin.comparison.benchmarks import load_benchmark
-from coliags_plugin.comparison.named_files import descriptions, shipped
+from coliags_plugin.comparison.named_files import ABLATIONS, load_ablation, load_benchmark, shipped
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.config.method_files import descriptions
 from coliags_plugin.core.errors import InputError
 
 
 @pytest.mark.parametrize("name", shipped())
 def test_every_shipped_benchmark_is_valid_and_described(name):
     benchmark = load_benchmark(name)
-    assert descriptions()[name] == benchmark.settings.description != ""
+    assert descriptions(shipped())[name] == benchmark.settings.description != ""
     for scene, entry in benchmark.settings.scenes.items():
         name_of_format = entry.format or benchmark.settings.format
         config = load_method("coliags", benchmark.overrides(scene), name_of_format).config
@@ -96,7 +95,7 @@ def test_an_unknown_name_says_which_was_meant():
 
 @pytest.mark.parametrize("name", shipped(ABLATIONS))
 def test_every_shipped_ablation_is_valid_and_described(name):
-    assert descriptions(ABLATIONS)[name]
+    assert descriptions(shipped(ABLATIONS))[name]
     for variant in load_ablation(name):
         assert load_method(variant.method, variant.overrides).config
 

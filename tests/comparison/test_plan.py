@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.comparison.cells import Variant, file_name
 from coliags_plugin.comparison.compare import make_request
+from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
+from coliags_plugin.comparison.plan_file import file_name
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager

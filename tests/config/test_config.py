@@ -7,7 +7,7 @@ import yaml
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import method_descriptions, method_folder, method_names
+from coliags_plugin.config.method_files import descriptions, method_files, method_folder, method_names
 from coliags_plugin.config.yaml_tree import parse_tree, parse_value
 from coliags_plugin.core.errors import InputError
 
@@ -24,7 +24,7 @@ def method_file(tmp_path):
 
 @pytest.mark.parametrize("name", method_names())
 def test_every_shipped_method_is_described(name):
-    assert method_descriptions()[name]
+    assert descriptions(method_files())[name]
 
 
 def test_benchmarks_are_no_methods():

@@ -151,13 +151,13 @@ def _method(folder: Path) -> None:
 
 
 def _benchmark(folder: Path) -> None:
-    from coliags_plugin.comparison.benchmarks import load_benchmark
+    from coliags_plugin.comparison.named_files import load_benchmark
 
     load_benchmark(str(folder / "benchmark.yaml"))
 
 
 def _ablation(folder: Path) -> None:
-    from coliags_plugin.comparison.ablations import load_ablation
+    from coliags_plugin.comparison.named_files import load_ablation
 
     load_ablation(str(folder / "ablation.yaml"))
 

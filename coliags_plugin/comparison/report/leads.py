@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from itertools import starmap
 
 from coliags_plugin.comparison.report.metric_columns import metric_columns
-from coliags_plugin.comparison.report.metric_tables import shared_scenes
+from coliags_plugin.comparison.report.metric_tables import shared_scenes, spreads
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
-from coliags_plugin.results.comparisons import LEVELS, PairedTests, RivalComparison, compare_with_rivals, spread
+from coliags_plugin.results.comparisons import LEVELS, PairedTests, RivalComparison, compare_with_rivals
 from coliags_plugin.results.paired import FEWEST_SCENES, RESAMPLES, smallest_p
 
 #: The reference where it is among the methods.
@@ -52,8 +52,8 @@ def _best_method(part: Part) -> str:
     """The method that is best by the first metric; the first one where none has a value."""
     column = metric_columns(part)[0]
     values = part.values(column.key)
-    shared = shared_scenes(values)
-    means = {method: spread(by_scene, shared).mean for method, by_scene in values.items() if by_scene and shared}
+    found = dict(zip(values, spreads(values, shared_scenes(values)), strict=True))
+    means = {method: own.mean for method, own in found.items() if own.mean is not None}
     sign = 1.0 if column.direction == "higher" else -1.0
     return max(means, key=lambda method: sign * means[method]) if means else part.study.methods[0]
 

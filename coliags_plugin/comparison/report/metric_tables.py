@@ -10,7 +10,7 @@ from coliags_plugin.comparison.report.published import PublishedBenchmark
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.reporting.model import Column, Table, TableCell, ranked_cells
 from coliags_plugin.reporting.numbers import counted
-from coliags_plugin.results.comparisons import LEVELS, BySeed, RivalComparison, common_scenes, spread
+from coliags_plugin.results.comparisons import LEVELS, BySeed, RivalComparison, Spread, common_scenes, spread
 
 #: Labels the rows.
 METHOD = Column("method", "Method", words=True)
@@ -30,6 +30,11 @@ def method_rows(
 def shared_scenes(values: Mapping[str, BySeed]) -> list[str]:
     """Scenes that every method with a value has; a method without any does not count."""
     return common_scenes([by_scene for by_scene in values.values() if by_scene])
+
+
+def spreads(values: Mapping[str, BySeed], scenes: Sequence[str]) -> list[Spread]:
+    """Mean and spread of every method over scenes; of one without any value, None."""
+    return [spread(by_scene, scenes if by_scene else ()) for by_scene in values.values()]
 
 
 def summary_table(
@@ -67,13 +72,9 @@ def summary_table(
 def _summary_cells(part: Part, column: Column, compared: Sequence[RivalComparison]) -> list[TableCell]:
     values = part.values(column.key)
     shared = shared_scenes(values)
-    spreads = [spread(by_scene, shared) if by_scene and shared else None for by_scene in values.values()]
-    cells = ranked_cells(
-        [None if own is None else own.mean for own in spreads],
-        column.unit,
-        column.direction,
-        [None if own is None else own.over_scenes if own.scenes > 1 else own.over_seeds for own in spreads],
-    )
+    found = spreads(values, shared)
+    over = [own.over_scenes if own.scenes > 1 else own.over_seeds for own in found]
+    cells = ranked_cells([own.mean for own in found], column.unit, column.direction, over)
     stars = {row.rival: row.stars for row in compared}
     return [
         replace(cell, stars=stars.get(method, ""), note=_summary_note(part, column, method, values[method], shared))
@@ -101,10 +102,8 @@ def scene_table(part: Part, columns: Sequence[Column], scene: str) -> Table:
 
 
 def _scene_cells(part: Part, column: Column, scene: str) -> list[TableCell]:
-    by_seed = [values.get(scene, {}) for values in part.values(column.key).values()]
-    spreads = [spread({scene: own}, [scene]) if own else None for own in by_seed]
-    means = [None if own is None else own.mean for own in spreads]
-    over_seeds = [None if own is None else own.over_seeds for own in spreads]
+    found = [spread(values, [scene] if scene in values else []) for values in part.values(column.key).values()]
+    means, over_seeds = [own.mean for own in found], [own.over_seeds for own in found]
     cells = ranked_cells(means, column.unit, column.direction, over_seeds)
     return [
         replace(cell, note=_scene_note(part, column, method, scene, cell.value))
@@ -117,9 +116,8 @@ def seed_table(part: Part, columns: Sequence[Column]) -> Table | None:
     cells = []
     for column in columns:
         values = part.values(column.key)
-        shared = shared_scenes(values)
-        spreads = [spread(by_scene, shared).over_seeds if by_scene and shared else None for by_scene in values.values()]
-        cells.append(ranked_cells(spreads, column.unit, None))
+        over_seeds = [own.over_seeds for own in spreads(values, shared_scenes(values))]
+        cells.append(ranked_cells(over_seeds, column.unit, None))
     if not any(cell.text for own in cells for cell in own):
         return None
     counts = {method: max(len(part.runs(scene, method)) for scene in part.scenes) for method in part.study.methods}

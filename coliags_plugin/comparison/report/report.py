@@ -23,29 +23,19 @@ SUFFIXES: dict[Format, str] = {"html": ".html", "markdown": ".md", "latex": ".te
 
 
 def write_report(
-    paths: Sequence[Path],
+    paths: Sequence[Path],  # run folders, results files, and folders of a comparison
     output: Path,
     formats: Sequence[Format] = ("html",),
     choices: Choices | None = None,
-    protocol: str = "paper",
-    methods: Sequence[str] = (),
-    scene: Section | None = None,
-    anonymous: bool = False,
+    protocol: str = "paper",  # name of the evaluation to read from folders
+    methods: Sequence[str] = (),  # to show, in this order; empty: all
+    scene: Section | None = None,  # a scene to fly through, of the HTML page alone
+    anonymous: bool = False,  # without absolute paths that results hold
 ) -> list[Path]:
     """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
 
-    Args:
-        paths: Run folders, results files, and folders of a comparison.
-        output: The file to write, replaced if it is there; with several formats, its suffix is that of each.
-        formats: What to write. CSV has every metric of every frame, JSON the tables.
-        choices: Columns, reference, title, note and number of views.
-        protocol: Name of the evaluation to read from folders.
-        methods: Names of methods to show, in this order; empty: all.
-        scene: Section with a scene to fly through, of the HTML page alone.
-        anonymous: Leave out absolute paths that results hold.
-
-    Returns:
-        The files.
+    Returns the files: the output, replaced if it is there, or that with the suffix of each of several formats. CSV has
+    every metric of every frame, JSON the tables.
     """
     choices = choices or Choices()
     files = {
