@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.arrays import read_arrays
@@ -35,7 +34,7 @@ def fuse_depth(
     docs/methods.md 6).
     """
     # Two passes over the frames, since the pixels of a long video may not fit into memory.
-    available = np.array(parallel_map(_count_usable, frames, "count depth pixels", progress))
+    available = np.array(parallel_map(lambda frame: len(_usable(frame)), frames, "count depth pixels", progress))
     if available.sum() == 0:
         raise InputError(
             f"none of the {len(frames)} training frames has a valid depth",
@@ -54,12 +53,9 @@ def fuse_depth(
     return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))
 
 
-def _count_usable(frame: Frame) -> int:
-    return len(_usable(frame.depth, frame.mask, frame.depth_confidence))
-
-
-def _usable(depth: Tensor | None, mask: Tensor | None, confidence: Tensor | None) -> np.ndarray:
+def _usable(frame: Frame) -> np.ndarray:
     """Flat indices of unmasked pixels with known depth, if possible of those that are trusted."""
+    depth, mask, confidence = frame.depth, frame.mask, frame.depth_confidence
     if depth is None:
         return np.zeros(0, np.int64)
     known = np.isfinite(depth.numpy())
@@ -75,7 +71,7 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     frame, chosen = wanted[0].to("cpu"), wanted[1]
     if frame.depth is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    pixels = _usable(frame.depth, frame.mask, frame.depth_confidence)[chosen]
+    pixels = _usable(frame)[chosen]
     camera = frame.camera
     row, column = np.divmod(pixels, camera.width)
     z = frame.depth.numpy().ravel()[pixels].astype(np.float64)

@@ -18,12 +18,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
+from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
-from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_in_parallel
+from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.datamanagers.units import read_unit
 
 log = logging.getLogger(__name__)
@@ -91,17 +92,16 @@ class RecordedDataManager(DataManager):
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
-            read_in_parallel([*video, *others], progress)
+            parallel_map(lambda frame: frame.image.numel(), [*video, *others], "read images", progress)
         points, described = self._initial_points(recording, path, train, progress)
-        split: dict[str, Any] = {
+        split = {
             "name": settings.split,
             "frame_step": settings.frame_step,
             "max_frames": settings.max_frames,
+            **({"block": list(settings.block)} if settings.split == "block" else {}),
+            "train": [frame.name for frame in train],
+            "test_sets": {name: [frame.name for frame in frames] for name, frames in test_sets.items()},
         }
-        if settings.split == "block":
-            split["block"] = list(settings.block)
-        split["train"] = [frame.name for frame in train]
-        split["test_sets"] = {name: [frame.name for frame in frames] for name, frames in test_sets.items()}
         provenance = {
             "dataset": self.name,
             "path": str(path.resolve()),

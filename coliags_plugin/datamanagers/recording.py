@@ -20,31 +20,18 @@ from coliags_plugin.datamanagers.rectification import Rectification
 
 @dataclass(frozen=True)
 class Shot:
-    """Files, pose and camera of one frame on disk.
+    """Files, pose and camera of one frame on disk; mask files are of the image's size."""
 
-    Attributes:
-        name: Unique within the recording.
-        image: The image file.
-        rectification: Mapping from the stored to the working image; shared by images of the same camera.
-        camera_to_world: Rigid, OpenCV axes, scene units. [4, 4]
-        depth: Depth file.
-        depth_format: Format of the depth file.
-        mask: Mask file of the image's size; black pixels are ignored.
-        seen: Mask file of the image's size; not black where training frames see the same surface.
-        sparse_depth: Depth at single points of the working image.
-        confidence: 8-bit grey image of the depth file's size: how far estimated depth can be trusted, 255 = 1.
-    """
-
-    name: str
+    name: str  # unique within the recording
     image: Path
-    rectification: Rectification
-    camera_to_world: Float[np.ndarray, "4 4"]
+    rectification: Rectification  # from the stored to the working image; shared by images of the same camera
+    camera_to_world: Float[np.ndarray, "4 4"]  # rigid, OpenCV axes, scene units
     depth: Path | None = None
     depth_format: DepthFormat | None = None
-    mask: Path | None = None
-    seen: Path | None = None
-    sparse_depth: SparseDepth | None = None
-    confidence: Path | None = None
+    mask: Path | None = None  # black pixels are ignored
+    seen: Path | None = None  # not black where training frames see the same surface
+    sparse_depth: SparseDepth | None = None  # at single points of the working image
+    confidence: Path | None = None  # 8-bit grey, of the depth file's size: how far depth can be trusted, 255 = 1
 
 
 def make_shots(
@@ -67,27 +54,16 @@ def make_shots(
 
 @dataclass(frozen=True)
 class Recording:
-    """A posed video on disk.
+    """A posed video on disk."""
 
-    Attributes:
-        kind: Dataset and layout, for the log.
-        shots: Frames in video order.
-        facts: Provenance: layout, lens, sizes, pose convention and so on.
-        fingerprint: Hash of the files; see :func:`fingerprint`.
-        test_sets: The dataset's separate test sets, by name.
-        own_split: The dataset's split as indices into ``shots``, ``{"train": ..., "test": ...}``.
-        own_points: Reads the dataset's initial points; None where there are none.
-        points_source: The file or folder of these points.
-    """
-
-    kind: str
-    shots: Sequence[Shot]
-    facts: Mapping[str, Any]
-    fingerprint: str
-    test_sets: Mapping[str, Sequence[Shot]] = field(default_factory=dict)
-    own_split: Mapping[str, Sequence[int]] | None = None
-    own_points: Callable[[], PointCloud] | None = None
-    points_source: Path | None = None
+    kind: str  # dataset and layout, for the log
+    shots: Sequence[Shot]  # frames in video order
+    facts: Mapping[str, Any]  # provenance: layout, lens, sizes, pose convention and so on
+    fingerprint: str  # hash of the files; see :func:`fingerprint`
+    test_sets: Mapping[str, Sequence[Shot]] = field(default_factory=dict)  # the dataset's separate ones, by name
+    own_split: Mapping[str, Sequence[int]] | None = None  # the dataset's: "train" and "test" indices into ``shots``
+    own_points: Callable[[], PointCloud] | None = None  # reads the dataset's initial points; None where there are none
+    points_source: Path | None = None  # the file or folder of these points
 
 
 #: Bytes read at once.

@@ -47,24 +47,15 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
 
 @dataclass(frozen=True)
 class Rectification:
-    """Rectification of the stored images of one camera to its working images.
+    """Rectification of the stored images of one camera to its working images."""
 
-    Attributes:
-        source_width, source_height: Size of the stored images, pixels.
-        pinhole: The camera of the working images.
-        described_by: The file with the size of the stored images, for errors.
-        lens: Lens of the stored images; None for pinhole images.
-        undistortion: Makes the undistortion of images taken through a lens, or returns the one that is kept.
-        stored_content: Stored pixels with image content; None where all have. [H, W]
-    """
-
-    source_width: int
+    source_width: int  # of the stored images, pixels
     source_height: int
-    pinhole: Intrinsics
-    described_by: Path
-    lens: Lens | None = None
-    undistortion: Callable[[], Undistortion] | None = None
-    stored_content: Bool[np.ndarray, "H W"] | None = None
+    pinhole: Intrinsics  # of the working images
+    described_by: Path  # the file with the size of the stored images, for errors
+    lens: Lens | None = None  # of the stored images; None for pinhole images
+    undistortion: Callable[[], Undistortion] | None = None  # for a lens: makes it, or returns the one that is kept
+    stored_content: Bool[np.ndarray, "H W"] | None = None  # stored pixels with image content; None where all have
 
     @classmethod
     def through(
@@ -77,12 +68,8 @@ class Rectification:
     ) -> Rectification:
         """The rectification of images taken through a lens: undistorted to its nominal pinhole.
 
-        Args:
-            lens: Of the stored images, at their size.
-            described_by: The file that describes the lens or its size.
-            size: Working width and height, pixels.
-            focal_scale: Factor on the nominal focal length.
-            shows: Stored pixels with image content; None for all.
+        ``lens`` is at the size of the stored images, which ``described_by`` states; ``size`` is the working width and
+        height, pixels; ``focal_scale`` a factor on the nominal focal length; ``shows`` the pixels with image content.
         """
         pinhole = undistorted_camera(lens, size, focal_scale)
         undistortion = Undistortion(lens, pinhole, shows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,12 +45,7 @@ def with_valid_seen_masks(
 ) -> Recording:
     """Keep the seen masks of test frames if the run trains on the frames they were made for, else drop all.
 
-    Args:
-        recording: Recording with all masks.
-        split: Split whose training frames the masks refer to, applied to all frames.
-        train: Indices of the run's training frames.
-        test: Indices of the run's test frames in the video.
-        path: The scene, for the log.
+    ``split`` of all frames is what the masks refer to; ``train`` and ``test`` are indices of the run's frames.
     """
     meant, _ = divide(split, range(len(recording.shots)), recording.own_split)
     trained = set(train)
@@ -65,15 +60,8 @@ def with_valid_seen_masks(
             path,
             split,
         )
-    return replace(
-        recording,
-        shots=_all_without_seen(recording.shots),
-        test_sets={name: _all_without_seen(shots) for name, shots in recording.test_sets.items()},
-    )
-
-
-def _all_without_seen(shots: Sequence[Shot]) -> list[Shot]:
-    return [_without_seen(shot) for shot in shots]
+    test_sets = {name: [*map(_without_seen, shots)] for name, shots in recording.test_sets.items()}
+    return replace(recording, shots=[*map(_without_seen, recording.shots)], test_sets=test_sets)
 
 
 def _without_seen(shot: Shot) -> Shot:

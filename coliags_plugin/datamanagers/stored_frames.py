@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +12,8 @@ from torch import Tensor
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
-from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.recording import Shot
 
 
@@ -34,13 +31,8 @@ class _Pixels:
 class StoredFrame(Frame):
     """A lazily read frame, cached in the stored data types: 5 bytes per pixel with 16-bit depth.
 
-    Thread-safe. Pixel attributes raise InputError if a file is damaged or has the wrong format or size.
-
-    Args:
-        shot: Files, pose and camera of the frame.
-        index: Index of the frame in the video, from 0.
-        keep: Whether to cache pixels. Otherwise every attribute access reads its file; use :meth:`to` to get several
-            attributes at once.
+    Thread-safe. Pixel attributes raise InputError if a file is damaged or has the wrong format or size. Without
+    ``keep``, every attribute access reads its file; use :meth:`to` to get several attributes at once.
     """
 
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
@@ -145,11 +137,6 @@ class StoredFrame(Frame):
     _shot: Shot
     _keep: bool
     _pixels: _Pixels | None
-
-
-def read_in_parallel(frames: Sequence[Frame], progress: Progress | None = None) -> None:
-    """Read the pixels of frames into their caches, in parallel."""
-    parallel_map(lambda frame: frame.image.numel(), frames, "read images", progress)
 
 
 def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:

@@ -13,6 +13,7 @@ from coliags_plugin.reporting.numbers import Direction, column_decimals, number_
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import UInt8
+    from torch import Tensor
 
     from coliags_plugin.outputs.charts import Series
     from coliags_plugin.outputs.colormaps import ColorMap
@@ -174,7 +175,7 @@ class EncodedImage:
     height: int  # px
 
     @classmethod
-    def png(cls, rgb: UInt8[np.ndarray, "H W 3"]) -> EncodedImage:
+    def png(cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> EncodedImage:
         """Colours as a PNG."""
         from coliags_plugin.outputs.image_files import encode_png
 

@@ -16,7 +16,7 @@ from coliags_plugin.checks.data.hypotheses import CHANGES
 from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, match
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale, Pair, agreement, best_scale
 from coliags_plugin.core.anonymity import without_places
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 
 #: Largest number of frame pairs.
@@ -82,9 +82,7 @@ def check_scene(
     agreements: dict[str, Agreement] = {}
     matches: dict[str, EpipolarAgreement] = {}
     if with_depth:
-        for done, name in enumerate(CHANGES):
-            if progress is not None:
-                progress("compare frames", done, len(CHANGES))
+        for name in with_progress(list(CHANGES), "compare frames", progress):
             agreements[name] = agreement(with_depth, name)
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
@@ -94,8 +92,6 @@ def check_scene(
         errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
         matches = {name: error for name, error in errors.items() if error is not None}
     scale = best_scale(with_depth) if with_depth else None
-    if progress is not None:
-        progress("compare frames", len(CHANGES), len(CHANGES))
     depth, path = facts.depth_facts(sample), facts.path_facts(video)
     images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
     findings = [

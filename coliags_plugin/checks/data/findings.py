@@ -237,12 +237,10 @@ def image_findings(images: ImageFacts) -> Iterator[Finding]:
             "Check the meaning of the mask: black is ignored here",
         )
     if images.repeated:
-        count = len(images.repeated)
+        others = len(images.repeated) - 1
         yield Finding(
             "images repeat",
-            f"{images.repeated[0]}"
-            + (f" and {count - 1} more equal" if count > 1 else " equals")
-            + " the image before",
+            f"{images.repeated[0]}{f' and {others} more equal' if others else ' equals'} the image before",
             "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
             "endoscope's",
         )

@@ -22,23 +22,13 @@ def _transposed(pose: Tensor) -> Tensor:
     return turned
 
 
-def _opposite_translation(pose: Tensor) -> Tensor:
-    moved = pose.clone()
-    moved[:3, 3] = -pose[:3, 3]
-    return moved
-
-
-def _flipped(pose: Tensor) -> Tensor:
-    return pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0])
-
-
 CHANGES: dict[str, Change] = {
     GIVEN: lambda pose: pose,
     NO_MOTION: lambda pose: torch.eye(4, dtype=pose.dtype),
     "world-to-camera": torch.linalg.inv,
     "rotation transposed": _transposed,
-    "translation of opposite sign": _opposite_translation,
-    "camera axes y up, z backward": _flipped,
+    "translation of opposite sign": lambda pose: pose * pose.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4]),
+    "camera axes y up, z backward": lambda pose: pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0]),
 }
 
 #: Advice where a hypothesis fits.

@@ -15,8 +15,9 @@ from coliags_plugin.checks.data.reprojection import warp_image
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
+from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.reporting import model
-from coliags_plugin.reporting.numbers import counted, sentence
+from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
 #: Number of pairs shown.
 _SHOWN = 3
@@ -24,12 +25,13 @@ _SHOWN = 3
 
 def check_page(check: SceneCheck) -> model.Page:
     """Everything that the checks found; in the terminal without pictures, trajectory and origin of the data."""
-    name = check.scene.name
+    name, pairs = check.scene.name, check.pairs
+    shown = pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
     sections = [
         model.Section("Suspect", _bullets(check.findings)),
         model.Section("Undecided", _bullets(check.undecided)),
         model.Section("Agreement", _agreement(check)),
-        model.Section("Reprojected frames", [_pair_images(*pair) for pair in _shown(check.pairs)], screen_only=True),
+        model.Section("Reprojected frames", [_pair_images(*pair) for pair in shown], screen_only=True),
         model.Section("Trajectory", [_trajectory(check.scene.video)], screen_only=True),
         model.Section("Data", [model.record("Origin of the data", check.scene.provenance)], screen_only=True),
     ]
@@ -102,44 +104,41 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
         )
         head = ["depth error, %", "depth error, mm", "colour error, grey levels", "projects into the image, %"]
         rows = [
-            [name, *map(_number, (_percent(e.depth_error), e.depth_error_mm, e.color_error, _percent(e.share)))]
+            [
+                name,
+                _percent(e.depth_error),
+                short_number(e.depth_error_mm),
+                short_number(e.color_error),
+                _percent(e.share),
+            ]
             for name, e in check.agreement.items()
         ]
         if scale := check.scale:
-            error = _number(_percent(scale.depth_error))
-            rows.append([f"given, depth times {scale.factor:.3g}", error, None, None, None])
+            rows.append([f"given, depth times {scale.factor:.3g}", _percent(scale.depth_error), None, None, None])
     else:
         note = f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
         head = ["distance from the epipolar line, px", "in front of both cameras, %", "parallax, px", "matches"]
         rows = [
-            [name, *map(_number, (e.error, _percent(e.in_front), e.parallax)), str(e.count)]
+            [name, short_number(e.error), _percent(e.in_front), short_number(e.parallax), str(e.count)]
             for name, e in check.matches.items()
         ]
     return [model.Paragraph(note), model.simple_table(["poses read as", *head], rows)] if rows else []
 
 
-def _percent(value: float | None) -> float | None:
-    return None if value is None else 100.0 * value
-
-
-def _number(value: float | None) -> str | None:
-    return None if value is None else f"{value:.3g}"
-
-
-def _shown(pairs: Sequence[tuple[Frame, Frame]]) -> Sequence[tuple[Frame, Frame]]:
-    return pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
+def _percent(share: float | None) -> str | None:
+    return short_number(share, 100.0)
 
 
 def _pair_images(source: Frame, target: Frame) -> model.Figures:
     """Both images; the source warped into the target view and its difference; and the target's depth."""
-    images = [(source.image.numpy(), source.name), (target.image.numpy(), target.name)]
+    images: list[tuple[np.ndarray | torch.Tensor, str]] = [(source.image, source.name), (target.image, target.name)]
     if source.depth is not None and target.depth is not None:
         painted, shown = warp_image(source, target)
         canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
         mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
         images += [
-            (_bytes(canvas), f"{target.name} warped from {source.name}"),
-            (_bytes(mixed), "checkerboard of both: edges must be continuous"),
+            (eight_bit(canvas), f"{target.name} warped from {source.name}"),
+            (eight_bit(mixed), "checkerboard of both: edges must be continuous"),
             (
                 colorize_rgb_error(painted.float(), target.rgb, shown),
                 "difference, black 0 to yellow 20 % of full scale",
@@ -156,10 +155,6 @@ def _pair_images(source: Frame, target: Frame) -> model.Figures:
         [model.Image(model.EncodedImage.png(rgb), caption) for rgb, caption in images],
         f"{source.name} and {target.name}",
     )
-
-
-def _bytes(rgb: torch.Tensor) -> np.ndarray:
-    return np.asarray((rgb * 255).round().byte().numpy())
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ from coliags_plugin.checks.depth.measures import DepthErrors, DepthStatistics, m
 from coliags_plugin.checks.depth.pairing import FramePairs, Samples
 from coliags_plugin.checks.depth.sources import DepthSource
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def check_depth(
     pairs = pairing.match_frames(estimate, truth)
     dense: list[Samples | None] = []
     sparse: list[Samples | None] = []
-    for done, (here, there) in enumerate(pairs.indices, start=1):
+    for here, there in with_progress(pairs.indices, "compare depth", progress):
         estimated, true = estimate.read(here), truth.read(there)
         if true.confidence is not None:
             raise InputError(
@@ -82,9 +82,7 @@ def check_depth(
         surface = pairing.true_depth_at(estimated, true)
         dense.append(None if surface is None else pairing.dense_samples(estimated, surface))
         sparse.append(pairing.sparse_samples(estimated, true))
-        if progress is not None:
-            progress("compare depth", done, len(pairs.indices))
-    of_all = [_pooled(dense), _pooled(sparse)]
+    of_all = [pooled(dense), pooled(sparse)]
     counted = [samples for samples in of_all if samples is not None and np.isfinite(samples.estimated).any()]
     if not counted:
         raise InputError(
@@ -102,11 +100,6 @@ def check_depth(
     ]
     unit = "mm" if truth.metric else "units of the truth"
     return DepthCheck(estimate, truth, pairs, unit, scale, measured[0], measured[1], frames)
-
-
-def _pooled(parts: list[Samples | None]) -> Samples | None:
-    there = [part for part in parts if part is not None and len(part.true)]
-    return pooled(there) if there else None
 
 
 def _frame_errors(samples: Samples | None, scale: float) -> DepthErrors | None:

@@ -82,24 +82,24 @@ def measure(samples: Samples, scale: float = 1.0) -> DepthStatistics:
     return DepthStatistics(_errors(relative, true), sure, _bands(relative, true), bins, gap / total if total else None)
 
 
-def median_scale(samples: Samples) -> float | None:
-    """Median of true / estimated depth; None where no pixel has both."""
+def median_scale(samples: Samples) -> float:
+    """Median of true / estimated depth over the pixels, at least one, that have both."""
     known = np.isfinite(samples.estimated)
-    if not known.any():
-        return None
     return float(np.median(samples.true[known].astype(np.float64) / samples.estimated[known]))
 
 
-def pooled(parts: Sequence[Samples]) -> Samples:
-    """Samples of several frames as one; where only some have confidence, that of the others is 0."""
+def pooled(parts: Sequence[Samples | None]) -> Samples | None:
+    """Samples of several frames as one, None without any; where only some have confidence, that of the others is 0."""
+    there = [part for part in parts if part is not None and len(part.true)]
+    if not there:
+        return None
     confidence = None
-    if any(part.confidence is not None for part in parts):
+    if any(part.confidence is not None for part in there):
         confidence = np.concatenate(
-            [np.zeros(len(part.true), np.float32) if part.confidence is None else part.confidence for part in parts]
+            [np.zeros(len(part.true), np.float32) if part.confidence is None else part.confidence for part in there]
         )
-    return Samples(
-        np.concatenate([part.estimated for part in parts]), np.concatenate([part.true for part in parts]), confidence
-    )
+    estimated, true = (np.concatenate(values) for values in zip(*((p.estimated, p.true) for p in there), strict=True))
+    return Samples(estimated, true, confidence)
 
 
 def _errors(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> DepthErrors:

@@ -13,18 +13,12 @@ from coliags_plugin.checks.depth.measures import SURE, DepthErrors, DepthStatist
 from coliags_plugin.checks.depth.pairing import true_depth_at
 from coliags_plugin.checks.depth.sources import FrameDepth, known_depth
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.outputs import colormaps
 from coliags_plugin.outputs.axis_ticks import round_up
 from coliags_plugin.outputs.charts import Series
-from coliags_plugin.outputs.colormaps import (
-    UNKNOWN_GREY,
-    color_bar,
-    colorize_depth,
-    colorize_error,
-    depth_limits,
-    stacked,
-)
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting import model
+from coliags_plugin.reporting.numbers import short_number
 
 #: Number of frames shown.
 _SHOWN = 4
@@ -89,8 +83,8 @@ def _confidence(statistics: DepthStatistics) -> list[model.Block]:
         [
             "0 (unknown)" if entry.high == 0.0 else f"{entry.low:g} to {entry.high:g}",
             entry.pixels,
-            _number(entry.stated, 100.0),
-            _number(entry.observed, 100.0),
+            short_number(entry.stated, 100.0),
+            short_number(entry.observed, 100.0),
         ]
         for entry in statistics.bins
     ]
@@ -115,12 +109,8 @@ def _head(check: DepthCheck) -> list[str]:
 
 
 def _cells(errors: DepthErrors) -> list[str | int | None]:
-    shares = [_number(share, 100.0) for share in (errors.coverage, errors.median, errors.p90, errors.within)]
-    return [errors.pixels, *shares, _number(errors.bias, 100.0, "+"), _number(errors.median_length)]
-
-
-def _number(value: float | None, factor: float = 1.0, sign: str = "") -> str | None:
-    return None if value is None else f"{value * factor:{sign}.3g}"
+    shares = [short_number(share, 100.0) for share in (errors.coverage, errors.median, errors.p90, errors.within)]
+    return [errors.pixels, *shares, short_number(errors.bias, 100.0, "+"), short_number(errors.median_length)]
 
 
 def _unit(check: DepthCheck) -> str:
@@ -146,11 +136,11 @@ def _frame_images(
     true, error = true_depth_at(estimate, truth), error_map(check, estimate, truth, limit)
     if true is None or error is None or estimate.depth is None:
         return {}
-    limits = depth_limits([true])
+    limits = colormaps.depth_limits([true])
     scaled = estimate.depth * (1.0 if check.scale is None else check.scale)
     images = {} if estimate.image is None else {"image": estimate.image}
-    images[f"true, 0 to {limits[1]:g}"] = colorize_depth(true, limits)
-    images["estimate, same colours"] = colorize_depth(scaled, limits)
+    images[f"true, 0 to {limits[1]:g}"] = colormaps.colorize_depth(true, limits)
+    images["estimate, same colours"] = colormaps.colorize_depth(scaled, limits)
     images["|dz|"] = error
     if estimate.confidence is not None:
         grey = np.rint(estimate.confidence * 255.0).astype(np.uint8)
@@ -176,17 +166,17 @@ def error_map(
         return None
     known, there = np.isfinite(true), known_depth(estimate.depth)
     error: Float[np.ndarray, "H W"] = np.abs(estimate.depth * (1.0 if check.scale is None else check.scale) - true)
-    image = colorize_error(np.where(there & known, error, 0.0), known, limit)
-    image[known & ~there] = UNKNOWN_GREY
+    image = colormaps.colorize_error(np.where(there & known, error, 0.0), known, limit)
+    image[known & ~there] = colormaps.UNKNOWN_GREY
     return image
 
 
 def write_error_maps(check: DepthCheck, folder: Path) -> None:
     """Write the error maps as ``NAME.png``, each above its colour bar; ``folder`` must be new or empty."""
     limit = error_limit(check)
-    bar = color_bar((0.0, limit), f"|dz|, {_unit(check)}", width=_BAR_WIDTH)
+    bar = colormaps.color_bar((0.0, limit), f"|dz|, {_unit(check)}", width=_BAR_WIDTH)
     with atomic_folder(folder) as scratch:
         for here, there in check.pairs.indices:
             image = error_map(check, check.estimate.read(here), check.truth.read(there), limit)
             if image is not None:
-                write_png(scratch / f"{check.estimate.names[here]}.png", stacked([image, bar]))
+                write_png(scratch / f"{check.estimate.names[here]}.png", colormaps.stacked([image, bar]))

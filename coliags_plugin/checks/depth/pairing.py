@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from coliags_plugin.checks.depth.sources import DepthSource, FrameDepth, known_depth
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.images import resize_nearest
 
 #: Largest difference of the relative intrinsics (focal length and centre over the image size) of one view.
 _SAME_CAMERA = 0.01
@@ -54,10 +55,7 @@ def true_depth_at(estimate: FrameDepth, truth: FrameDepth) -> Float[np.ndarray, 
     """Dense true depth at the estimate's pixel centres, nearest neighbour; NaN where unknown. [H, W]"""
     if truth.depth is None:
         return None
-    width, height = estimate.size
-    row = ((np.arange(height) + 0.5) * truth.depth.shape[0] / height).astype(np.int64)
-    column = ((np.arange(width) + 0.5) * truth.depth.shape[1] / width).astype(np.int64)
-    sampled = truth.depth[row[:, None], column[None, :]]
+    sampled = resize_nearest(truth.depth, *estimate.size)
     return np.where(known_depth(sampled), sampled, np.float32(np.nan))
 
 

@@ -52,17 +52,7 @@ def renders_every_output(context: CheckContext) -> str:
 
 def _resized(camera: Camera) -> Camera:
     """The camera with fewer pixels, an odd number of them, over the same field of view."""
-    width, height = (max(1, int(0.35 * side)) * 2 + 1 for side in (camera.width, camera.height))
-    across, down = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,
-        cy=camera.cy * down,
-        width=width,
-        height=height,
-    )
+    return camera.resized(*(max(1, int(0.35 * side)) * 2 + 1 for side in (camera.width, camera.height)))
 
 
 @torch.no_grad()

@@ -1,11 +1,10 @@
-"""Scenes that methods are checked on: a small phantom, and scenes that lack something."""
+"""The small phantom that methods are checked on, and the depth of a scene."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,7 +14,7 @@ import torch
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method, method_tree
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import phantom_settings
 
@@ -72,38 +71,3 @@ def depth_range(scene: Scene) -> tuple[float, float] | None:
         depth = camera.project(scene.points.positions.to(camera.camera_to_world))[1]
         known = depth[depth > 0]
     return (float(known.min()), float(known.max())) if len(known) else None
-
-
-def without_depth(scene: Scene) -> Scene:
-    """The scene without depth of any kind; its points stay."""
-    return replace(scene, train=[_without_depth(frame.to("cpu")) for frame in scene.train])
-
-
-def without_points(scene: Scene) -> Scene:
-    """The scene without initial points."""
-    return replace(scene, points=PointCloud(torch.zeros(0, 3)))
-
-
-def with_one_frame(scene: Scene) -> Scene:
-    """The scene with its first training frame only."""
-    return replace(scene, train=scene.train[:1])
-
-
-def with_ignored_pixels(scene: Scene, spoilt: bool) -> Scene:
-    """The scene with a part of every training image masked out; ``spoilt``: of other colours, and depth that is NaN."""
-    return replace(scene, train=[_masked(frame.to("cpu"), spoilt) for frame in scene.train])
-
-
-def _masked(frame: Frame, spoilt: bool) -> Frame:
-    height, width = frame.image.shape[:2]
-    ignored = torch.zeros(height, width, dtype=torch.bool)
-    ignored[height // 4 : height // 2, width // 4 : width // 2] = True
-    masked = replace(frame, mask=frame.valid & ~ignored)
-    if not spoilt:
-        return masked
-    depth = None if frame.depth is None else frame.depth.masked_fill(ignored, torch.nan)
-    return replace(masked, image=torch.where(ignored[..., None], 255 - frame.image, frame.image), depth=depth)
-
-
-def _without_depth(frame: Frame) -> Frame:
-    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None, depth_confidence=None)

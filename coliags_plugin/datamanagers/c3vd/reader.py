@@ -10,16 +10,8 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
-from coliags_plugin.datamanagers.reading.files import (
-    DEPTH_SUFFIXES,
-    IMAGE_SUFFIXES,
-    TIFF_SUFFIXES,
-    inventory,
-    numbered,
-    paired,
-    require_folder,
-)
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.geometry.lenses.models import LENSES
@@ -64,7 +56,7 @@ class C3VDDataManager(SequenceDataManager):
 
     def find(self, folder: Path) -> SequenceFiles:
         """See :class:`SequenceDataManager`; ``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
-        require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
+        reading.require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
         raw = [path for path in folder.iterdir() if re.fullmatch(r"\d+_color\.png", path.name)]
         camera = None
         if raw and (folder / "images").is_dir():
@@ -75,21 +67,23 @@ class C3VDDataManager(SequenceDataManager):
             )
         if raw:
             kind, poses = "raw", folder / "pose.txt"
-            images = numbered(folder, "color", frozenset({".png"}))
-            depths = numbered(folder, "depth", TIFF_SUFFIXES)
+            images = reading.numbered(folder, "color", frozenset({".png"}))
+            depths = reading.numbered(folder, "depth", reading.TIFF_SUFFIXES)
         elif (folder / "images").is_dir():
             kind, poses, camera = "undistorted", folder / "camera_pose.txt", folder / "camera.json"
-            images = numbered(folder / "images", "color", IMAGE_SUFFIXES)
-            depths = numbered(folder / "depths", "depth", DEPTH_SUFFIXES)
+            images = reading.numbered(folder / "images", "color", reading.IMAGE_SUFFIXES)
+            depths = reading.numbered(folder / "depths", "depth", reading.DEPTH_SUFFIXES)
         else:
             do = "Name the sequence's own folder, for instance cecum_t1_a"
-            raise InputError(f"{folder} holds {inventory(folder)}", LAYOUTS, do)
+            raise InputError(f"{folder} holds {reading.inventory(folder)}", LAYOUTS, do)
         if not images:
-            raise InputError(f"{folder / 'images'} holds {inventory(folder / 'images')}", "<number>_color.png files")
+            raise InputError(
+                f"{folder / 'images'} holds {reading.inventory(folder / 'images')}", "<number>_color.png files"
+            )
         for path in filter(None, (poses, camera)):
             if not path.is_file():
                 raise InputError(f"{folder} has images but no {path.name}", LAYOUTS, f"Add {path.name}")
-        return SequenceFiles(kind, folder, *paired(folder, images, depths), poses, camera)
+        return SequenceFiles(kind, folder, *reading.paired(folder, images, depths), poses, camera)
 
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """See :class:`SequenceDataManager`."""

@@ -12,14 +12,7 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.files import (
-    PINHOLES,
-    RegisteredImage,
-    SparseModel,
-    find_models,
-    read_model,
-    sidecar_file,
-)
+from coliags_plugin.datamanagers.colmap import files
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import (
     first_few,
@@ -85,7 +78,7 @@ class ColmapDataManager(RecordedDataManager):
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
         # A nerfstudio scene may contain its COLMAP model, but its poses are in transforms.json.
-        found = [] if (path / "transforms.json").is_file() else find_models(path)
+        found = [] if (path / "transforms.json").is_file() else files.find_models(path)
         return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
 
     def open(self, path: Path) -> Recording:
@@ -93,12 +86,12 @@ class ColmapDataManager(RecordedDataManager):
         settings = self.settings
         if not path.is_dir():
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
-        model = read_model(self._model_folder(path))
+        model = files.read_model(self._model_folder(path))
         paths = _image_paths(path / settings.images_folder, model, settings.outside_files)
-        masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
+        masks = [files.sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
         lenses = {
-            number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
+            number: PinholeLens.of(lens.pinhole) if lens.model in files.PINHOLES else lens
             for number, lens in model.cameras.items()
         }
         rectification_of = rectifications(lenses, model.cameras_file, self.working_size, settings.focal_scale)
@@ -131,7 +124,7 @@ class ColmapDataManager(RecordedDataManager):
             "layout": "colmap",
             "model": str(model.folder),
             "lens": ", ".join(kinds),
-            "focal_scale": settings.focal_scale if set(kinds) - PINHOLES else None,
+            "focal_scale": settings.focal_scale if set(kinds) - files.PINHOLES else None,
             "cameras": len(rectification_of),
             **next(iter(rectification_of.values())).facts(),
             "scale": settings.scale,
@@ -152,7 +145,7 @@ class ColmapDataManager(RecordedDataManager):
     def _model_folder(self, path: Path) -> Path:
         if self.settings.model is not None:
             return path / self.settings.model
-        found = find_models(path)
+        found = files.find_models(path)
         if not found:
             raise InputError(
                 f"{path} holds no COLMAP model",
@@ -166,7 +159,11 @@ class ColmapDataManager(RecordedDataManager):
         return found[0]
 
     def _sparse_depth(
-        self, model: SparseModel, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification
+        self,
+        model: files.SparseModel,
+        image: files.RegisteredImage,
+        camera_to_world: np.ndarray,
+        rectification: Rectification,
     ) -> SparseDepth | None:
         """z-depth of the image's points at their projections (not at the observed keypoints)."""
         settings, lens = self.settings, model.cameras[image.camera]
@@ -180,25 +177,20 @@ class ColmapDataManager(RecordedDataManager):
             kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
         kept &= model.track_lengths[image.points] >= settings.min_track_length
         # One depth per point, even if the image observes it twice.
-        kept[kept] = _first_of_each(image.points[kept])
-        if not kept.any():
+        _, first = np.unique(image.points[kept], return_index=True)
+        rows = np.flatnonzero(kept)[np.sort(first)]
+        if not len(rows):
             return None
         return SparseDepth(
-            torch.from_numpy(pixels[kept].astype(np.float32)), torch.from_numpy(local[kept, 2].astype(np.float32))
+            torch.from_numpy(pixels[rows].astype(np.float32)), torch.from_numpy(local[rows, 2].astype(np.float32))
         )
 
-    def _points(self, model: SparseModel) -> PointCloud:
+    def _points(self, model: files.SparseModel) -> PointCloud:
         positions = (model.positions * self.settings.scale).astype(np.float32)
         return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
 
 
-def _first_of_each(numbers: np.ndarray) -> np.ndarray:
-    first = np.zeros(len(numbers), bool)
-    first[np.unique(numbers, return_index=True)[1]] = True
-    return first
-
-
-def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
+def _image_paths(folder: Path, model: files.SparseModel, outside: bool) -> list[Path]:
     if not folder.is_dir():
         raise InputError(
             f"no folder {folder}", "the images that the model was made from", "Set datamanager.images_folder"
@@ -215,11 +207,11 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
     return paths
 
 
-def _depths(folder: Path, model: SparseModel) -> list[Path | None]:
+def _depths(folder: Path, model: files.SparseModel) -> list[Path | None]:
     """Depth files of all images, or of none."""
     if not folder.is_dir():
         return [None] * len(model.images)
-    depths = [sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
+    depths = [files.sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
     missing = [image.name for image, depth in zip(model.images, depths, strict=True) if depth is None]
     if missing:
         raise InputError(

@@ -30,23 +30,14 @@ class EstimatedSceneWriter:
 
     def write_frame(
         self,
-        name: str,
-        camera: Camera,
-        image: UInt8[np.ndarray, "H W 3"],
-        mask: Bool[np.ndarray, "H W"] | None,
-        depth: Float[np.ndarray, "H W"],
-        confidence: Float[np.ndarray, "H W"],
+        name: str,  # unique; the stem of its files
+        camera: Camera,  # pinhole of the image, posed
+        image: UInt8[np.ndarray, "H W 3"],  # RGB
+        mask: Bool[np.ndarray, "H W"] | None,  # False where a pixel is to be ignored; None: nowhere
+        depth: Float[np.ndarray, "H W"],  # z-depth, scene units; not positive where unknown
+        confidence: Float[np.ndarray, "H W"],  # 0 to 1
     ) -> None:
-        """Write the files of a frame.
-
-        Args:
-            name: Unique; the stem of its files.
-            camera: Pinhole of the image, posed.
-            image: RGB.
-            mask: False where a pixel is to be ignored; None: nowhere.
-            depth: z-depth, scene units; not positive where unknown.
-            confidence: 0 to 1.
-        """
+        """Write the files of a frame."""
         file = f"{name}.png"
         steps = np.clip(np.rint(depth / self.depth_unit), 0, 65535).astype(np.uint16)
         write_image(self.folder / "images" / file, image)

@@ -32,17 +32,11 @@ class DepthFormat(ABC):
 
 @dataclass(frozen=True)
 class DepthSteps(DepthFormat):
-    """Integers proportional to z-depth.
+    """Integers proportional to z-depth."""
 
-    Attributes:
-        size: Scene units per step.
-        bits: 8 or 16.
-        far: Stored value of depths clipped to the range; None where there is none.
-    """
-
-    size: float
-    bits: int = 16
-    far: int | None = None
+    size: float  # scene units per step
+    bits: int = 16  # 8 or 16
+    far: int | None = None  # stored value of depths clipped to the range; None where there is none
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`; an image of one channel."""
@@ -67,13 +61,9 @@ C3VD_DEPTH = DepthSteps(100.0 / 65535.0, 16, 65535)
 
 @dataclass(frozen=True)
 class DepthArray(DepthFormat):
-    """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown.
+    """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown."""
 
-    Attributes:
-        size: Scene units per stored unit.
-    """
-
-    size: float
+    size: float  # scene units per stored unit
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""

@@ -86,13 +86,9 @@ def inventory(folder: Path) -> str:
 
 
 def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
-    """The path of a file that another one names; it need not exist.
+    """The path of a file that another one, ``said`` in messages, names relative to ``folder``; it need not exist.
 
-    Args:
-        folder: What names are relative to.
-        name: As it stands.
-        said: Where, for the message.
-        outside: Whether it may lie outside of the folder. Links within the folder may always lead anywhere.
+    ``outside`` tells whether it may lie outside of the folder. Links within the folder may always lead anywhere.
     """
     path = folder / name
     within = Path(posixpath.normpath(folder.absolute()))

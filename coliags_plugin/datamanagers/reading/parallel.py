@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -28,15 +28,10 @@ def parallel_map(
     ``what`` names the task for ``progress``. ``threads`` is by default what reads files fastest. The exception of the
     first item that fails is raised, and the remaining items are cancelled.
     """
-    results = []
     with ThreadPoolExecutor(threads or min(_READERS, os.cpu_count() or 1)) as pool:
         pending = [pool.submit(function, item) for item in items]
         try:
-            for done, future in enumerate(pending, start=1):
-                results.append(future.result())
-                if progress is not None:
-                    progress(what, done, len(pending))
+            return [future.result() for future in with_progress(pending, what, progress)]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return results

@@ -63,15 +63,10 @@ class ReimNerfSequence:
 
 @dataclass(frozen=True, eq=False)
 class RayDistance(DepthFormat):
-    """16-bit distance along the ray; 0 is unknown, and C3VD's 100 mm z-depth is a lower bound.
+    """16-bit distance along the ray; 0 is unknown, and C3VD's 100 mm z-depth is a lower bound."""
 
-    Attributes:
-        size: mm per step, along the ray.
-        cosine: Ratio of z-depth to ray distance at each working pixel's source pixel. [h, w]
-    """
-
-    size: float
-    cosine: Float32[np.ndarray, "h w"]
+    size: float  # mm per step, along the ray
+    cosine: Float32[np.ndarray, "h w"]  # ratio of z-depth to ray distance at each working pixel's source pixel
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""

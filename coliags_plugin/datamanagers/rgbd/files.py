@@ -146,11 +146,7 @@ def find_mesh(folder: Path) -> Path | None:
 
 
 def read_obj_points(path: Path) -> PointCloud:
-    """Read the vertices of an OBJ file, and their colours (0 to 1 behind the position) if all have one.
-
-    Raises:
-        InputError: The file cannot be read, or a vertex line does not hold three or six numbers.
-    """
+    """Read the vertices of an OBJ file, and their colours (0 to 1 behind the position) if all have one."""
     rows: list[list[float]] = []
     for row_number, line in text_lines(path, "an OBJ file"):
         if not line.startswith("v "):

@@ -19,23 +19,7 @@ from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.rgbd.files import (
-    CONFIDENCE_FOLDERS,
-    MASK_FOLDERS,
-    CameraFile,
-    by_number,
-    files_of_images,
-    find_camera,
-    find_depths,
-    find_images,
-    find_mesh,
-    find_trajectory,
-    is_time,
-    lacks_trajectory,
-    read_obj_points,
-    recognise,
-    times,
-)
+from coliags_plugin.datamanagers.rgbd import files
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
@@ -94,12 +78,12 @@ class RGBDDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        return files.recognise(path)
 
     @classmethod
     def recognise_unposed(cls, path: Path) -> bool:
         """See :class:`DataManager`."""
-        return lacks_trajectory(path)
+        return files.lacks_trajectory(path)
 
     def without_poses(self) -> DataManager:
         """See :class:`DataManager`."""
@@ -108,23 +92,23 @@ class RGBDDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        images = find_images(path)
-        depths = find_depths(path) if settings.depth == "metric" else []
+        images = files.find_images(path)
+        depths = files.find_depths(path) if settings.depth == "metric" else []
         file, trajectory = self._trajectory(path, images)
         by_time = self._by_time(images)
         pair = self._paired_by_time if by_time else self._paired_by_order
         frames = pair(images, depths, trajectory, file or path)
-        camera = find_camera(path, frames.images[0])
+        camera = files.find_camera(path, frames.images[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
         size = self.working_size(camera.intrinsics.width, camera.intrinsics.height)
         rectification = Rectification.of_pinhole(camera.intrinsics, camera.path, size)
         complete = len(frames.images) == len(images) == len(trajectory)
         seen = find_seen_masks(path / "truth", len(images), complete)
-        masks = files_of_images(path, MASK_FOLDERS, frames.images, "mask")
+        masks = files.files_of_images(path, files.MASK_FOLDERS, frames.images, "mask")
         confidences: dict[str, Path] = {}
         if settings.depth == "metric":
-            confidences = files_of_images(path, CONFIDENCE_FOLDERS, frames.images, "confidence")
+            confidences = files.files_of_images(path, files.CONFIDENCE_FOLDERS, frames.images, "confidence")
         if confidences and not depths:
             raise InputError(
                 f"{path} holds confidence/, but no depth",
@@ -162,7 +146,7 @@ class RGBDDataManager(RecordedDataManager):
                 "poses": len(trajectory),
                 "summary": trajectory.summary(printed_unit(path)),
             }
-        points = next((file for file in (path / POINTS_FILE, find_mesh(path)) if file and file.is_file()), None)
+        points = next((file for file in (path / POINTS_FILE, files.find_mesh(path)) if file and file.is_file()), None)
         return Recording(
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
             shots=shots,
@@ -172,19 +156,19 @@ class RGBDDataManager(RecordedDataManager):
             ),
             own_points=None
             if points is None
-            else partial(read_obj_points if points.suffix == ".obj" else load_points, points),
+            else partial(files.read_obj_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
         )
 
     def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
         """The trajectory and its file."""
-        file = find_trajectory(path, self.settings.trajectory)
+        file = files.find_trajectory(path, self.settings.trajectory)
         return file, tum.read(file)
 
     def _by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
             return self.settings.association == "time"
-        timed = [is_time(path.stem) for path in images]
+        timed = [files.is_time(path.stem) for path in images]
         if any(timed) and not all(timed):
             raise InputError(
                 f"{images[timed.index(False)]} is not named by a timestamp, but {images[timed.index(True)].name} is",
@@ -197,7 +181,7 @@ class RGBDDataManager(RecordedDataManager):
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
         tolerance = self.settings.max_time_difference
-        taken = times(images)
+        taken = files.times(images)
         order = np.argsort(taken, kind="stable")
         images, taken = [images[index] for index in order], taken[order]
         same = np.flatnonzero(np.diff(taken) == 0.0)
@@ -219,7 +203,7 @@ class RGBDDataManager(RecordedDataManager):
         depth = np.full(len(images), -1)
         complete = posed.copy()
         if depths:
-            depth[posed] = nearest_in_time(taken[posed], times(depths), within)
+            depth[posed] = nearest_in_time(taken[posed], files.times(depths), within)
             complete &= depth >= 0
         if not complete.any():
             raise InputError(
@@ -249,7 +233,7 @@ class RGBDDataManager(RecordedDataManager):
     def _paired_by_order(
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
-        numbered = by_number(images)
+        numbered = files.by_number(images)
         if len(trajectory) != len(numbered):
             raise InputError(
                 f"{file} has {len(trajectory)} poses for {len(numbered)} images",
@@ -257,7 +241,7 @@ class RGBDDataManager(RecordedDataManager):
                 "Restore the missing ones; or set association: time, if images are named by its timestamps",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
-        deep = by_number(depths)
+        deep = files.by_number(depths)
         if deep and deep.keys() != numbered.keys():
             lone = min(deep.keys() ^ numbered.keys())
             raise InputError(
@@ -287,7 +271,7 @@ class RGBDDataManager(RecordedDataManager):
                 "Set association: time if the names are timestamps, or order if the timestamps are meaningless",
             )
 
-    def _depth_scale(self, camera: CameraFile, path: Path) -> float:
+    def _depth_scale(self, camera: files.CameraFile, path: Path) -> float:
         said, given = camera.depth_scale, self.settings.depth_scale
         if said is not None and given is not None and said != given:
             raise InputError(
@@ -314,4 +298,4 @@ class UnposedRGBDDataManager(RGBDDataManager):
     def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
         identity = np.tile(np.eye(4), (len(images), 1, 1))
         # Each image's pose has its own timestamp, so that only depth has to be matched.
-        return None, Trajectory(identity, timestamps=times(images) if self._by_time(images) else None)
+        return None, Trajectory(identity, timestamps=files.times(images) if self._by_time(images) else None)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.files import is_time, times
@@ -81,16 +81,14 @@ def write_rgbd_scene(
     if not timed:
         names = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
-        for index, frame in enumerate(frames):
+        for name, frame in zip(names, with_progress(frames, "write frames", progress), strict=True):
             if frame.camera.intrinsics != intrinsics:
                 raise InputError(f"frame {frame.name} has another camera", "one pinhole for all frames")
             mask = None if frame.mask is None else frame.mask.numpy()
-            write_frame(scratch, names[index], frame.image.numpy(), _depth(frame), scale, mask)
-            if progress is not None:
-                progress("write frames", index + 1, len(frames))
+            write_frame(scratch, name, frame.image.numpy(), _depth(frame), scale, mask)
         tum.write(scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(name) for name in names])))
-        size = {"w": intrinsics.width, "h": intrinsics.height}
-        write_camera_json(scratch / CAMERA, intrinsics, **size, depth_scale=scale)
+        k = intrinsics
+        write_camera_json(scratch / CAMERA, k, w=k.width, h=k.height, depth_scale=scale)
     return folder / TRAJECTORY
 
 

@@ -19,18 +19,9 @@ from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
+from coliags_plugin.datamanagers.rotatecolon import files as layout
 from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
-from coliags_plugin.datamanagers.rotatecolon.files import (
-    LAYOUT,
-    POINTS,
-    TEST,
-    TRAIN,
-    TRAIN_DEPTH,
-    TRAIN_VIEWS,
-    ViewFiles,
-    find_views,
-)
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
@@ -77,7 +68,11 @@ class RotateColonDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return f"{TRAIN} beside {TRAIN_VIEWS}/" if (path / TRAIN).is_file() and (path / TRAIN_VIEWS).is_dir() else None
+        return (
+            f"{layout.TRAIN} beside {layout.TRAIN_VIEWS}/"
+            if (path / layout.TRAIN).is_file() and (path / layout.TRAIN_VIEWS).is_dir()
+            else None
+        )
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -90,7 +85,7 @@ class RotateColonDataManager(RecordedDataManager):
         if test is not None:
             seen = find_seen_masks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
             test_sets[name], facts[name] = self._shots(test, seen, "test-")
-        points = path / POINTS
+        points = path / layout.POINTS
         facts["depth_against_points"] = self._compared(shots, points)
         files = [part for part in (train, test) if part is not None]
         return Recording(
@@ -111,25 +106,25 @@ class RotateColonDataManager(RecordedDataManager):
             points_source=points,
         )
 
-    def _views(self, path: Path) -> tuple[ViewFiles, ViewFiles | None]:
+    def _views(self, path: Path) -> tuple[layout.ViewFiles, layout.ViewFiles | None]:
         """The training views, and the test views if there are any."""
-        require_folder(path, LAYOUT)
+        require_folder(path, layout.LAYOUT)
         if self.recognise(path) is None:
-            raise InputError(f"{path} holds {inventory(path)}", LAYOUT, "Name the scene's own folder")
-        train = find_views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)
-        if not (path / TEST).is_file():
+            raise InputError(f"{path} holds {inventory(path)}", layout.LAYOUT, "Name the scene's own folder")
+        train = layout.find_views(path / layout.TRAIN, path / layout.TRAIN_VIEWS, path / layout.TRAIN_DEPTH)
+        if not (path / layout.TEST).is_file():
             return train, None
         images = path / self.settings.test_folder
         if not images.is_dir():
             raise InputError(
-                f"{path} has {TEST} but no folder {self.settings.test_folder}",
+                f"{path} has {layout.TEST} but no folder {self.settings.test_folder}",
                 "the images of the test views",
                 "Set test_folder to the folder they are in",
             )
-        return train, find_views(path / TEST, images, None)
+        return train, layout.find_views(path / layout.TEST, images, None)
 
     def _shots(
-        self, files: ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
+        self, files: layout.ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
         settings = self.settings
         width, height = size_of(files.images[0])
