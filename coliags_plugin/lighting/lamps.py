@@ -67,7 +67,7 @@ class HeldLight(ABC):
 
     @abstractmethod
     def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """Distance of points to the lamp, scene units, and cosine of their angle to its axis, in [0, 1]. [N], [N]"""
+        """Distance of points to the lamp, scene units, and cosine of their angle to its axis, in [0, 1]."""
 
     @property
     @abstractmethod
@@ -76,12 +76,7 @@ class HeldLight(ABC):
 
     @abstractmethod
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Unit vectors from points of a surface to the lamp. [N, 3]
-
-        Args:
-            points: On the surface, world frame. [N, 3]
-            normals: Unit normals there. [N, 3]
-        """
+        """Unit vectors from points of a surface, world frame, with unit normals to the lamp."""
 
 
 @dataclass(frozen=True)

@@ -77,13 +77,9 @@ SOURCES: dict[str, tuple[Published, Published]] = {
 def install(nets: Sequence[str], folder: Path | None, origin: Path | None, progress: Progress) -> list[Path]:
     """Install the weights of some nets where they are missing, see that their networks load, and name the new files.
 
-    Args:
-        nets: Keys of :data:`SOURCES`.
-        folder: Where they are looked for and installed; None: looked for wherever LPIPS does, and installed where
-            ``torch.hub`` keeps downloads.
-        origin: A folder to copy the files from; nothing is copied unless all that are missing are in it. None: they are
-            downloaded.
-        progress: Called with what has arrived of a file, and its total, MiB.
+    Without a folder to look in and install to, they are looked for wherever LPIPS does, and installed where
+    ``torch.hub`` keeps downloads. Without an ``origin`` to copy from they are downloaded, with progress in MiB of each
+    file; nothing is copied unless all that are missing are in it.
     """
     if origin is not None and not origin.is_dir():
         raise InputError(f"--from {origin} is not a folder", "a folder with LPIPS weights")

@@ -23,14 +23,10 @@ class DepthPrior(ABC):
 
     @abstractmethod
     def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
-        """Log of z-depth at every pixel of a frame, fitted to its known depth.
+        """Log of z-depth at every pixel of a frame, of the size of the maps or larger, fitted to its known depth.
 
-        Args:
-            frame: The frame, of the size of the maps or larger.
-            usable: Neither masked nor near a highlight. [H, W]
-            known: Log of z-depth; anything where the weight is 0. [H, W]
-            weight: Of the known depth, 0 to 1. [H, W]
-            typical: z-depth of a typical pixel, for a frame without known depth.
+        ``usable``: neither masked nor near a highlight; ``known``: log of z-depth, anything where its ``weight``, 0 to
+        1, is 0; ``typical``: z-depth of a typical pixel, for a frame without known depth.
         """
 
     @abstractmethod

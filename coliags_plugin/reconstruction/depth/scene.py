@@ -49,20 +49,10 @@ class DepthRequest:
 def estimate_scene(
     scene: Scene, out: Path, request: DepthRequest, overwrite: bool = False, progress: Progress | None = None
 ) -> str:
-    """Estimate the depth of a scene's video, write it as a scene in nerfstudio's layout, and return a summary line.
+    """Estimate the depth of a posed scene's video, write it as a scene in nerfstudio's layout, and return a summary.
 
     Training and test frames take part; test sets of their own do not. Work files stay beside ``out`` until all is
     written, and the same request resumes from them.
-
-    Args:
-        scene: With poses, opened with its images read when needed.
-        out: Folder to create.
-        request: What is asked for.
-        overwrite: Replace an existing folder.
-        progress: Progress callback.
-
-    Raises:
-        InputError: The frames give no depth, the prior does not fit them, or a folder cannot be written.
     """
     frames = scene.video
     if others := [name for name in scene.test_sets if name != "test"]:
