@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
-from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
+from coliags_plugin.renderers.projection import slope_limits
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 
 #: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones. Surfels have two scales.
@@ -76,8 +76,6 @@ def render_gaussians(
             Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
     """
     from coliags_plugin.renderers.numba_kernels import autograd, pipeline
-    from coliags_plugin.renderers.numba_kernels.gaussian_pipeline import GaussianPipeline
-    from coliags_plugin.renderers.numba_kernels.surfel_pipeline import SurfelPipeline
 
     settings = settings or CpuRendererSettings()
     check_gaussian_outputs(wants, gaussians)
@@ -86,7 +84,7 @@ def render_gaussians(
     wanted = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}
     if "expected" in wanted:
         wanted.add("depth")
-    stages = SurfelPipeline if is_surfels(gaussians) else GaussianPipeline
+    stages = pipeline.SurfelPipeline if is_surfels(gaussians) else pipeline.GaussianPipeline
     view = stages(_view_table(camera, pose, settings), camera.width, camera.height, wanted)
     channels = [name for name in wants if name in gaussians.features]
     try:
@@ -114,14 +112,11 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         raise InputError(f"camera_to_world of shape {list(matrix.shape)}", "[4, 4]")
     if camera.width < 1 or camera.height < 1:
         raise InputError(f"a camera of {camera.width} x {camera.height} pixels", "at least one pixel each way")
-    limits = []
-    for focal, principal, size in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)):
-        margin = JACOBIAN_MARGIN * 0.5 * size / focal
-        limits += [-principal / focal - margin, (size - principal) / focal + margin]
     table = [
         *matrix[:3].T.ravel(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
-        *limits,
+        *slope_limits(camera.fx, camera.cx, camera.width),
+        *slope_limits(camera.fy, camera.cy, camera.height),
         *(camera.near_plane, settings.eps2d, camera.width, camera.height),
         *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
         *settings.background,

@@ -123,6 +123,7 @@ def _draw_gaussians(
         parts["normals"] = _facing_normals(gaussians, sight, camera)
     parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
     features = torch.cat(list(parts.values()), dim=-1)
+    backgrounds = features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
     image, alpha = library.rasterize_to_pixels(
         means2d[None],
         conics,
@@ -131,11 +132,14 @@ def _draw_gaussians(
         *size,
         _TILE_SIZE,
         *_tiles(library, means2d, radii, depths, size),
-        backgrounds=_backgrounds(features, settings),
+        backgrounds=backgrounds if any(settings.background) else None,
     )
     maps = split_channels(image[0], parts)
     if "depth_median" in needs:
-        maps["depth_median"] = _median_by_definition(gaussians, camera, settings)
+        # By the torch reference, as gsplat has none for 3D Gaussians.
+        with torch.no_grad():
+            options = TorchRendererSettings(eps2d=settings.eps2d)
+            maps["depth_median"] = render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
     largest = torch.where(visible, radii[0].amax(-1), 0).to(means2d.dtype)
     return DrawnView(maps["rgb"], alpha[0, ..., 0], maps, means2d, largest)
 
@@ -180,19 +184,3 @@ def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: C
     """Shortest axis of each Gaussian in camera axes, oriented towards the camera. [N, 3]"""
     normals = facing(shortest_axes(gaussians.quats_wxyz, gaussians.scales), sight)
     return normals @ camera.camera_to_world[:3, :3]
-
-
-@torch.no_grad()
-def _median_by_definition(
-    gaussians: Gaussians, camera: Camera, settings: GsplatRendererSettings
-) -> Float[Tensor, "H W"]:
-    """Median depth by the torch reference, as gsplat has none for 3D Gaussians; without gradient. [H, W]"""
-    options = TorchRendererSettings(eps2d=settings.eps2d)
-    return render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
-
-
-def _backgrounds(features: Float[Tensor, "N F"], settings: GsplatRendererSettings) -> Float[Tensor, "1 F"] | None:
-    """Background of the colour channels, 0 for the others. [1, F]"""
-    if not any(settings.background):
-        return None
-    return features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])

@@ -24,26 +24,18 @@ JACOBIAN_MARGIN = 0.3
 class ProjectedGaussians:
     """N projected Gaussians.
 
-    Every entry is finite; those of Gaussians not ``in_front`` are meaningless and pass no gradient.
-
-    Attributes:
-        means_camera: Centres, camera axes, scene units. [N, 3]
-        rotations: Local axes (columns) in camera axes. [N, 3, 3]
-        means2d: Projected centres, pixels. [N, 2]
-        depths: z-depths of the centres, scene units; 1 where not ``in_front``. [N]
-        covariances: xx, xy, yy of the 2D covariance with its low-pass term, square pixels. [N, 3]
-        whitenings: u_xx, u_yx, u_yy of the lower triangular U with U^T U the inverse of the covariance, so that the
-            Mahalanobis distance of an offset d is |U d|. 1 / pixels. [N, 3]
-        in_front: Whether beyond the near plane. [N]
+    Every entry is finite; those of Gaussians not ``in_front`` are meaningless and pass no gradient. ``whitenings`` are
+    u_xx, u_yx, u_yy of the lower triangular U with U^T U the inverse of the covariance, so that the Mahalanobis
+    distance of an offset d is |U d|.
     """
 
-    means_camera: Float[Tensor, "N 3"]
-    rotations: Float[Tensor, "N 3 3"]
-    means2d: Float[Tensor, "N 2"]
-    depths: Float[Tensor, "N"]
-    covariances: Float[Tensor, "N 3"]
-    whitenings: Float[Tensor, "N 3"]
-    in_front: Bool[Tensor, "N"]
+    means_camera: Float[Tensor, "N 3"]  # centres, camera axes, scene units
+    rotations: Float[Tensor, "N 3 3"]  # local axes (columns) in camera axes
+    means2d: Float[Tensor, "N 2"]  # projected centres, pixels
+    depths: Float[Tensor, "N"]  # z-depths of the centres, scene units; 1 where not in_front
+    covariances: Float[Tensor, "N 3"]  # xx, xy, yy of the 2D covariance with its low-pass term, square pixels
+    whitenings: Float[Tensor, "N 3"]  # 1 / pixels
+    in_front: Bool[Tensor, "N"]  # whether beyond the near plane
 
 
 def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> ProjectedGaussians:
@@ -69,8 +61,8 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> Pro
 
     rotations = camera_axes.T @ rotation_matrices(gaussians.quats_wxyz)
     # The 2D covariance is V V^T with V = J (W R S): one row of V per image axis.
-    slope_x = (x / z).clamp(*_slope_limits(camera.fx, camera.cx, camera.width))
-    slope_y = (y / z).clamp(*_slope_limits(camera.fy, camera.cy, camera.height))
+    slope_x = (x / z).clamp(*slope_limits(camera.fx, camera.cx, camera.width))
+    slope_y = (y / z).clamp(*slope_limits(camera.fy, camera.cy, camera.height))
     axes = rotations * gaussians.scales[:, None, :]
     row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
     row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
@@ -108,7 +100,7 @@ def facing(axes: Float[Tensor, "N 3"], sight: Float[Tensor, "N 3"]) -> Float[Ten
     return torch.where(away, -axes, axes)
 
 
-def _slope_limits(focal: float, principal: float, size: int) -> tuple[float, float]:
+def slope_limits(focal: float, principal: float, size: int) -> tuple[float, float]:
     """Range of x/z (or y/z) to which the Jacobian is clamped: the image's, widened on both sides."""
     margin = JACOBIAN_MARGIN * 0.5 * size / focal
     return -principal / focal - margin, (size - principal) / focal + margin

@@ -30,17 +30,6 @@ class SurfelRules(NamedTuple):
     depths: bool
 
 
-class CompositedSurfels(NamedTuple):
-    """Sums over the surfels of each tile at each of its pixels, w the weight of a surfel and z its depth there.
-
-    ``features`` are sum w f; ``depths`` are sum w z, sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and
-    the median depth; 0 unless wanted.
-    """
-
-    features: Float[Tensor, "tiles F P"]
-    depths: Float[Tensor, "tiles 4 P"]
-
-
 def pair_rows(
     intersections: Float[Tensor, "M 10"],
     filter_centers: Float[Tensor, "M 2"],
@@ -67,33 +56,30 @@ def composite_surfels(
     pairs: TilePairs,
     offsets: Float[Tensor, "P 2"],
     rules: SurfelRules,
-) -> CompositedSurfels:
+) -> tuple[Float[Tensor, "tiles F P"], Float[Tensor, "tiles 4 P"]]:
     """Composite the pairs of each tile at each of its pixels; differentiable (once) in ``rows`` and ``features``.
 
     ``rows`` are of :func:`pair_rows`, by tile and front to back; ``offsets`` lead from a tile's midpoint to its pixel
-    centres.
+    centres. With w the weight of a surfel at a pixel and z its depth there, the result is sum w f, and sum w z,
+    sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and the median depth, 0 unless wanted.
     """
     pixels = torch.nn.functional.pad(offsets, (1, 0), value=1.0).T.contiguous()
-    return CompositedSurfels(*_CompositeSurfels.apply(rows, features, pairs.starts, pixels, rules))  # type: ignore[no-untyped-call]
+    composited: tuple[Tensor, Tensor] = _CompositeSurfels.apply(rows, features, pairs.starts, pixels, rules)  # type: ignore[no-untyped-call]
+    return composited
 
 
 class _Hits(NamedTuple):
     """Where the rays of a tile's P pixels meet R surfels; all finite.
 
-    Attributes:
-        inverse_w: 1 / W; 0 where the ray misses: W is 0, or the intersection is nearer than the near plane. [R, P]
-        u, v: Intersection in standard deviations; 0 where missed. [R, P]
-        depths: z-depth; 1 where missed. [R, P]
-        on_disc: Whether u^2 + v^2 counts, else the low-pass filter. [R, P]
-        from_center: Offset of the pixel from the filter's centre, pixels. [R, P], [R, P]
+    A ray misses where W is 0, or the intersection is nearer than the near plane.
     """
 
-    inverse_w: Float[Tensor, "R P"]
-    u: Float[Tensor, "R P"]
+    inverse_w: Float[Tensor, "R P"]  # 1 / W; 0 where missed
+    u: Float[Tensor, "R P"]  # intersection in standard deviations; 0 where missed
     v: Float[Tensor, "R P"]
-    depths: Float[Tensor, "R P"]
-    on_disc: Bool[Tensor, "R P"]
-    from_center: tuple[Float[Tensor, "R P"], Float[Tensor, "R P"]]
+    depths: Float[Tensor, "R P"]  # z-depth; 1 where missed
+    on_disc: Bool[Tensor, "R P"]  # whether u^2 + v^2 counts, else the low-pass filter
+    from_center: tuple[Float[Tensor, "R P"], Float[Tensor, "R P"]]  # offset from the filter's centre, pixels
 
 
 def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules) -> Iterator[Chunk[_Hits]]:

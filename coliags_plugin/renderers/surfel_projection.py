@@ -23,28 +23,18 @@ class ProjectedSurfels:
 
     The ray of a pixel at offset d from ``means2d`` meets the disc's plane at u = U / W and v = V / W standard
     deviations from its centre and at z-depth D / W, where (U, V, W) = ``slopes`` d + (0, 0, D / z), z the centre's
-    depth. Every entry is finite; those of surfels not ``visible`` are meaningless.
-
-    Attributes:
-        places: Centres, camera axes, scene units; a stand-in where not beyond the near plane. [N, 3]
-        tangents: Local axes 0 and 1 in camera axes, each times its standard deviation. [N, 2, 3]
-        normals: Local axis 2 in camera axes, oriented towards the camera. [N, 3]
-        means2d: Projected centres, pixels; the intersections depend on the centre's direction through these only.
-            [N, 2]
-        filter_centers: The same values, for the low-pass filter, whose gradient is none of ``means2d``. [N, 2]
-        slopes: Derivatives of U, V and W with respect to the pixel position. [N, 3, 2]
-        offsets: D: distance of the camera from the disc's plane, with a sign, scene units. [N]
-        visible: Whether beyond the near plane, of positive area and not seen exactly edge-on. [N]
+    depth. The intersections depend on the centre's direction through ``means2d`` only. Every entry is finite; those of
+    surfels not ``visible`` are meaningless.
     """
 
-    places: Float[Tensor, "N 3"]
-    tangents: Float[Tensor, "N 2 3"]
-    normals: Float[Tensor, "N 3"]
-    means2d: Float[Tensor, "N 2"]
-    filter_centers: Float[Tensor, "N 2"]
-    slopes: Float[Tensor, "N 3 2"]
-    offsets: Float[Tensor, "N"]
-    visible: Bool[Tensor, "N"]
+    places: Float[Tensor, "N 3"]  # centres, camera axes, scene units; a stand-in where not beyond the near plane
+    tangents: Float[Tensor, "N 2 3"]  # local axes 0 and 1 in camera axes, each times its standard deviation
+    normals: Float[Tensor, "N 3"]  # local axis 2 in camera axes, oriented towards the camera
+    means2d: Float[Tensor, "N 2"]  # projected centres, pixels
+    filter_centers: Float[Tensor, "N 2"]  # the same values, for the low-pass filter, whose gradient is none of means2d
+    slopes: Float[Tensor, "N 3 2"]  # derivatives of U, V and W with respect to the pixel position
+    offsets: Float[Tensor, "N"]  # D: distance of the camera from the disc's plane, with a sign, scene units
+    visible: Bool[Tensor, "N"]  # whether beyond the near plane, of positive area and not seen exactly edge-on
 
     @property
     def depths(self) -> Float[Tensor, "N"]:

@@ -28,27 +28,16 @@ Evaluated = TypeVar("Evaluated")
 
 @dataclass(frozen=True)
 class Chunk(Generic[Evaluated]):
-    """C consecutive pairs of each of G tiles, at all P pixels.
+    """C consecutive pairs of each of G tiles, at all P pixels."""
 
-    Attributes:
-        tiles: Which tiles, no two the same. [G]
-        rows: Index of each pair in the list of pairs; M, one past its end, where a tile has fewer. [G * C]
-        before: Transmittance in front of the chunk; 0 where compositing has stopped. [G, P]
-        transmittances: The same behind each pair. [G, C, P]
-        alphas: [G, C, P]
-        ratios: alpha / (1 - alpha). [G, C, P]
-        weights: alpha times the transmittance in front of the pair. [G, C, P]
-        evaluated: What else came with the alphas.
-    """
-
-    tiles: Int[Tensor, "G"]
-    rows: Int[Tensor, "GC"]
-    before: Float[Tensor, "G P"]
-    transmittances: Float[Tensor, "G C P"]
+    tiles: Int[Tensor, "G"]  # which tiles, no two the same
+    rows: Int[Tensor, "GC"]  # index of each pair in the list of pairs; M, one past its end, where a tile has fewer
+    before: Float[Tensor, "G P"]  # transmittance in front of the chunk; 0 where compositing has stopped
+    transmittances: Float[Tensor, "G C P"]  # the same behind each pair
     alphas: Float[Tensor, "G C P"]
-    ratios: Float[Tensor, "G C P"]
-    weights: Float[Tensor, "G C P"]
-    evaluated: Evaluated
+    ratios: Float[Tensor, "G C P"]  # alpha / (1 - alpha)
+    weights: Float[Tensor, "G C P"]  # alpha times the transmittance in front of the pair
+    evaluated: Evaluated  # what else came with the alphas
 
     def rows_of(self, padded: Float[Tensor, "M+1 F"]) -> Float[Tensor, "G C F"]:
         """The rows of a table that belong to the pairs. [M + 1, F] -> [G, C, F]"""

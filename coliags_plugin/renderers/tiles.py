@@ -1,4 +1,4 @@
-"""Binning of Gaussians into image tiles, front to back.
+"""Screen extent of Gaussians and surfels, and their binning into image tiles, front to back.
 
 Tiles only save work and do not change the result, because the pairs kept here are a superset of the (pixel, Gaussian)
 pairs with alpha >= alpha_min, and compositing tests each of those again.
@@ -6,21 +6,26 @@ pairs with alpha >= alpha_min, and compositing tests each of those again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from coliags_plugin.renderers.projection import ProjectedGaussians
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.renderers.projection import ProjectedGaussians, filtered_covariances
+from coliags_plugin.renderers.splatting import CutSettings
+from coliags_plugin.renderers.surfel_projection import ProjectedSurfels
 
 #: Slack on the squared Mahalanobis radius, so that rounding here never drops a pixel that compositing would draw.
-RADIUS_SLACK = 1e-2
+_RADIUS_SLACK = 1e-2
+#: Added to the squared half-axes of the ellipses, square pixels: keeps those seen nearly edge-on invertible.
+_ELLIPSE_SLACK = 1e-4
 
 
 @dataclass(frozen=True)
 class TileGrid:
-    """An image in square tiles of ``size`` pixels; the last column and row may extend beyond its edge."""
+    """An image in square tiles of ``size`` pixels, row by row; the last column and row may extend beyond its edge."""
 
     width: int
     height: int
@@ -35,16 +40,6 @@ class TileGrid:
     def rows(self) -> int:
         """Number of tile rows."""
         return -(-self.height // self.size)
-
-    @property
-    def count(self) -> int:
-        """Number of tiles, which are numbered row by row."""
-        return self.columns * self.rows
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels of a tile."""
-        return self.size * self.size
 
     def centers(self, tiles: Int[Tensor, "M"], dtype: torch.dtype) -> Float[Tensor, "M 2"]:
         """Midpoints of tiles, pixels. [M, 2]"""
@@ -84,18 +79,11 @@ class TilePairs:
 
 @dataclass(frozen=True)
 class Extents:
-    """Exact extents of the Gaussians, to where alpha falls to alpha_min.
+    """Exact extents of the Gaussians, to where alpha falls to alpha_min."""
 
-    Attributes:
-        squared_radii: tau: the squared Mahalanobis distance at which alpha = alpha_min; negative where it never
-            reaches it. [N]
-        halves: Half-extents of the ellipse along x and y, pixels. [N, 2]
-        drawn: Whether beyond the near plane and overlapping the rectangle of pixel centres. [N]
-    """
-
-    squared_radii: Float[Tensor, "N"]
-    halves: Float[Tensor, "N 2"]
-    drawn: Bool[Tensor, "N"]
+    squared_radii: Float[Tensor, "N"]  # tau: squared Mahalanobis distance where alpha = alpha_min; negative if nowhere
+    halves: Float[Tensor, "N 2"]  # half-extents of the ellipse along x and y, pixels
+    drawn: Bool[Tensor, "N"]  # whether beyond the near plane and overlapping the rectangle of pixel centres
 
 
 @torch.no_grad()
@@ -107,7 +95,7 @@ def gaussian_extents(
     halves = (tau.clamp_min(0)[:, None] * projected.covariances[:, ::2]).sqrt()
     low = torch.full_like(projected.means2d, 0.5)
     high = low.new_tensor([grid.width - 0.5, grid.height - 0.5]).expand_as(low)
-    nearest = squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
+    nearest = _squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
     return Extents(tau, halves, projected.in_front & (tau >= 0) & (nearest <= tau))
 
 
@@ -118,18 +106,104 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
     # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
     # depth keep the order they came in.
     drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
-    tau = extents.squared_radii[drawn] + RADIUS_SLACK
+    tau = extents.squared_radii[drawn] + _RADIUS_SLACK
     means2d, covariances = projected.means2d[drawn], projected.covariances[drawn]
     halves = (tau[:, None] * covariances[:, ::2]).sqrt()
-    owner, column, row = tiles_of_boxes(means2d - halves, means2d + halves, grid)
+    owner, column, row = _tiles_of_boxes(means2d - halves, means2d + halves, grid)
     low, high = grid.boxes(column, row, means2d.dtype)
     table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
-    nearest = squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
+    nearest = _squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
     kept = (nearest <= table[:, 8]).nonzero().squeeze(-1)
-    return pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
+    return _pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
 
 
-def tiles_of_boxes(
+@dataclass(frozen=True)
+class SurfelExtents:
+    """Where surfels reach alpha_min: within the image of a disc, or a circle around the centre. Pixels.
+
+    Covariances and whitenings are as :class:`ProjectedGaussians` has them, of the ellipse, at whose rim the Mahalanobis
+    distance is 1.
+    """
+
+    ellipse_centers: Float[Tensor, "N 2"]  # of the disc's image
+    covariances: Float[Tensor, "N 3"]
+    whitenings: Float[Tensor, "N 3"]
+    circle_centers: Float[Tensor, "N 2"]
+    squared_radii: Float[Tensor, "N"]  # of the circle
+    everywhere: Bool[
+        Tensor, "N"
+    ]  # whether the disc crosses the near plane: its image is no ellipse, and may be anywhere
+    low: Float[Tensor, "N 2"]  # corners of the bounding box; of the image where everywhere
+    high: Float[Tensor, "N 2"]
+    drawn: Bool[Tensor, "N"]  # whether anything is reached
+
+    @property
+    def radii(self) -> Float[Tensor, "N"]:
+        """Half the larger edge of the bounding box in pixels, rounded up, where drawn; else 0. [N]"""
+        return torch.where(self.drawn, (0.5 * (self.high - self.low)).amax(-1).ceil(), 0.0)
+
+
+@torch.no_grad()
+def surfel_extents(
+    projected: ProjectedSurfels, opacities: Float[Tensor, "N"], camera: Camera, grid: TileGrid, settings: CutSettings
+) -> SurfelExtents:
+    """Compute the extent of each surfel, and whether it overlaps the rectangle of pixel centres."""
+    tau = 2 * torch.log(opacities / settings.alpha_min)
+    bright = projected.visible & (tau >= 0)
+    level = tau.clamp_min(0) + _RADIUS_SLACK
+    rim = projected.tangents * level.sqrt()[:, None, None]
+    x, y, z = projected.places.unbind(-1)
+    # With a point of the rim at z (x/z, y/z, 1) + rim^T (cos, sin), the image is a conic: an ellipse if its z-depths,
+    # within z +- |rise|, are positive.
+    rise = rim[:, :, 2]
+    spread = rise.norm(dim=-1)
+    everywhere = z - spread <= camera.near_plane
+    span = torch.where(everywhere, 1.0, (z - spread) * (z + spread))[:, None]
+    row_x = camera.fx * (rim[:, :, 0] - (x / z)[:, None] * rise)
+    row_y = camera.fy * (rim[:, :, 1] - (y / z)[:, None] * rise)
+    along_x, along_y = ((row * rise).sum(-1, keepdim=True) / span for row in (row_x, row_y))
+    bend = rise / (z[:, None] + span.sqrt())
+    images = (row_x / span.sqrt() + along_x * bend, row_y / span.sqrt() + along_y * bend)
+    flat_x, flat_y = (torch.nn.functional.pad(row, (0, 1)) for row in images)
+    covariances, whitenings = filtered_covariances(flat_x, flat_y, _ELLIPSE_SLACK)
+    ellipse_centers = projected.means2d - torch.cat([along_x, along_y], dim=-1)
+    halves = covariances[:, ::2].sqrt()
+    squared_radii = level * settings.surfel_filter**2
+    radii = squared_radii.sqrt()[:, None]
+    centers = projected.filter_centers
+    low = torch.minimum(ellipse_centers - halves, centers - radii)
+    high = torch.maximum(ellipse_centers + halves, centers + radii)
+    size = low.new_tensor([grid.width, grid.height])
+    low, high = (torch.where(everywhere[:, None], edge, box) for edge, box in ((size * 0, low), (size, high)))
+    extents = SurfelExtents(
+        ellipse_centers, covariances, whitenings, centers, squared_radii, everywhere, low, high, bright
+    )
+    overlaps = _overlaps(extents, slice(None), torch.full_like(low, 0.5), (size - 0.5).expand_as(low))
+    return replace(extents, drawn=bright & overlaps)
+
+
+@torch.no_grad()
+def bin_surfels(projected: ProjectedSurfels, extents: SurfelExtents, grid: TileGrid) -> TilePairs:
+    """Pair the drawn surfels with the tiles they reach."""
+    drawn = extents.drawn.nonzero().squeeze(-1)
+    drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
+    owner, column, row = _tiles_of_boxes(extents.low[drawn], extents.high[drawn], grid)
+    low, high = grid.boxes(column, row, extents.low.dtype)
+    kept = _overlaps(extents, drawn[owner], low, high).nonzero().squeeze(-1)
+    return _pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
+
+
+def _overlaps(extents: SurfelExtents, index: Tensor | slice, low: Tensor, high: Tensor) -> Bool[Tensor, "M"]:
+    """Whether surfels reach rectangles. [M], [M, 2], [M, 2]"""
+    in_ellipse = _squared_distance_to_box(
+        extents.ellipse_centers[index], extents.covariances[index], extents.whitenings[index], low, high
+    )
+    centers = extents.circle_centers[index]
+    to_circle = (centers - centers.maximum(low).minimum(high)).square().sum(-1)
+    return extents.everywhere[index] | (in_ellipse <= 1) | (to_circle <= extents.squared_radii[index])
+
+
+def _tiles_of_boxes(
     low: Float[Tensor, "N 2"], high: Float[Tensor, "N 2"], grid: TileGrid
 ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"]]:
     """Pairs of a box and a tile that it touches, in the order of the boxes: index of the box, column and row.
@@ -151,16 +225,16 @@ def tiles_of_boxes(
     return owner, column, row + first_tile[:, 1].int()[owner]
 
 
-def pairs_by_tile(
+def _pairs_by_tile(
     gaussian: Int[Tensor, "M"], column: Int[Tensor, "M"], row: Int[Tensor, "M"], grid: TileGrid
 ) -> TilePairs:
     """Sort pairs by tile; within a tile they keep their order. [M], [M], [M]"""
     tile, order = torch.sort(row * grid.columns + column, stable=True)
-    starts = torch.searchsorted(tile, torch.arange(grid.count + 1, dtype=tile.dtype, device=tile.device))
+    starts = torch.searchsorted(tile, torch.arange(grid.columns * grid.rows + 1, dtype=tile.dtype, device=tile.device))
     return TilePairs(gaussian=gaussian[order], tile=tile.long(), starts=starts)
 
 
-def squared_distance_to_box(
+def _squared_distance_to_box(
     means2d: Float[Tensor, "M 2"],
     covariances: Float[Tensor, "M 3"],
     whitenings: Float[Tensor, "M 3"],

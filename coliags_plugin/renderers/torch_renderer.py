@@ -20,10 +20,9 @@ from coliags_plugin.renderers.projection import facing_normals, project_gaussian
 from coliags_plugin.renderers.splatting import CutSettings, DrawnView, SplattingRenderer, split_channels
 from coliags_plugin.renderers.surfel_compositing import SurfelRules, composite_surfels, pair_rows
 from coliags_plugin.renderers.surfel_projection import project_surfels
-from coliags_plugin.renderers.surfel_tiles import bin_surfels, surfel_extents
-from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
+from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, bin_surfels, gaussian_extents, surfel_extents
 
-#: Outputs in the order of :attr:`coliags_plugin.renderers.surfel_compositing.CompositedSurfels.depths`.
+#: Outputs in the order of the depths of :func:`composite_surfels`.
 _OF_SURFELS = ("depth_accumulated", "inverse_depth_accumulated", "distortion", "depth_median")
 
 
@@ -119,10 +118,10 @@ def _draw_surfels(
     origins = grid.centers(pairs.tile, of_pairs.dtype)
     rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
     rules = SurfelRules(settings, camera.near_plane, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
-    composited = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
-    maps = split_channels(grid.to_image(composited.features), features)
+    sums, depths = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
+    maps = split_channels(grid.to_image(sums), features)
     if rules.depths:
-        maps |= dict(zip(_OF_SURFELS, grid.to_image(composited.depths).unbind(-1), strict=True))
+        maps |= dict(zip(_OF_SURFELS, grid.to_image(depths).unbind(-1), strict=True))
         # m = far / (far - near) (1 - near / z) is linear in 1 / z.
         maps["distortion"] = maps["distortion"] * settings.distortion_slope(camera.near_plane) ** 2
     return _over_background(maps, projected.means2d, extents.radii, settings)

@@ -55,7 +55,7 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, circle, k
 
     Writes the pairs from ``pair`` on and counts those of each tile from ``counted`` on; returns the index after the last.
     """
-    records, bounds = projections.records, projections.bounds
+    records, bounds = projections.outlines, projections.bounds
     for tile in range(counted, counted + grid.tiles):
         pairs.tile_counts[tile] = 0
     block_left = vec.fma(vec.lane_columns(), layout.BLOCK, 0.5)

@@ -13,40 +13,25 @@ from coliags_plugin.renderers.numba_kernels import layout
 
 
 class Projected(NamedTuple):
-    """Sixteen Gaussians in camera coordinates; those not ``in_front`` have a stand-in position.
+    """Sixteen Gaussians in camera coordinates; those not ``in_front`` have a stand-in position."""
 
-    Attributes:
-        in_front: Whether beyond the near plane.
-        offset: From the camera's centre, world axes.
-        x, y, z: The same in camera axes.
-        inverse_z: 1 / z
-        slope_x, slope_y: x / z and y / z, clamped.
-        follows_x, follows_y: Where they are not.
-        rotation: Rows of the rotation matrix.
-        quaternion: Normalised, w first.
-        inverse_norm: 1 / length of the quaternion given.
-        squared_norm: Its length, squared.
-        image_x, image_y: Rows of J C^T: pixels moved along x or y for a step in the world.
-        local_x, local_y: The same for a step along the local axes: rows of J C^T R.
-    """
-
-    in_front: vec.LaneMask
-    offset: tuple[vec.Vector, ...]
-    x: vec.Vector
+    in_front: vec.LaneMask  # whether beyond the near plane
+    offset: tuple[vec.Vector, ...]  # from the camera's centre, world axes
+    x: vec.Vector  # the same in camera axes
     y: vec.Vector
     z: vec.Vector
     inverse_z: vec.Vector
-    slope_x: vec.Vector
-    slope_y: vec.Vector
-    follows_x: vec.LaneMask
+    slope_x: vec.Vector  # x / z, clamped
+    slope_y: vec.Vector  # y / z, clamped
+    follows_x: vec.LaneMask  # where it is not
     follows_y: vec.LaneMask
-    rotation: tuple[tuple[vec.Vector, ...], ...]
-    quaternion: tuple[vec.Vector, ...]
-    inverse_norm: vec.Vector
-    squared_norm: vec.Vector
-    image_x: tuple[vec.Vector, ...]
+    rotation: tuple[tuple[vec.Vector, ...], ...]  # rows of the rotation matrix
+    quaternion: tuple[vec.Vector, ...]  # normalised, w first
+    inverse_norm: vec.Vector  # 1 / length of the quaternion given
+    squared_norm: vec.Vector  # its length, squared
+    image_x: tuple[vec.Vector, ...]  # rows of J C^T: pixels moved along x or y for a step in the world
     image_y: tuple[vec.Vector, ...]
-    local_x: tuple[vec.Vector, ...]
+    local_x: tuple[vec.Vector, ...]  # the same for a step along the local axes: rows of J C^T R
     local_y: tuple[vec.Vector, ...]
 
 
@@ -71,14 +56,8 @@ def project_axes(mean, quat, view):
     z = vec.select(in_front, z, 1.0)
     inverse_z = vec.div(1.0, z)
     free_x, free_y = vec.mul(x, inverse_z), vec.mul(y, inverse_z)
-    slope_x_min, slope_x_max = (
-        vec.broadcast(view, layout.VIEW_SLOPE_X_MIN),
-        vec.broadcast(view, layout.VIEW_SLOPE_X_MAX),
-    )
-    slope_y_min, slope_y_max = (
-        vec.broadcast(view, layout.VIEW_SLOPE_Y_MIN),
-        vec.broadcast(view, layout.VIEW_SLOPE_Y_MAX),
-    )
+    limits = vec.broadcast_all(view, layout.VIEW_SLOPE_LIMITS, (0, 0, 0, 0))
+    slope_x_min, slope_x_max, slope_y_min, slope_y_max = limits
     slope_x = vec.larger(vec.smaller(free_x, slope_x_max), slope_x_min)
     slope_y = vec.larger(vec.smaller(free_y, slope_y_max), slope_y_min)
     follows_x = vec.both(vec.at_least(free_x, slope_x_min), vec.at_most(free_x, slope_x_max))

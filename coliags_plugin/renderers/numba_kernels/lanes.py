@@ -126,11 +126,7 @@ def _is_numeric(numba_type: types.Type) -> bool:
 
 def _elements(operands: Sequence[types.Type]) -> list[types.Type]:
     """The types of all operands, of the elements where they are tuples."""
-    return [
-        kind
-        for operand in operands
-        for kind in (operand if isinstance(operand, types.BaseTuple) else [operand])
-    ]  # fmt: skip
+    return [kind for given in operands for kind in (given if isinstance(given, types.BaseTuple) else [given])]
 
 
 def _result_type(operands: Sequence[types.Type]) -> types.Type:
@@ -213,13 +209,10 @@ def _write(builder: ir.IRBuilder, value: ir.Value, address: ir.Value) -> None:
 def _lanewise(
     name: str, arity: int, emit: Callable[..., ir.Value], result: types.Type | None = None
 ) -> Callable[..., Intrinsic]:
-    """An operation on numbers, lane by lane.
+    """An operation on numbers, lane by lane; ``name`` is for error messages.
 
-    Args:
-        name: For error messages.
-        arity: How many operands.
-        emit: Gets the builder and one vector for each operand, and gives the vector of the result.
-        result: Type of the result, of one element where operands are tuples; None for that of the operands.
+    ``emit`` gets the builder and one vector for each operand, and gives that of the result, whose type (of one element where
+    operands are tuples) is ``result``, None for that of the operands.
     """
 
     def typed(*operands: types.Type) -> ir.Value:
@@ -337,13 +330,8 @@ def select(typingctx: Context, mask: types.Type, chosen: types.Type, other: type
         pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
         if length is None:
             return builder.select(arguments[0], *(_as_lanes(builder, *pair, kind) for pair in pairs))
-        return _pack(
-            builder,
-            [
-                builder.select(arguments[0], *(_element(builder, *pair, index, kind) for pair in pairs))
-                for index in range(length)
-            ],
-        )
+        elements = ([_element(builder, *pair, index, kind) for pair in pairs] for index in range(length))
+        return _pack(builder, [builder.select(arguments[0], *chosen) for chosen in elements])
 
     return (kind if length is None else types.UniTuple(kind, length))(mask, chosen, other), generate
 
@@ -464,96 +452,92 @@ prefetch = _prefetching("prefetch", 0)
 prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 
-@intrinsic
-def load_all(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
-    """As many vectors, one behind the other from ``table[index]`` on, as the tuple ``like`` is long."""
-    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
-        return _pack(builder, [_read(builder, place) for place in places])
-
-    return _tuple_of_lanes(len(like))(table, types.intp, like), generate
+def _places(builder: ir.IRBuilder, address: ir.Value, count: int) -> list[ir.Value]:
+    return [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(count)]
 
 
-@intrinsic
-def store_all(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
-    """A tuple of vectors, one behind the other, to ``table[index]`` and on."""
-    if not (_is_table(table) and isinstance(values, types.BaseTuple)):
-        return None
+def _reading_all(
+    name: str, form: ir.Type, emit: Callable[[ir.IRBuilder, list[ir.Value]], list[ir.Value]]
+) -> Callable[..., Intrinsic]:
+    """An operation that reads as many of ``form`` from ``table[index]`` on as a tuple is long; ``emit`` gets their places."""
 
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        for place in range(len(values)):
-            vector = _element(builder, arguments[2], signature.args[2], place)
-            _write(builder, vector, builder.gep(address, [ir.Constant(_INT, place)]))
-        return context.get_dummy_value()
+    def typed(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
+        if not (_is_table(table) and isinstance(like, types.BaseTuple)):
+            return None
 
-    return types.none(table, types.intp, values), generate
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+            address = _address(context, builder, signature.args[0], *arguments[:2], form)
+            return _pack(builder, emit(builder, _places(builder, address, len(like))))
 
+        return _tuple_of_lanes(len(like))(table, types.intp, like), generate
 
-@intrinsic
-def broadcast_all(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
-    """Consecutive numbers from ``table[index]`` on, each in all lanes of its vector; as many as ``like`` is long."""
-    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2], _FLOAT)
-        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
-        return _pack(builder, [_repeat(builder, _read(builder, place)) for place in places])
-
-    return _tuple_of_lanes(len(like))(table, types.intp, like), generate
+    typed.__name__ = name
+    return intrinsic(typed)
 
 
-@intrinsic
-def load_columns(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
-    """The columns of a matrix with sixteen rows, as many columns as ``like`` is long, which starts at ``index``."""
-    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
-        return None
-    columns = len(like)
+def _writing_all(
+    name: str, emit: Callable[[ir.IRBuilder, list[ir.Value], list[ir.Value]], None]
+) -> Callable[..., Intrinsic]:
+    """An operation that writes a tuple of vectors from ``table[index]`` on; ``emit`` gets them and as many places."""
 
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(columns)]
-        if columns == WIDTH:
-            return _pack(builder, _transposed(builder, [_read(builder, place) for place in places]))
-        kind = ir.VectorType(_FLOAT, WIDTH * columns)
-        flat = _read(builder, builder.bitcast(address, kind.as_pointer()))
-        picks = [[row * columns + column for row in range(WIDTH)] for column in range(columns)]
-        return _pack(builder, [_shuffle(builder, flat, flat, picked) for picked in picks])
+    def typed(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
+        if not (_is_table(table) and isinstance(values, types.BaseTuple)):
+            return None
 
-    return _tuple_of_lanes(columns)(table, types.intp, like), generate
-
-
-@intrinsic
-def store_columns(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
-    """The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on."""
-    if not (_is_table(table) and isinstance(values, types.BaseTuple)):
-        return None
-    columns = len(values)
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        vectors = [_element(builder, arguments[2], signature.args[2], column) for column in range(columns)]
-        if columns == WIDTH:
-            for row, vector in enumerate(_transposed(builder, vectors)):
-                _write(builder, vector, builder.gep(address, [ir.Constant(_INT, row)]))
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+            address = _address(context, builder, signature.args[0], *arguments[:2])
+            vectors = [_element(builder, arguments[2], signature.args[2], place) for place in range(len(values))]
+            emit(builder, vectors, _places(builder, address, len(values)))
             return context.get_dummy_value()
-        while len(vectors) & (len(vectors) - 1):
-            vectors.append(ir.Constant(_LANES, ir.Undefined))
-        whole = vectors
-        while len(whole) > 1:
-            width = 2 * whole[0].type.count
-            whole = [_shuffle(builder, a, b, list(range(width))) for a, b in zip(whole[::2], whole[1::2], strict=True)]
-        picks = [column * WIDTH + row for row in range(WIDTH) for column in range(columns)]
-        flat = _shuffle(builder, whole[0], whole[0], picks)
-        _write(builder, flat, builder.bitcast(address, flat.type.as_pointer()))
-        return context.get_dummy_value()
 
-    return types.none(table, types.intp, values), generate
+        return types.none(table, types.intp, values), generate
+
+    typed.__name__ = name
+    return intrinsic(typed)
+
+
+def _emit_load_columns(builder: ir.IRBuilder, places: list[ir.Value]) -> list[ir.Value]:
+    columns = len(places)
+    if columns == WIDTH:
+        return _transposed(builder, [_read(builder, place) for place in places])
+    kind = ir.VectorType(_FLOAT, WIDTH * columns)
+    flat = _read(builder, builder.bitcast(places[0], kind.as_pointer()))
+    picks = [[row * columns + column for row in range(WIDTH)] for column in range(columns)]
+    return [_shuffle(builder, flat, flat, picked) for picked in picks]
+
+
+def _emit_store_columns(builder: ir.IRBuilder, vectors: list[ir.Value], places: list[ir.Value]) -> None:
+    columns = len(vectors)
+    if columns == WIDTH:
+        _emit_store_all(builder, _transposed(builder, vectors), places)
+        return
+    while len(vectors) & (len(vectors) - 1):
+        vectors.append(ir.Constant(_LANES, ir.Undefined))
+    while len(vectors) > 1:
+        width = list(range(2 * vectors[0].type.count))
+        vectors = [_shuffle(builder, a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
+    picks = [column * WIDTH + row for row in range(WIDTH) for column in range(columns)]
+    flat = _shuffle(builder, vectors[0], vectors[0], picks)
+    _write(builder, flat, builder.bitcast(places[0], flat.type.as_pointer()))
+
+
+def _emit_store_all(builder: ir.IRBuilder, vectors: list[ir.Value], places: list[ir.Value]) -> None:
+    for vector, place in zip(vectors, places, strict=True):
+        _write(builder, vector, place)
+
+
+#: As many vectors, one behind the other from ``table[index]`` on, as a tuple is long
+load_all = _reading_all("load_all", _LANES, lambda builder, places: [_read(builder, place) for place in places])
+#: Consecutive numbers from ``table[index]`` on, as many as a tuple is long, each in all lanes of its vector
+broadcast_all = _reading_all(
+    "broadcast_all", _FLOAT, lambda builder, places: [_repeat(builder, _read(builder, place)) for place in places]
+)
+#: The columns of a matrix with sixteen rows from ``table[index]`` on, as many columns as a tuple is long
+load_columns = _reading_all("load_columns", _LANES, _emit_load_columns)
+#: A tuple of vectors, one behind the other, to ``table[index]`` and on
+store_all = _writing_all("store_all", _emit_store_all)
+#: The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on
+store_columns = _writing_all("store_columns", _emit_store_columns)
 
 
 def _transposed(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
@@ -655,18 +639,14 @@ def _summed(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
     return parts[0]
 
 
-@intrinsic
-def lane_columns(typingctx: Context) -> Intrinsic:
-    """0, 1, 2, 3 four times over: column of a lane's pixel in a block of 4 x 4, or of a block in a tile."""
-    values = [float(lane % 4) for lane in range(WIDTH)]
-    return lanes(), lambda context, builder, signature, arguments: _constant(values)
+def _fixed(values: Sequence[float]) -> Callable[..., Intrinsic]:
+    return intrinsic(lambda typingctx: (lanes(), lambda context, builder, signature, arguments: _constant(values)))
 
 
-@intrinsic
-def lane_rows(typingctx: Context) -> Intrinsic:
-    """Each of 0, 1, 2, 3 four times: row of a lane's pixel in a block of 4 x 4. Also the row of a block in a tile."""
-    values = [float(lane // 4) for lane in range(WIDTH)]
-    return lanes(), lambda context, builder, signature, arguments: _constant(values)
+#: Column of a lane's pixel in a block of 4 x 4, or of a block in a tile: 0, 1, 2, 3 four times over
+lane_columns = _fixed([float(lane % 4) for lane in range(WIDTH)])
+#: Row of a lane's pixel in a block, or of a block in a tile: each of 0, 1, 2, 3 four times
+lane_rows = _fixed([float(lane // 4) for lane in range(WIDTH)])
 
 
 @intrinsic

@@ -68,10 +68,7 @@ VIEW_FX = 12
 VIEW_FY = 13
 VIEW_CX = 14
 VIEW_CY = 15
-VIEW_SLOPE_X_MIN = 16  # where the Jacobian is clamped
-VIEW_SLOPE_X_MAX = 17
-VIEW_SLOPE_Y_MIN = 18
-VIEW_SLOPE_Y_MAX = 19
+VIEW_SLOPE_LIMITS = 16  # least and largest x / z, then y / z: where the Jacobian is clamped
 VIEW_NEAR = 20
 VIEW_LOW_PASS = 21
 VIEW_WIDTH = 22
@@ -95,15 +92,16 @@ class Parameters(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """Channels composited besides colour, in this order."""
+    """Channels composited besides colour, in this order; ``median`` has one element where its depth is wanted, else none."""
 
     depth: bool
     inverse_depth: bool
     normals: bool
+    median: tuple[int, ...]
 
 
 #: Channels of a sweep over features, where colours, depths and normals are in the first one.
-FEATURES = Extras(depth=True, inverse_depth=True, normals=True)
+FEATURES = Extras(depth=True, inverse_depth=True, normals=True, median=())
 
 
 class Grid(NamedTuple):
@@ -116,21 +114,15 @@ class Grid(NamedTuple):
 
 
 class Projections(NamedTuple):
-    """Output of the projection, padded to whole groups.
+    """Output of the projection, padded to whole groups."""
 
-    Attributes:
-        records: One row for each Gaussian; anything where it is not drawn.
-        depths: z-depths; 1 where not in front of the camera.
-        bounds: First and last column, first and last row of the tiles within reach. [4 for each Gaussian]
-        drawn: One bit for each Gaussian of a group. [groups]
-        parcels: Gaussians drawn, -1 where one cannot be used; and tiles within their bounds. [2 for each parcel]
-    """
-
-    records: Array
-    depths: Array
-    bounds: Array
-    drawn: Array
-    parcels: Array
+    records: Array  # one row for each Gaussian; anything where it is not drawn
+    outlines: Array  # the same for binning: of surfels see surfel_layout, of 3D Gaussians the records
+    remainders: Array  # what float32 leaves of the projected centres, pixels; 2 for each surfel, none for 3D Gaussians
+    depths: Array  # z-depths; 1 where not in front of the camera
+    bounds: Array  # first and last column, first and last row of the tiles within reach; 4 for each Gaussian
+    drawn: Array  # one bit for each Gaussian of a group
+    parcels: Array  # Gaussians drawn, -1 where one cannot be used, and tiles within their bounds; 2 for each parcel
 
 
 class Pairs(NamedTuple):
@@ -149,25 +141,15 @@ class Pairs(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """The same pairs by tile and front to back; they are called entries there.
+    """The same pairs by tile and front to back; they are called entries there."""
 
-    Attributes:
-        keys: Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits.
-        entry_counts: Entries of each of them. [Gaussians drawn]
-        stretch_entries: Number of the first entry of each stretch of ``keys``, and how many there are. [stretches + 1]
-        cells: See ``CELL``. [3 for each entry]
-        starts: First entry of each tile, and how many there are. [tiles + 1]
-        order: Tiles, long lists first. [tiles]
-        reached: End of the entries of each tile that any pixel gets to see; known after the forward sweep. [tiles]
-    """
-
-    keys: Array
-    entry_counts: Array
-    stretch_entries: Array
-    cells: Array
-    starts: Array
-    order: Array
-    reached: Array
+    keys: Array  # Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits
+    entry_counts: Array  # entries of each of them
+    stretch_entries: Array  # number of the first entry of each stretch of keys, and at the end how many there are
+    cells: Array  # see CELL; 3 for each entry
+    starts: Array  # first entry of each tile, and at the end how many there are
+    order: Array  # tiles, long lists first
+    reached: Array  # end of the entries of each tile that any pixel gets to see; known after the forward sweep
 
 
 class Images(NamedTuple):

@@ -5,14 +5,28 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 
 from coliags_plugin.core.numba_compilation import Array
-from coliags_plugin.renderers.numba_kernels import binning, layout, sorting
+from coliags_plugin.renderers.numba_kernels import (
+    binning,
+    layout,
+    sorting,
+    surfel_layout,
+    surfel_sweep_backward,
+    surfel_sweep_forward,
+    sweep_backward,
+    sweep_forward,
+)
 from coliags_plugin.renderers.numba_kernels.buffers import ArenaPool, Results
+from coliags_plugin.renderers.numba_kernels.projection import project
+from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
+from coliags_plugin.renderers.numba_kernels.surfel_projection import project_surfels
+from coliags_plugin.renderers.numba_kernels.surfel_projection_backward import gather_surfels, project_surfels_backward
 from coliags_plugin.renderers.numba_kernels.threads import Crew
 
 #: Pieces of work per thread where their costs differ.
@@ -38,14 +52,24 @@ class TooManyPairsError(Exception):
 class Layer(NamedTuple):
     """What one pair of sweeps composites.
 
-    ``records`` has a row of sixteen for each Gaussian, ``channels`` is any tuple as long as there are channels in them, and
-    ``own`` is what is composited besides, in the form that the sweeps take it.
+    ``channels`` is any tuple as long as there are channels in the records of ``projections``, and ``own`` is what is
+    composited besides, ``layout.Extras`` or ``surfel_layout.Measures``.
     """
 
-    records: Array
+    projections: layout.Projections
     view: Array
     channels: tuple[int, ...]
     own: Any
+
+
+class Kernels(NamedTuple):
+    """The kernels of one primitive; of the sweeps, the modules, which also say how much memory a thread needs."""
+
+    project: Callable[..., None]
+    sweep_forward: ModuleType
+    sweep_backward: ModuleType
+    gather: Callable[..., None]
+    project_backward: Callable[..., None]
 
 
 class Pipeline(ABC):
@@ -55,16 +79,20 @@ class Pipeline(ABC):
     expected is.
     """
 
+    kernels: ClassVar[Kernels]
     #: Scales of a Gaussian.
     scales: ClassVar[int]
+    #: Whether Gaussians also reach a circle, the low-pass filter's: outlines differ from records then.
+    circles: ClassVar[bool]
     #: Images without derivatives.
     constant_images: ClassVar[tuple[str, ...]]
     #: First of the channels' columns of records, and of sums.
     first_channel: ClassVar[int]
     first_channel_sum: ClassVar[int]
-    #: How many feature channels one sweep composites, and the images that hold them.
+    #: How many feature channels one sweep composites, the images that hold them, and what is composited besides.
     feature_channels: ClassVar[int]
     feature_images: ClassVar[tuple[str, ...]]
+    feature_own: ClassVar[Any]
 
     def __init__(self, view: Array, width: int, height: int, wanted: Collection[str]) -> None:
         columns = -(-width // layout.TILE)
@@ -79,57 +107,42 @@ class Pipeline(ABC):
         self._composited: Array
         self._feature_composited: Array
 
-    # --- the kernels of one primitive ---------------------------------------------------------------------------------
-
     @abstractmethod
     def _main_layer(self) -> Layer:
         """Colours and all that is wanted besides."""
 
-    @abstractmethod
-    def _feature_layer(self, records: Array, view: Array) -> Layer:
-        """Feature channels."""
-
-    @abstractmethod
-    def _outlines(self) -> tuple[layout.Projections, tuple[int, ...]]:
-        """What ``find_pairs`` takes as projections and circle."""
-
-    @abstractmethod
-    def _sums_size(self, layer: Layer, rows: int) -> int:
-        """Numbers in the sums of so many Gaussians or entries."""
-
-    @abstractmethod
     def _composited_vectors(self, layer: Layer) -> int:
         """Vectors that a forward sweep leaves of each block."""
+        return 1 + len(layer.channels)
 
-    @abstractmethod
-    def _run_project(self, run: Runner, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
-        """Project."""
+    def _sums_size(self, layer: Layer, rows: int) -> int:
+        """Numbers in the sums of so many Gaussians or entries: sixteen, or with one more behind those of all."""
+        return (layout.ROW + (self.first_channel_sum + len(layer.channels) > layout.ROW)) * rows
 
-    @abstractmethod
-    def _run_sweep(self, run: Runner, layer: Layer, composited: Array, images: layout.Images) -> None:
-        """Composite."""
+    def _sweep(self, run: Runner, stage: ModuleType, layer: Layer, *tables: Any) -> None:
+        """Run a sweep, which takes or writes the tables."""
+        numbers = self._arena.take("numbers", run.workers * stage.NUMBERS)
+        scratch = layout.Scratch(numbers, self._arena.take("integers", run.workers * stage.INTEGERS, np.int32))
+        run(
+            stage.sweep,
+            layer.projections,
+            self._bins,
+            layer.view,
+            self._grid,
+            layer.channels,
+            layer.own,
+            scratch,
+            *tables,
+        )
 
-    @abstractmethod
-    def _run_sweep_backward(
-        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
+    def _sweep_backward(
+        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, sums: Array, of_means2d: Array
     ) -> None:
-        """Find the sums of entries."""
-
-    @abstractmethod
-    def _run_gather(self, run: Runner, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
         """Find the sums of Gaussians, and the derivative with respect to the projected centres."""
-
-    @abstractmethod
-    def _run_project_backward(
-        self,
-        run: Runner,
-        gaussians: layout.Parameters,
-        sums: Array,
-        given_means2d: Array,
-        of_gaussians: layout.Parameters,
-        of_pose: Array,
-    ) -> None:
-        """Find the derivatives with respect to Gaussians and pose."""
+        entry_sums = self._arena.take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
+        self._sweep(run, self.kernels.sweep_backward, layer, composited, _flat_images(of_images), entry_sums)
+        gathered = (entry_sums, sums, of_means2d.reshape(-1))
+        run(self.kernels.gather, layer.projections, self._bins, layer.view, layer.channels, *gathered)
 
     # --- stages -------------------------------------------------------------------------------------------------------
 
@@ -142,16 +155,20 @@ class Pipeline(ABC):
         self._count = count = len(gaussians.opacities)
         groups, filled, take = -(-count // layout.GROUP), self._filled, self._arena.take
         self._tail = _tail(gaussians, count, self.scales)
+        records = take("records", layout.ROW * filled)
         self._projections = layout.Projections(
-            records=take("records", layout.ROW * filled),
+            records=records,
+            outlines=take("outlines", len(records)) if self.circles else records,
+            remainders=take("remainders", 2 * filled * self.circles),
             depths=take("depths", filled),
             bounds=take("bounds", 4 * filled),
             drawn=take("drawn", groups, np.int64),
             parcels=take("parcels", 2 * -(-count // layout.PARCEL), np.int64),
         )
         means2d, radii = _results.take(filled, 2), _results.take(filled)
+        written = (self._projections, means2d.reshape(-1), radii)
         with _workers() as run:
-            self._run_project(run, gaussians, means2d.reshape(-1), radii)
+            run(self.kernels.project, count, gaussians, self._tail, self._view, self._main_layer().own, *written)
         if count and self._projections.parcels[::2].min() < 0:
             raise UnusableGaussianError
         return means2d[:count], radii[:count], take("links", self._sums_size(self._main_layer(), filled))
@@ -163,7 +180,7 @@ class Pipeline(ABC):
         with _workers() as run:
             self._bin(run)
             self._composited = self._arena.take("composited", self._composited_size(layer))
-            self._run_sweep(run, layer, self._composited, _flat_images(images))
+            self._sweep(run, self.kernels.sweep_forward, layer, self._composited, _flat_images(images))
         return images
 
     def composite_features(self, features: Array) -> Array:
@@ -178,9 +195,9 @@ class Pipeline(ABC):
         self._feature_composited = self._arena.take("feature_composited", sweeps * size)
         with _workers() as run:
             for sweep in range(sweeps):
-                images = self._feature_images()
+                layer, images = self._features_layer(features, sweep), self._feature_images()
                 composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._run_sweep(run, self._features_layer(features, sweep), composited, _flat_images(images))
+                self._sweep(run, self.kernels.sweep_forward, layer, composited, _flat_images(images))
                 result[..., width * sweep : width * (sweep + 1)] = self._joined(images)
         return result[..., :count]
 
@@ -191,9 +208,7 @@ class Pipeline(ABC):
         channels, and the derivative with respect to the features [N, C].
         """
         width, filled, first_sum = self.feature_channels, self._filled, self.first_channel_sum
-        layer = self._features_layer(features, 0)
-        size = self._composited_size(layer)
-        entry_sums = self._arena.take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
+        size = self._composited_size(self._features_layer(features, 0))
         part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
         total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
         result = np.empty_like(features)
@@ -204,8 +219,7 @@ class Pipeline(ABC):
                 self._part_into(of_features[..., first : first + width], given)
                 layer = self._features_layer(features, sweep)
                 composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._run_sweep_backward(run, layer, composited, _flat_images(given), entry_sums)
-                self._run_gather(run, layer, entry_sums, part, of_part.reshape(-1))
+                self._sweep_backward(run, layer, composited, given, part, of_part)
                 rows = part.reshape(filled, layout.ROW)
                 total[:, :first_sum] += rows[:, :first_sum]
                 of_means2d += of_part
@@ -221,13 +235,11 @@ class Pipeline(ABC):
         Returns the derivative with respect to the projected centres [N, 2], and the sums of each Gaussian, which are good until
         the next call.
         """
-        layer, filled, take = self._main_layer(), self._filled, self._arena.take
-        entry_sums = take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
-        gaussian_sums = take("gaussian_sums", self._sums_size(layer, filled))
+        layer, filled = self._main_layer(), self._filled
+        gaussian_sums = self._arena.take("gaussian_sums", self._sums_size(layer, filled))
         of_means2d = _results.take(filled, 2)
         with _workers() as run:
-            self._run_sweep_backward(run, layer, self._composited, _flat_images(of_images), entry_sums)
-            self._run_gather(run, layer, entry_sums, gaussian_sums, of_means2d.reshape(-1))
+            self._sweep_backward(run, layer, self._composited, of_images, gaussian_sums, of_means2d)
         return of_means2d[: self._count], gaussian_sums
 
     def project_backward(
@@ -237,17 +249,18 @@ class Pipeline(ABC):
 
         Returns those with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
-        filled = self._filled
+        filled, layer = self._filled, self._main_layer()
         given = self._arena.take("given_means2d", 2 * filled)
         given[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
         given[2 * self._count :] = 0.0
         if gaussian_sums is None:
-            gaussian_sums = np.zeros(self._sums_size(self._main_layer(), filled), np.float32)
+            gaussian_sums = np.zeros(self._sums_size(layer, filled), np.float32)
         of_pose = self._arena.take("of_pose", layout.ROW * -(-self._count // layout.PARCEL))
         results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self.scales, 1, 3)))
         flat = layout.Parameters(*(result.reshape(-1) for result in results))
+        tables = (layer.channels, layer.own, self._projections, gaussian_sums, given, flat, of_pose)
         with _workers() as run:
-            self._run_project_backward(run, gaussians, gaussian_sums, given, flat, of_pose)
+            run(self.kernels.project_backward, self._count, gaussians, self._tail, self._view, *tables)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
         return layout.Parameters(*(result[: self._count] for result in results)), columns.T
 
@@ -264,7 +277,7 @@ class Pipeline(ABC):
         rows[:, : part.shape[1]] = part
         view = self._view.copy()
         view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
-        return self._feature_layer(records, view)
+        return Layer(self._projections._replace(records=records), view, (0,) * width, self.feature_own)
 
     def _feature_images(self) -> layout.Images:
         """Images for the channels of a sweep."""
@@ -317,8 +330,8 @@ class Pipeline(ABC):
             ends=take("pair_ends", stretches, np.int64),
             tile_counts=take("tile_counts", stretches * grid.tiles, np.int32),
         )
-        projections, circle = self._outlines()
-        run(binning.find_pairs, projections, self._view, grid, circle, bins.keys, pairs, bins.entry_counts)
+        circle = (0,) * self.circles
+        run(binning.find_pairs, self._projections, self._view, grid, circle, bins.keys, pairs, bins.entry_counts)
         binning.place_entries(grid, pairs, bins)
         run(binning.sort_pairs, grid, pairs, bins)
 
@@ -356,10 +369,51 @@ class Pipeline(ABC):
         """Numbers that a forward sweep leaves."""
         return 16 * layout.BLOCKS * self._grid.tiles * self._composited_vectors(layer)
 
-    def _scratch(self, run: Runner, sweep: Any) -> layout.Scratch:
-        """Memory for all threads of a sweep."""
-        numbers = self._arena.take("numbers", run.workers * sweep.NUMBERS)
-        return layout.Scratch(numbers, self._arena.take("integers", run.workers * sweep.INTEGERS, np.int32))
+
+class GaussianPipeline(Pipeline):
+    """Rendering of 3D Gaussians."""
+
+    kernels: ClassVar[Kernels] = Kernels(project, sweep_forward, sweep_backward, gather, project_backward)
+    scales: ClassVar[int] = 3
+    circles: ClassVar[bool] = False
+    constant_images: ClassVar[tuple[str, ...]] = ("median",)
+    first_channel: ClassVar[int] = layout.CHANNELS
+    first_channel_sum: ClassVar[int] = layout.SUM_CHANNELS
+    feature_channels: ClassVar[int] = layout.MAX_CHANNELS
+    feature_images: ClassVar[tuple[str, ...]] = ("rgb", "depth", "inverse_depth", "normals")
+    feature_own: ClassVar[layout.Extras] = layout.FEATURES
+
+    def _main_layer(self) -> Layer:
+        depth, inverse_depth, normals = (name in self._wanted for name in ("depth", "inverse_depth", "normals"))
+        extras = layout.Extras(depth, inverse_depth, normals, (0,) * ("median" in self._wanted))
+        channels = (0,) * (3 + depth + inverse_depth + 3 * normals)
+        return Layer(self._projections, self._view, channels, extras)
+
+
+class SurfelPipeline(Pipeline):
+    """Rendering of surfels, whose measures differ from pixel to pixel."""
+
+    kernels: ClassVar[Kernels] = Kernels(
+        project_surfels, surfel_sweep_forward, surfel_sweep_backward, gather_surfels, project_surfels_backward
+    )
+    scales: ClassVar[int] = 2
+    circles: ClassVar[bool] = True
+    constant_images: ClassVar[tuple[str, ...]] = ()
+    first_channel: ClassVar[int] = surfel_layout.CHANNELS
+    first_channel_sum: ClassVar[int] = surfel_layout.SUM_CHANNELS
+    feature_channels: ClassVar[int] = surfel_layout.ROW_CHANNELS
+    feature_images: ClassVar[tuple[str, ...]] = ("rgb", "normals")
+    feature_own: ClassVar[surfel_layout.Measures] = surfel_layout.NOTHING
+
+    def _main_layer(self) -> Layer:
+        measures = surfel_layout.Measures(*((0,) * (name in self._wanted) for name in surfel_layout.Measures._fields))
+        channels = (0,) * (3 + 3 * ("normals" in self._wanted))
+        return Layer(self._projections, self._view, channels, measures)
+
+    def _composited_vectors(self, layer: Layer) -> int:
+        measures = layer.own
+        of_measures = len(measures.depth) + len(measures.inverse_depth) + 2 * len(measures.distortion)
+        return super()._composited_vectors(layer) + of_measures
 
 
 class Runner:

@@ -23,7 +23,7 @@ SMALLEST_SQUARED_NORM = 1e-24
 
 
 @kernel
-def project(counters, count, gaussians, tail, view, extras, projections, means2d, radii):
+def project(counters, count, gaussians, tail, view, own, projections, means2d, radii):
     """Project all Gaussians and compute their extents.
 
     Written are ``projections``, ``means2d`` in pixels and ``radii`` in pixels, 0 where not drawn. ``tail`` are the Gaussians
@@ -34,9 +34,9 @@ def project(counters, count, gaussians, tail, view, extras, projections, means2d
     for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
-        drawn, tiles = _project_groups(first, last, first, gaussians, view, extras, projections, means2d, radii)
+        drawn, tiles = _project_groups(first, last, first, gaussians, view, own, projections, means2d, radii)
         if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-            more, more_tiles = _project_groups(last, last + 1, 0, tail, view, extras, projections, means2d, radii)
+            more, more_tiles = _project_groups(last, last + 1, 0, tail, view, own, projections, means2d, radii)
             drawn = -1 if drawn < 0 or more < 0 else drawn + more
             tiles += more_tiles
         projections.parcels[2 * parcel] = drawn
@@ -51,18 +51,14 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
     """
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
-    log2_alpha_min, low_pass = (
-        vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN),
-        vec.broadcast(view, layout.VIEW_LOW_PASS),
-    )
+    log2_alpha_min = vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)
+    low_pass = vec.broadcast(view, layout.VIEW_LOW_PASS)
     right_edge = vec.sub(vec.broadcast(view, layout.VIEW_WIDTH), 0.5)
     bottom_edge = vec.sub(vec.broadcast(view, layout.VIEW_HEIGHT), 0.5)
     for group in range(first, last):
         row = layout.GROUP * (group - first + source)
-        mean, scale = (
-            vec.load_columns(gaussians.means, 3 * row, three),
-            vec.load_columns(gaussians.scales, 3 * row, three),
-        )
+        mean = vec.load_columns(gaussians.means, 3 * row, three)
+        scale = vec.load_columns(gaussians.scales, 3 * row, three)
         quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
         color = vec.load_columns(gaussians.colors, 3 * row, three)
         at = project_axes(mean, quat, view)
@@ -78,12 +74,9 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
         u_yy = vec.mul(layout.U_FACTOR, vec.sqrt(vec.div(xx, determinant)))
         slope_upright, slope_level = vec.div(xy, xx), vec.div(xy, yy)
         u_yx = vec.neg(vec.mul(u_yy, slope_upright))
-        mean_x = vec.fma(
-            vec.broadcast(view, layout.VIEW_FX), vec.mul(at.x, at.inverse_z), vec.broadcast(view, layout.VIEW_CX)
-        )
-        mean_y = vec.fma(
-            vec.broadcast(view, layout.VIEW_FY), vec.mul(at.y, at.inverse_z), vec.broadcast(view, layout.VIEW_CY)
-        )
+        slope_x, slope_y = vec.mul(at.x, at.inverse_z), vec.mul(at.y, at.inverse_z)
+        mean_x = vec.fma(vec.broadcast(view, layout.VIEW_FX), slope_x, vec.broadcast(view, layout.VIEW_CX))
+        mean_y = vec.fma(vec.broadcast(view, layout.VIEW_FY), slope_y, vec.broadcast(view, layout.VIEW_CY))
 
         log2_opacity = vec.log2(opacity)
         reach = vec.sub(log2_opacity, log2_alpha_min)
@@ -97,36 +90,28 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
 
         tau = vec.mul(vec.add(reach, layout.REACH_SLACK), 1.0 / layout.U_FACTOR_SQUARED)
         half_x, half_y = vec.sqrt(vec.mul(tau, xx)), vec.sqrt(vec.mul(tau, yy))
-        column_first, column_last = (
-            tile_at(vec.sub(mean_x, half_x), right_edge),
-            tile_at(vec.add(mean_x, half_x), right_edge),
-        )
-        row_first, row_last = (
-            tile_at(vec.sub(mean_y, half_y), bottom_edge),
-            tile_at(vec.add(mean_y, half_y), bottom_edge),
-        )
-        vec.store_columns(
-            projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last)
-        )
-        area = vec.mul(vec.add(vec.sub(column_last, column_first), 1.0), vec.add(vec.sub(row_last, row_first), 1.0))
-        tiles += int(vec.lane(vec.lane_sums((vec.select(shown, area, 0.0),)), 0))
-        flags = vec.bits(shown)
-        drawn += vec.bit_count(flags)
-        projections.drawn[group] = flags
+        columns = (tile_at(vec.sub(mean_x, half_x), right_edge), tile_at(vec.add(mean_x, half_x), right_edge))
+        rows = (tile_at(vec.sub(mean_y, half_y), bottom_edge), tile_at(vec.add(mean_y, half_y), bottom_edge))
+        more, more_tiles = store_extents(group, shown, columns, rows, projections)
+        drawn, tiles = drawn + more, tiles + more_tiles
 
         vec.store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
         vec.store(projections.depths, layout.GROUP * group, at.z)
-        normal = (
-            _facing_normals(at, scale, view) if extras.normals else (vec.splat(0.0), vec.splat(0.0), vec.splat(0.0))
-        )
-        whole = (
-            (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity)
-            + color
-            + _without_gaps(at.z, at.inverse_z, normal, extras)
-            + (slope_upright, slope_level)
-        )
+        normal = _facing_normals(at, scale, view) if extras.normals else vec.repeat(0.0, three)
+        whole = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + color
+        whole = whole + _without_gaps(at.z, at.inverse_z, normal, extras) + (slope_upright, slope_level)
         vec.store_columns(projections.records, layout.ROW * layout.GROUP * group, whole)
     return (drawn if usable else -1), tiles
+
+
+@inline
+def store_extents(group, shown, columns, rows, projections):
+    """Write the first and last columns and rows of tiles of a group; how many of it are drawn, and tiles within bounds."""
+    vec.store_columns(projections.bounds, 4 * layout.GROUP * group, columns + rows)
+    area = vec.mul(vec.add(vec.sub(columns[1], columns[0]), 1.0), vec.add(vec.sub(rows[1], rows[0]), 1.0))
+    flags = vec.bits(shown)
+    projections.drawn[group] = flags
+    return vec.bit_count(flags), int(vec.lane(vec.lane_sums((vec.select(shown, area, 0.0),)), 0))
 
 
 @inline

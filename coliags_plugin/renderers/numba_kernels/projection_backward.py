@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
@@ -22,61 +24,77 @@ _PLAIN_FOURTH = _PLAIN_SQUARE * _PLAIN_SQUARE
 _AHEAD = 16
 
 
-@kernel
-def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
-    """Sum the gradient sums of each Gaussian's entries, 0 where it is not drawn.
+def gathering(of_center: Callable[..., tuple[float, float]], row_channels: int) -> Callable[..., None]:
+    """Compile the summing of the gradient sums of each Gaussian's entries, 0 where it is not drawn.
 
-    Written are ``gaussian_sums`` and the derivative with respect to the projected centres.
+    ``of_center`` gives the derivative with respect to the projected centre from the sums; with more than ``row_channels``
+    channels there is a seventeenth sum, of the last one.
     """
-    groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
-    per_parcel = layout.PARCEL // layout.GROUP
-    for first in pieces(counters, 0, groups, per_parcel):
-        clear_undrawn(first, min(first + per_parcel, groups), projections.drawn, gaussian_sums, of_means2d)
-    for stretch in pieces(counters, 1, stretches):
-        first, last = count * stretch // stretches, count * (stretch + 1) // stretches
-        entry = bins.stretch_entries[stretch]
-        _gather_stretch(first, last, entry, projections.records, bins, entry_sums, gaussian_sums, of_means2d)
+
+    @part
+    def gather_all(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d):
+        groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
+        records, entries_further, further = (
+            projections.records,
+            layout.ROW * bins.starts[-1],
+            layout.ROW * layout.GROUP * groups,
+        )
+        for group in pieces(counters, 0, groups):
+            flags = projections.drawn[group] ^ 0xFFFF
+            while flags:
+                index = layout.GROUP * group + vec.lowest_bit(flags)
+                flags &= flags - 1
+                vec.store(gaussian_sums, layout.ROW * index, 0.0)
+                of_means2d[2 * index] = 0.0
+                of_means2d[2 * index + 1] = 0.0
+                if len(channels) > row_channels:
+                    gaussian_sums[further + index] = 0.0
+        for stretch in pieces(counters, 1, stretches):
+            first, last = count * stretch // stretches, count * (stretch + 1) // stretches
+            entry = bins.stretch_entries[stretch]
+            for place in range(first, last):
+                ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
+                vec.prefetch(records, layout.ROW * ahead)
+                vec.prefetch_to_write(gaussian_sums, layout.ROW * ahead)
+                vec.prefetch_to_write(of_means2d, 2 * ahead)
+                index = bins.keys[place] & NUMBER
+                total, last_total = vec.splat(0.0), np.float32(0.0)
+                for _ in range(bins.entry_counts[place]):
+                    total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
+                    if len(channels) > row_channels:
+                        last_total += vec.number(entry_sums, entries_further + entry)
+                    entry += 1
+                vec.store(gaussian_sums, layout.ROW * index, total)
+                if len(channels) > row_channels:
+                    gaussian_sums[further + index] = last_total
+                of_means2d[2 * index], of_means2d[2 * index + 1] = of_center(total, records, layout.ROW * index, view)
+
+    return gather_all
 
 
-@part
-def clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):
-    """Write zeros for the Gaussians of groups ``first`` to ``last`` that are not drawn."""
-    for group in range(first, last):
-        flags = drawn[group] ^ 0xFFFF
-        while flags:
-            index = layout.GROUP * group + vec.lowest_bit(flags)
-            flags &= flags - 1
-            vec.store(gaussian_sums, layout.ROW * index, 0.0)
-            of_means2d[2 * index] = 0.0
-            of_means2d[2 * index + 1] = 0.0
-
-
-@part
-def _gather_stretch(first, last, entry, records, bins, entry_sums, gaussian_sums, of_means2d):
-    """Gaussians with indices ``first`` to ``last`` in the sorted list, whose entries are those from ``entry`` on."""
+@inline
+def _of_center(total, records, row, view):
+    """Derivative with respect to a projected centre."""
     square = np.float32(_PLAIN_SQUARE)
-    for place in range(first, last):
-        ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
-        vec.prefetch(records, layout.ROW * ahead)
-        vec.prefetch_to_write(gaussian_sums, layout.ROW * ahead)
-        vec.prefetch_to_write(of_means2d, 2 * ahead)
-        index = bins.keys[place] & NUMBER
-        row = layout.ROW * index
-        total = vec.splat(0.0)
-        for _ in range(bins.entry_counts[place]):
-            total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
-            entry += 1
-        vec.store(gaussian_sums, row, total)
-        e, f = vec.lane(total, layout.SUM_E), vec.lane(total, layout.SUM_F)
-        of_x = vec.number(records, row + layout.U_XX) * e + vec.number(records, row + layout.U_YX) * f
-        of_means2d[2 * index] = square * of_x
-        of_means2d[2 * index + 1] = square * (vec.number(records, row + layout.U_YY) * f)
+    e, f = vec.lane(total, layout.SUM_E), vec.lane(total, layout.SUM_F)
+    of_x = vec.number(records, row + layout.U_XX) * e + vec.number(records, row + layout.U_YX) * f
+    return square * of_x, square * (vec.number(records, row + layout.U_YY) * f)
+
+
+_gather = gathering(_of_center, layout.ROW - layout.SUM_CHANNELS)
+
+
+@kernel
+def gather(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d):
+    """Write ``gaussian_sums`` and the derivative with respect to the projected centres."""
+    _gather(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d)
 
 
 @kernel
 def project_backward(
-    counters, count, gaussians, tail, view, extras, projections, gaussian_sums, given_means2d, of_gaussians, of_pose
-):
+    counters, count, gaussians, tail, view, channels, extras, projections, gaussian_sums, given_means2d, of_gaussians,
+    of_pose,
+):  # fmt: skip
     """Derivatives of the loss with respect to Gaussians and pose, from the sums of each Gaussian.
 
     ``of_pose`` gets those with respect to the camera's three axes and its centre in the world, one row for each parcel.
@@ -110,10 +128,8 @@ def _project_groups_backward(
     for group in range(first, last):
         shown = vec.from_bits(projections.drawn[group])
         row = layout.GROUP * (group - first + source)
-        mean, scale = (
-            vec.load_columns(gaussians.means, 3 * row, three),
-            vec.load_columns(gaussians.scales, 3 * row, three),
-        )
+        mean = vec.load_columns(gaussians.means, 3 * row, three)
+        scale = vec.load_columns(gaussians.scales, 3 * row, three)
         quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
         at = project_axes(mean, quat, view)
         row = layout.GROUP * group
@@ -121,9 +137,8 @@ def _project_groups_backward(
         by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
 
         row_x, row_y = vec.mul(at.local_x, scale), vec.mul(at.local_y, scale)
-        by_xx, by_xy, by_yy = _covariance_derivative(
-            vec.load_columns(projections.records, layout.ROW * row, (0,) * 16), sums
-        )
+        record = vec.load_columns(projections.records, layout.ROW * row, (0,) * 16)
+        by_xx, by_xy, by_yy = _covariance_derivative(record, sums)
         of_row_x = vec.fma(by_xx, row_x, vec.mul(by_xy, row_y))
         of_row_y = vec.fma(by_xy, row_x, vec.mul(by_yy, row_y))
         of_scale = vec.fma(of_row_x, at.local_x, vec.mul(of_row_y, at.local_y))
@@ -138,10 +153,8 @@ def _project_groups_backward(
         of_c = vec.fma(at.image_x[2], of_local_x, vec.mul(at.image_y[2], of_local_y))
 
         # image_x = fx / z (right - slope_x forward), where slope_x follows x / z unless it is clamped.
-        to_right, to_down = (
-            vec.mul(vec.mul(fx, at.inverse_z), of_image_x),
-            vec.mul(vec.mul(fy, at.inverse_z), of_image_y),
-        )
+        to_right = vec.mul(vec.mul(fx, at.inverse_z), of_image_x)
+        to_down = vec.mul(vec.mul(fy, at.inverse_z), of_image_y)
         to_forward = vec.neg(vec.fma(at.slope_x, to_right, vec.mul(at.slope_y, to_down)))
         of_slope_x = vec.select(at.follows_x, vec.neg(vec.dot(forward, to_right, 0.0)), 0.0)
         of_slope_y = vec.select(at.follows_y, vec.neg(vec.dot(forward, to_down, 0.0)), 0.0)
@@ -159,11 +172,7 @@ def _project_groups_backward(
             axis = shortest_column(at.rotation, second, third)
             of_normal = vec.mul(vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), -1.0, 1.0), of_normal)
             of_axis = vec.fma(of_normal[0], right, vec.fma(of_normal[1], down, vec.mul(of_normal[2], forward)))
-            chosen = (
-                vec.select(third, 0.0, vec.select(second, 0.0, 1.0)),
-                vec.select(third, 0.0, vec.select(second, 1.0, 0.0)),
-            )
-            chosen = (chosen[0], chosen[1], vec.select(third, 1.0, 0.0))
+            chosen = vec.select(third, (0.0, 0.0, 1.0), vec.select(second, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
             of_a, of_b = vec.fma(of_axis[0], chosen, of_a), vec.fma(of_axis[1], chosen, of_b)
             of_c = vec.fma(of_axis[2], chosen, of_c)
             to_right, to_down = vec.fma(of_normal[0], axis, to_right), vec.fma(of_normal[1], axis, to_down)
@@ -175,10 +184,7 @@ def _project_groups_backward(
         of_down = vec.add(of_down, vec.select(shown, vec.fma(of_y, at.offset, to_down), nothing))
         of_forward = vec.add(of_forward, vec.select(shown, vec.fma(of_z, at.offset, to_forward), nothing))
 
-        of_quat = quaternion_derivative(at.quaternion, of_a, of_b, of_c)
-        # Its length does not matter.
-        along = vec.dot(of_quat, at.quaternion, 0.0)
-        of_quat = vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_quat))
+        of_quat = quaternion_derivative(at, of_a, of_b, of_c)
         of_color = (sums[layout.SUM_CHANNELS], sums[layout.SUM_CHANNELS + 1], sums[layout.SUM_CHANNELS + 2])
         vec.store_columns(of_gaussians.means, 3 * row, of_mean)
         vec.store_columns(of_gaussians.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
@@ -197,12 +203,8 @@ def _covariance_derivative(record, sums):
     u_xx, u_yx, u_yy = record[layout.U_XX], record[layout.U_YX], record[layout.U_YY]
     sum_ee, sum_ef, sum_ff = sums[layout.SUM_EE], sums[layout.SUM_EF], sums[layout.SUM_FF]
     right_e, right_f = vec.fma(sum_ee, u_xx, vec.mul(sum_ef, u_yx)), vec.fma(sum_ef, u_xx, vec.mul(sum_ff, u_yx))
-    xx, xy, yy = (
-        vec.fma(u_xx, right_e, vec.mul(u_yx, right_f)),
-        vec.mul(u_yy, right_f),
-        vec.mul(u_yy, vec.mul(u_yy, sum_ff)),
-    )
-    return vec.mul(_PLAIN_FOURTH, (xx, xy, yy))
+    xx, yy = vec.fma(u_xx, right_e, vec.mul(u_yx, right_f)), vec.mul(u_yy, vec.mul(u_yy, sum_ff))
+    return vec.mul(_PLAIN_FOURTH, (xx, vec.mul(u_yy, right_f), yy))
 
 
 @inline
@@ -219,17 +221,13 @@ def _extra_sums(sums, extras):
 
 
 @inline
-def quaternion_derivative(quaternion, a, b, c):
-    """Derivative with respect to a unit quaternion, w first, from that with respect to the rows of its rotation."""
-    w, x, y, z = quaternion
+def quaternion_derivative(at, a, b, c):
+    """Derivative with respect to the quaternion given, w first, from that with respect to the rows of its rotation."""
+    w, x, y, z = at.quaternion
     turn_x, turn_y, turn_z = vec.sub(c[1], b[2]), vec.sub(a[2], c[0]), vec.sub(b[0], a[1])
     xy, xz, yz = vec.add(a[1], b[0]), vec.add(a[2], c[0]), vec.add(b[2], c[1])
-    less_x, less_y, less_z = (
-        vec.mul(-2.0, vec.add(b[1], c[2])),
-        vec.mul(-2.0, vec.add(a[0], c[2])),
-        vec.mul(-2.0, vec.add(a[0], b[1])),
-    )
-    return vec.mul(
+    less_x, less_y, less_z = vec.mul(-2.0, (vec.add(b[1], c[2]), vec.add(a[0], c[2]), vec.add(a[0], b[1])))
+    of_unit = vec.mul(
         2.0,
         (
             vec.fma(x, turn_x, vec.fma(y, turn_y, vec.mul(z, turn_z))),
@@ -238,3 +236,6 @@ def quaternion_derivative(quaternion, a, b, c):
             vec.fma(w, turn_z, vec.fma(x, xz, vec.fma(y, yz, vec.mul(z, less_z)))),
         ),
     )
+    # The length does not matter.
+    along = vec.dot(of_unit, at.quaternion, 0.0)
+    return vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_unit))

@@ -20,32 +20,23 @@ _ROUNDING = 1e-5
 class Placed(NamedTuple):
     """Sixteen surfels before the camera; those not ``in_front`` have a stand-in position in camera axes.
 
-    Attributes:
-        in_front: Whether the centre is beyond the near plane.
-        offset: Of the centre from the camera's, world axes.
-        x, y, z: The same in camera axes.
-        inverse_z: 1 / z
-        quaternion: Normalised, w first.
-        inverse_norm: 1 / length of the quaternion given.
-        first, second, normal: Local axes in the world: columns of the rotation.
-        height: Of the disc's plane above the camera, along the normal; 0 where edge-on.
-        of_first, of_second, of_z: Where a ray (x, y, 1), turned into the world, meets the plane: its products with these
-            are the coordinates along the two axes, from the centre, and 1, all divided by the z-depth there. Infinite
-            where edge-on.
+    A ray (x, y, 1), turned into the world, meets the disc's plane where its products with ``of_first``, ``of_second`` and
+    ``of_z`` are the coordinates along the two axes, from the centre, and 1, all divided by the z-depth there. These three
+    are infinite where edge-on.
     """
 
-    in_front: vec.LaneMask
-    offset: tuple[vec.Vector, ...]
-    x: vec.Vector
+    in_front: vec.LaneMask  # whether the centre is beyond the near plane
+    offset: tuple[vec.Vector, ...]  # of the centre from the camera's, world axes
+    x: vec.Vector  # the same in camera axes
     y: vec.Vector
     z: vec.Vector
     inverse_z: vec.Vector
-    quaternion: tuple[vec.Vector, ...]
-    inverse_norm: vec.Vector
-    first: tuple[vec.Vector, ...]
+    quaternion: tuple[vec.Vector, ...]  # normalised, w first
+    inverse_norm: vec.Vector  # 1 / length of the quaternion given
+    first: tuple[vec.Vector, ...]  # local axes in the world: columns of the rotation
     second: tuple[vec.Vector, ...]
     normal: tuple[vec.Vector, ...]
-    height: vec.Vector
+    height: vec.Vector  # of the disc's plane above the camera, along the normal; 0 where edge-on
     of_first: tuple[vec.Vector, ...]
     of_second: tuple[vec.Vector, ...]
     of_z: tuple[vec.Vector, ...]

@@ -9,7 +9,7 @@ from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, squared_distance_to_box
-from coliags_plugin.renderers.numba_kernels.projection import are_usable, tile_at
+from coliags_plugin.renderers.numba_kernels.projection import are_usable, store_extents, tile_at
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show, place_surfels
 from coliags_plugin.renderers.numba_kernels.threads import pieces
 
@@ -22,24 +22,19 @@ _LARGEST_SLOPE = 1e10
 
 
 @kernel
-def project_surfels(counters, count, surfels, tail, view, projections, outlines, remainders, means2d, radii):
+def project_surfels(counters, count, surfels, tail, view, own, projections, means2d, radii):
     """Project all surfels and compute their extents.
 
-    Written are, besides what ``projection.project`` writes, ``outlines`` and what float32 leaves of the projected centres in
-    pixels, ``remainders``.
+    Written is what ``projection.project`` writes, with outlines and remainders.
     """
     whole_groups = count // layout.GROUP
     per_parcel = layout.PARCEL // layout.GROUP
     for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
-        drawn, tiles = _project_groups(
-            first, last, first, surfels, view, projections, outlines, remainders, means2d, radii
-        )
+        drawn, tiles = _project_groups(first, last, first, surfels, view, projections, means2d, radii)
         if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-            more, more_tiles = _project_groups(
-                last, last + 1, 0, tail, view, projections, outlines, remainders, means2d, radii
-            )
+            more, more_tiles = _project_groups(last, last + 1, 0, tail, view, projections, means2d, radii)
             drawn = -1 if drawn < 0 or more < 0 else drawn + more
             tiles += more_tiles
         projections.parcels[2 * parcel] = drawn
@@ -47,31 +42,22 @@ def project_surfels(counters, count, surfels, tail, view, projections, outlines,
 
 
 @part
-def _project_groups(first, last, source, surfels, view, projections, outlines, remainders, means2d, radii):
-    """Project groups ``first`` to ``last``, reading from group ``source`` of the surfels on.
-
-    Returns:
-        The number of surfels drawn, -1 where one is invalid; and the number of tiles within their bounds.
-    """
+def _project_groups(first, last, source, surfels, view, projections, means2d, radii):
+    """As ``projection._project_groups``."""
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
     right, down, forward = camera_axes(view)
     fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
     log2_alpha_min, near = vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), vec.broadcast(view, layout.VIEW_NEAR)
     pixel_scale = vec.broadcast(view, layout.VIEW_PIXEL_SCALE)
-    right_edge = vec.sub(vec.broadcast(view, layout.VIEW_WIDTH), 0.5)
-    bottom_edge = vec.sub(vec.broadcast(view, layout.VIEW_HEIGHT), 0.5)
-    half_size = vec.mul(
-        0.5, vec.larger(vec.broadcast(view, layout.VIEW_WIDTH), vec.broadcast(view, layout.VIEW_HEIGHT))
-    )
+    width, height = vec.broadcast(view, layout.VIEW_WIDTH), vec.broadcast(view, layout.VIEW_HEIGHT)
+    right_edge, bottom_edge = vec.sub(width, 0.5), vec.sub(height, 0.5)
+    half_size = vec.mul(0.5, vec.larger(width, height))
     for group in range(first, last):
         row = layout.GROUP * (group - first + source)
         mean, scale = vec.load_columns(surfels.means, 3 * row, three), vec.load_columns(surfels.scales, 2 * row, (0, 0))
-        quat, color = (
-            vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)),
-            vec.load_columns(surfels.colors, 3 * row, three),
-        )
-        opacity = vec.load(surfels.opacities, row)
+        quat, opacity = vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), vec.load(surfels.opacities, row)
+        color = vec.load_columns(surfels.colors, 3 * row, three)
         squared_norm = vec.dot(quat, quat, 0.0)
         all_scales = (scale[0], scale[1], scale[1])
         usable = usable and vec.bits(are_usable(mean, squared_norm, all_scales, opacity, color)) == 0xFFFF
@@ -82,14 +68,12 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         wide_y = vec.fma(fy, slope_y, vec.broadcast(view, layout.VIEW_CY))
         mean_x, mean_y = vec.narrow(wide_x), vec.narrow(wide_y)
         remainder = vec.narrow((vec.sub(wide_x, mean_x), vec.sub(wide_y, mean_y)))
-        vec.store_columns(remainders, 2 * layout.GROUP * group, remainder)
+        vec.store_columns(projections.remainders, 2 * layout.GROUP * group, remainder)
         per_x, per_y = vec.div(at.z, vec.mul(fx, pixel_scale)), vec.div(at.z, vec.mul(fy, pixel_scale))
         u_x, u_y = _slopes(at.of_first, right, down, per_x, per_y, scale[0])
         v_x, v_y = _slopes(at.of_second, right, down, per_x, per_y, scale[1])
-        q_x, q_y = (
-            vec.narrow(vec.mul(per_x, vec.dot(right, at.of_z, 0.0))),
-            vec.narrow(vec.mul(per_y, vec.dot(down, at.of_z, 0.0))),
-        )
+        q_x, q_y = vec.mul(per_x, vec.dot(right, at.of_z, 0.0)), vec.mul(per_y, vec.dot(down, at.of_z, 0.0))
+        q_x, q_y = vec.narrow((q_x, q_y))
         normal = vec.select(vec.greater(at.height, 0.0), vec.neg(at.normal), at.normal)
         normal = vec.narrow((vec.dot(right, normal, 0.0), vec.dot(down, normal, 0.0), vec.dot(forward, normal, 0.0)))
 
@@ -100,14 +84,9 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         # The rim, about the centre: pixels moved along x and y for a step along the two axes, and the change of depth.
         image_x, image_y = vec.fma(vec.neg(slope_x), forward, right), vec.fma(vec.neg(slope_y), forward, down)
         scale_x, scale_y = vec.mul(fx, at.inverse_z), vec.mul(fy, at.inverse_z)
-        rim_x = vec.mul(
-            vec.narrow(vec.mul(scale_x, (vec.dot(image_x, at.first, 0.0), vec.dot(image_x, at.second, 0.0)))),
-            deviations,
-        )
-        rim_y = vec.mul(
-            vec.narrow(vec.mul(scale_y, (vec.dot(image_y, at.first, 0.0), vec.dot(image_y, at.second, 0.0)))),
-            deviations,
-        )
+        rim_x = vec.mul(scale_x, (vec.dot(image_x, at.first, 0.0), vec.dot(image_x, at.second, 0.0)))
+        rim_y = vec.mul(scale_y, (vec.dot(image_y, at.first, 0.0), vec.dot(image_y, at.second, 0.0)))
+        rim_x, rim_y = vec.mul(vec.narrow(rim_x), deviations), vec.mul(vec.narrow(rim_y), deviations)
         rise = vec.mul(vec.narrow((vec.dot(forward, at.first, 0.0), vec.dot(forward, at.second, 0.0))), deviations)
         z = vec.narrow(at.z)
         crosses, shift_x, shift_y, rim_x, rim_y = _bent(rim_x, rim_y, rise, z, near)
@@ -129,10 +108,8 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         outwards = vec.mul(pixel_scale, (out_x, out_y))
         in_circle = vec.dot(outwards, outwards, 0.0)
         shown = vec.either(crosses, vec.at_most(vec.smaller(in_ellipse, in_circle), level))
-        shown = vec.both(
-            vec.both(shown, at.in_front),
-            vec.both(vec.at_least(reach, 0.0), vec.greater(vec.smaller(scale[0], scale[1]), 0.0)),
-        )
+        shown = vec.both(vec.both(shown, at.in_front), vec.at_least(reach, 0.0))
+        shown = vec.both(shown, vec.greater(vec.smaller(scale[0], scale[1]), 0.0))
         shown = vec.both(shown, vec.either(vec.less(at.height, 0.0), vec.greater(at.height, 0.0)))
 
         half_x, half_y, radius = vec.sqrt(xx), vec.sqrt(yy), vec.div(vec.sqrt(level), pixel_scale)
@@ -144,8 +121,8 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         vec.store(radii, layout.GROUP * group, vec.select(shown, vec.ceil(half), 0.0))
         left, end = vec.select(crosses, 0.0, left), vec.select(crosses, right_edge, end)
         top, bottom = vec.select(crosses, 0.0, top), vec.select(crosses, bottom_edge, bottom)
-        column_first, column_last = tile_at(left, right_edge), tile_at(end, right_edge)
-        row_first, row_last = tile_at(top, bottom_edge), tile_at(bottom, bottom_edge)
+        columns = (tile_at(left, right_edge), tile_at(end, right_edge))
+        rows = (tile_at(top, bottom_edge), tile_at(bottom, bottom_edge))
         # Most discs that cross the near plane are beside the camera: drawn, but in no tile.
         slopes, largest_q = (u_x, u_y, v_x, v_y, q_x, q_y), vec.smaller(vec.div(z, near), surfel_layout.LARGE)
         size_x, size_y = vec.mul(0.5, vec.sub(right_edge, 0.5)), vec.mul(0.5, vec.sub(bottom_edge, 0.5))
@@ -153,22 +130,16 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         size_x, size_y = vec.mul(pixel_scale, (size_x, size_y))
         seen = may_show(slopes, vec.sqrt(level), largest_q, middle[0], middle[1], size_x, size_y)
         absent = vec.select(vec.either(seen, vec.at_most(in_circle, level)), 0.0, vec.select(crosses, 1.0, 0.0))
-        column_first, column_last = vec.select(vec.greater(absent, 0.0), (0.0, -1.0), (column_first, column_last))
-        vec.store_columns(
-            projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last)
-        )
-        area = vec.mul(vec.add(vec.sub(column_last, column_first), 1.0), vec.add(vec.sub(row_last, row_first), 1.0))
-        tiles += int(vec.lane(vec.lane_sums((vec.select(shown, area, 0.0),)), 0))
-        flags = vec.bits(shown)
-        drawn += vec.bit_count(flags)
-        projections.drawn[group] = flags
+        columns = vec.select(vec.greater(absent, 0.0), (0.0, -1.0), columns)
+        more, more_tiles = store_extents(group, shown, columns, rows, projections)
+        drawn, tiles = drawn + more, tiles + more_tiles
 
         vec.store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
         vec.store(projections.depths, layout.GROUP * group, z)
         u_xx, u_yy = vec.select(crosses, (0.0, largest_q), (u_xx, u_yy))
         outline = (u_xx, u_yx, u_yy, center_x, center_y, log2_opacity, mean_x, mean_y)
         outline = outline + slopes + (slope_upright, slope_level)
-        vec.store_columns(outlines, layout.ROW * layout.GROUP * group, outline)
+        vec.store_columns(projections.outlines, layout.ROW * layout.GROUP * group, outline)
         record = slopes + (mean_x, mean_y, log2_opacity, z) + color + normal
         vec.store_columns(projections.records, layout.ROW * layout.GROUP * group, record)
     return (drawn if usable else -1), tiles
@@ -194,10 +165,8 @@ def _bent(rim_x, rim_y, rise, z, near):
     crosses = vec.at_most(vec.sub(z, spread), near)
     span = vec.select(crosses, 1.0, vec.mul(vec.sub(z, spread), vec.add(z, spread)))
     root = vec.sqrt(span)
-    shift_x, shift_y = (
-        vec.mul(z, vec.div(vec.dot(rim_x, rise, 0.0), span)),
-        vec.mul(z, vec.div(vec.dot(rim_y, rise, 0.0), span)),
-    )
+    shift_x = vec.mul(z, vec.div(vec.dot(rim_x, rise, 0.0), span))
+    shift_y = vec.mul(z, vec.div(vec.dot(rim_y, rise, 0.0), span))
     bend, shrink = vec.div(rise, vec.add(z, root)), vec.div(z, root)
     bent_x, bent_y = vec.fma(shrink, rim_x, vec.mul(shift_x, bend)), vec.fma(shrink, rim_y, vec.mul(shift_y, bend))
     return crosses, shift_x, shift_y, bent_x, bent_y

@@ -16,84 +16,45 @@ from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes
-from coliags_plugin.renderers.numba_kernels.projection_backward import clear_undrawn, quaternion_derivative
-from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
+from coliags_plugin.renderers.numba_kernels.projection_backward import gathering, quaternion_derivative
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
 from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Turns products of two of the scaled e and f into those of standard deviations; and of one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
 _PLAIN = 1.0 / layout.U_FACTOR
-#: Prefetch distance, surfels.
-_AHEAD = 16
+
+
+@inline
+def _of_center(total, records, row, view):
+    """Derivative with respect to a projected centre."""
+    scale, square = vec.number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
+    e, f = square * vec.lane(total, surfel_layout.SUM_E), square * vec.lane(total, surfel_layout.SUM_F)
+    c = vec.lane(total, surfel_layout.SUM_C)
+    of_x = vec.number(records, row + surfel_layout.U_X) * e + vec.number(records, row + surfel_layout.V_X) * f
+    of_y = vec.number(records, row + surfel_layout.U_Y) * e + vec.number(records, row + surfel_layout.V_Y) * f
+    of_x, of_y = (
+        of_x + vec.number(records, row + surfel_layout.Q_X) * c,
+        of_y + vec.number(records, row + surfel_layout.Q_Y) * c,
+    )
+    return scale * of_x, scale * of_y
+
+
+_gather = gathering(_of_center, surfel_layout.ROW_CHANNELS)
 
 
 @kernel
-def gather_surfels(counters, records, drawn, bins, view, channels, entry_sums, surfel_sums, of_means2d):
-    """Sum the gradient sums of each surfel's entries, 0 where it is not drawn.
-
-    Written are ``surfel_sums`` and the derivative with respect to the projected centres.
-    """
-    groups, count, stretches = len(drawn), len(bins.keys), len(bins.stretch_entries) - 1
-    per_parcel = layout.PARCEL // layout.GROUP
-    for first in pieces(counters, 0, groups, per_parcel):
-        last = min(first + per_parcel, groups)
-        clear_undrawn(first, last, drawn, surfel_sums, of_means2d)
-        if len(channels) > surfel_layout.ROW_CHANNELS:
-            for group in range(first, last):
-                if drawn[group] != 0xFFFF:
-                    _clear_further(group, drawn[group], groups, surfel_sums)
-    for stretch in pieces(counters, 1, stretches):
-        first, last = count * stretch // stretches, count * (stretch + 1) // stretches
-        entry = bins.stretch_entries[stretch]
-        _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d)
-
-
-@part
-def _clear_further(group, flags, groups, surfel_sums):
-    """Write zeros for the seventeenth sums of a group's surfels that are not drawn."""
-    first = layout.GROUP * (layout.ROW * groups + group)
-    for place in range(layout.GROUP):
-        if not flags >> place & 1:
-            surfel_sums[first + place] = 0.0
-
-
-@part
-def _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d):
-    """Surfels with indices ``first`` to ``last`` in the sorted list, whose entries are those from ``entry`` on."""
-    scale, square = vec.number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
-    entries_further, surfels_further = layout.ROW * bins.starts[-1], layout.ROW * layout.GROUP * groups
-    for place in range(first, last):
-        ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
-        vec.prefetch(records, layout.ROW * ahead)
-        vec.prefetch_to_write(surfel_sums, layout.ROW * ahead)
-        vec.prefetch_to_write(of_means2d, 2 * ahead)
-        index = bins.keys[place] & NUMBER
-        row = layout.ROW * index
-        total, further = vec.splat(0.0), np.float32(0.0)
-        for _ in range(bins.entry_counts[place]):
-            total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
-            if len(channels) > surfel_layout.ROW_CHANNELS:
-                further += vec.number(entry_sums, entries_further + entry)
-            entry += 1
-        vec.store(surfel_sums, row, total)
-        if len(channels) > surfel_layout.ROW_CHANNELS:
-            surfel_sums[surfels_further + index] = further
-        e, f = square * vec.lane(total, surfel_layout.SUM_E), square * vec.lane(total, surfel_layout.SUM_F)
-        c = vec.lane(total, surfel_layout.SUM_C)
-        for axis in range(2):
-            of_center = vec.number(records, row + surfel_layout.U_X + axis) * e
-            of_center += vec.number(records, row + surfel_layout.V_X + axis) * f
-            of_center += vec.number(records, row + surfel_layout.Q_X + axis) * c
-            of_means2d[2 * index + axis] = scale * of_center
+def gather_surfels(counters, projections, bins, view, channels, entry_sums, surfel_sums, of_means2d):
+    """Write ``surfel_sums`` and the derivative with respect to the projected centres."""
+    _gather(counters, projections, bins, view, channels, entry_sums, surfel_sums, of_means2d)
 
 
 @kernel
 def project_surfels_backward(
-    counters, count, surfels, tail, view, channels, drawn, surfel_sums, given_means2d, of_surfels, of_pose
+    counters, count, surfels, tail, view, channels, own, projections, surfel_sums, given_means2d, of_surfels, of_pose
 ):
     """Derivatives of the loss with respect to surfels and pose: as ``projection_backward.project_backward``."""
-    whole_groups = count // layout.GROUP
+    whole_groups, drawn = count // layout.GROUP, projections.drawn
     per_parcel = layout.PARCEL // layout.GROUP
     for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
@@ -119,7 +80,7 @@ def _project_groups_backward(
     fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
     filtered = vec.mul(_PLAIN_SQUARE, vec.broadcast(view, layout.VIEW_PIXEL_SCALE))
     of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
-    nothing = vec.repeat(0.0, three)
+    nothing, channel = vec.repeat(0.0, three), surfel_layout.SUM_CHANNELS
     for group in range(first, last):
         shown = vec.from_bits(drawn[group])
         row = layout.GROUP * (group - first + source)
@@ -149,7 +110,8 @@ def _project_groups_backward(
         of_normal = vec.mul(0.0, at.normal)
         if len(channels) > 3:
             # In camera axes, turned by its sign.
-            given = _normal_sums(sums, surfel_sums, layout.ROW * layout.GROUP * len(drawn) + row)
+            further = layout.ROW * layout.GROUP * len(drawn) + row  # the last sum is behind the rows of sixteen
+            given = (sums[channel + 3], sums[channel + 4], vec.load(surfel_sums, further))
             given = vec.mul(vec.select(vec.greater(at.height, 0.0), -1.0, 1.0), given)
             of_normal = vec.fma(given[0], right, vec.fma(given[1], down, vec.mul(vec.widen(given[2]), forward)))
 
@@ -163,26 +125,14 @@ def _project_groups_backward(
         a = (of_first[0], of_second[0], of_normal[0])
         b = (of_first[1], of_second[1], of_normal[1])
         c = (of_first[2], of_second[2], of_normal[2])
-        of_quat = quaternion_derivative(at.quaternion, a, b, c)
-        # Its length does not matter.
-        along = vec.dot(of_quat, at.quaternion, 0.0)
-        of_quat = vec.narrow(vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_quat)))
-        of_color = (
-            sums[surfel_layout.SUM_CHANNELS], sums[surfel_layout.SUM_CHANNELS + 1], sums[surfel_layout.SUM_CHANNELS + 2]
-        )  # fmt: skip
+        of_quat = vec.narrow(quaternion_derivative(at, a, b, c))
+        of_color = (sums[channel], sums[channel + 1], sums[channel + 2])
         vec.store_columns(of_surfels.means, 3 * row, of_mean)
         vec.store_columns(of_surfels.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
         vec.store_columns(of_surfels.scales, 2 * row, vec.select(shown, of_scale, vec.repeat(0.0, (0, 0))))
         vec.store(of_surfels.opacities, row, vec.select(shown, vec.div(sums[surfel_layout.SUM_V], opacity), 0.0))
         vec.store_columns(of_surfels.colors, 3 * row, vec.select(shown, of_color, nothing))
     return of_right + of_down + of_forward + of_center
-
-
-@inline
-def _normal_sums(sums, surfel_sums, further):
-    """The sums of the normal's components; the last is behind the rows of sixteen."""
-    first = surfel_layout.SUM_CHANNELS + 3
-    return sums[first], sums[first + 1], vec.load(surfel_sums, further)
 
 
 @inline

@@ -47,13 +47,11 @@ _PER_SQUARE = -2.0 * math.log(2.0)
 
 
 @kernel
-def sweep_surfels_backward(
-    counters, records, remainders, bins, view, grid, channels, measures, scratch, composited, of_images, entry_sums
-):
+def sweep(counters, projections, bins, view, grid, channels, measures, scratch, composited, of_images, entry_sums):
     """Write the gradient sums over the pixels of each entry: see ``surfel_layout``. Empty ``of_images`` are 0."""
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
-    state, source = rows[CHUNK * FETCHED :], (records, remainders, view)
+    state, source = rows[CHUNK * FETCHED :], (projections.records, projections.remainders, view)
     blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
     further = layout.ROW * bins.starts[grid.tiles]
     for place in pieces(counters, 0, grid.tiles):
@@ -108,9 +106,8 @@ def _prepare_tile(tile, channels, measures, view, composited, state):
     for block in range(layout.BLOCKS):
         at, source = _STATE * block, 16 * width * (layout.BLOCKS * tile + block)
         alpha, sums = vec.load(composited, source), vec.load_all(composited, source + 16, channels)
-        of_alpha = vec.sub(
-            vec.load(state, at + _ALPHA), vec.dot(vec.load_all(state, at + _CHANNELS, (0, 0, 0)), background, 0.0)
-        )
+        shaded = vec.dot(vec.load_all(state, at + _CHANNELS, (0, 0, 0)), background, 0.0)
+        of_alpha = vec.sub(vec.load(state, at + _ALPHA), shaded)
         behind = vec.dot(vec.load_all(state, at + _CHANNELS, channels), sums, 0.0)
         source += 16 * (1 + len(channels))
         if len(measures.depth) > 0:
@@ -168,26 +165,22 @@ def _sweep_entry(row, blocks, alive, rows, channels, measures, view, state, targ
         shown = vec.dot(own, given, vec.load(state, at + _ALPHA))
         # Derivative with respect to ln(z), of the weighted sums over the weight, and of the median.
         of_log_z, of_median = zero, zero
+        z = vec.mul(vec.broadcast(rows, row + surfel_layout.DEPTH), inverse_q)
+        inverse_z = vec.mul(vec.broadcast(rows, row + INVERSE_DEPTH), q)
         if len(measures.depth) > 0:
-            of_log_z = vec.mul(
-                vec.mul(vec.broadcast(rows, row + surfel_layout.DEPTH), inverse_q), vec.load(state, at + _DEPTH)
-            )
+            of_log_z = vec.mul(z, vec.load(state, at + _DEPTH))
             shown = vec.add(shown, of_log_z)
         if len(measures.inverse_depth) > 0:
-            part = vec.mul(vec.mul(vec.broadcast(rows, row + INVERSE_DEPTH), q), vec.load(state, at + _INVERSE_DEPTH))
+            part = vec.mul(inverse_z, vec.load(state, at + _INVERSE_DEPTH))
             shown, of_log_z = vec.add(shown, part), vec.sub(of_log_z, part)
         if len(measures.distortion) > 0:
-            inverse_z = vec.mul(vec.broadcast(rows, row + INVERSE_DEPTH), q)
             difference = vec.sub(inverse_z, vec.load(state, at + _MEAN))
             slope = vec.mul(vec.load(state, at + _OF_SQUARE), difference)
             shown = vec.add(shown, vec.fma(slope, difference, vec.load(state, at + _OF_WEIGHT)))
             of_log_z = vec.fma(vec.mul(slope, -2.0), inverse_z, of_log_z)
         if len(measures.median) > 0:
             crosses = vec.both(vec.both(drawn, vec.greater(transmittance, 0.5)), vec.at_most(behind, 0.5))
-            of_median = vec.mul(
-                vec.mul(vec.broadcast(rows, row + surfel_layout.DEPTH), inverse_q), vec.load(state, at + _MEDIAN)
-            )
-            of_median = vec.select(crosses, of_median, 0.0)
+            of_median = vec.select(crosses, vec.mul(z, vec.load(state, at + _MEDIAN)), 0.0)
         shown = vec.mul(weight, shown)
         hidden = vec.sub(vec.load(state, at + _BEHIND), shown)
         vec.store(state, at + _BEHIND, hidden)

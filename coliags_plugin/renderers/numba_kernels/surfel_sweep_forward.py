@@ -40,7 +40,7 @@ INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 
 @kernel
-def sweep_surfels(counters, records, remainders, bins, view, grid, channels, measures, scratch, composited, images):
+def sweep(counters, projections, bins, view, grid, channels, measures, scratch, composited, images):
     """Composite all tiles; writes ``bins.reached``, the images that are not empty, and ``composited``.
 
     The last is for the backward sweep, vectors by tile and block: alpha, channels without background, depth and inverse depth,
@@ -48,7 +48,7 @@ def sweep_surfels(counters, records, remainders, bins, view, grid, channels, mea
     """
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
-    state, source = rows[CHUNK * FETCHED :], (records, remainders, view)
+    state, source = rows[CHUNK * FETCHED :], (projections.records, projections.remainders, view)
     blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
     for place in pieces(counters, 0, grid.tiles):
         tile = bins.order[place]
@@ -61,11 +61,7 @@ def sweep_surfels(counters, records, remainders, bins, view, grid, channels, mea
 def _sweep_block(block, count, listed, rows, channels, measures, view, state):
     """Composite the first ``count`` rows listed into one block; whether any pixel has transmittance left."""
     x, y = scaled_pixels(block, view)
-    log2_alpha_min, alpha_max = (
-        vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN),
-        vec.broadcast(view, layout.VIEW_ALPHA_MAX),
-    )
-    transmittance_min = vec.broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
+    log2_alpha_min, alpha_max, transmittance_min = vec.broadcast_all(view, layout.VIEW_LOG2_ALPHA_MIN, (0, 0, 0))
     at = _STATE * block
     transmittance, alpha_sum = vec.load(state, at + TRANSMITTANCE), vec.load(state, at + ALPHA)
     sums = vec.load_all(state, at + _CHANNELS, channels)
@@ -148,9 +144,8 @@ def _finish_tile(tile, channels, measures, view, state, composited):
             squares = vec.larger(vec.fma(vec.neg(difference), mean, vec.load(state, at + _SQUARE)), 0.0)
             vec.store(composited, target, vec.add(vec.load(state, at + _NEAREST), mean))
             vec.store(composited, target + 16, squares)
-            vec.store(
-                state, at + _DISTORTION, vec.mul(vec.broadcast(view, layout.VIEW_DISTORTION), vec.mul(alpha, squares))
-            )
+            distortion = vec.mul(vec.broadcast(view, layout.VIEW_DISTORTION), vec.mul(alpha, squares))
+            vec.store(state, at + _DISTORTION, distortion)
         color = vec.load_all(state, at + _CHANNELS, (0, 0, 0))
         vec.store_all(state, at + _CHANNELS, vec.fma(vec.sub(1.0, alpha), background, color))
 

@@ -7,7 +7,7 @@ import numpy as np
 from coliags_plugin.core.numba_compilation import inline, part
 from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.tiles import block_corner
+from coliags_plugin.renderers.numba_kernels.tiles import block_pixels
 
 # A fetched row is one of ``records`` with the centre from the middle of the tile, in scaled pixels, and two more columns:
 # 1 / DEPTH, and the largest q, where the disc is at the near plane.
@@ -45,35 +45,21 @@ def fetch_surfels(first, last, alive, corner_x, corner_y, source, cells, rows, b
 @inline
 def scaled_pixels(block, view):
     """Columns and rows of a block's pixel centres from the middle of its tile, in scaled pixels."""
-    block_x, block_y = block_corner(block)
-    half = 0.5 * layout.TILE - 0.5
-    scale = vec.broadcast(view, layout.VIEW_PIXEL_SCALE)
-    return vec.mul(scale, vec.add(vec.lane_columns(), block_x - half)), vec.mul(
-        scale, vec.add(vec.lane_rows(), block_y - half)
-    )
+    return vec.mul(vec.broadcast(view, layout.VIEW_PIXEL_SCALE), block_pixels(block))
 
 
 @inline
 def intersect(rows, row, x, y):
     """Intersect the rays of pixels with the disc of a fetched row.
 
-    Returns:
-        Offset from the projected centre, scaled pixels; q, 1 / q, e and f of ``surfel_layout``; and where the ray hits the
-        disc's plane beyond the near plane: elsewhere all but the offset are 0.
+    Returns the offset from the projected centre, scaled pixels; q, 1 / q, e and f of ``surfel_layout``; and where the ray
+    hits the disc's plane beyond the near plane: elsewhere all but the offset are 0.
     """
+    u_x, u_y, v_x, v_y, q_x, q_y = vec.broadcast_all(rows, row + surfel_layout.U_X, (0,) * 6)
     d_x = vec.sub(x, vec.broadcast(rows, row + surfel_layout.MEAN_X))
     d_y = vec.sub(y, vec.broadcast(rows, row + surfel_layout.MEAN_Y))
-    q = vec.fma(
-        vec.broadcast(rows, row + surfel_layout.Q_X),
-        d_x,
-        vec.fma(vec.broadcast(rows, row + surfel_layout.Q_Y), d_y, 1.0),
-    )
+    q = vec.fma(q_x, d_x, vec.fma(q_y, d_y, 1.0))
     hit = vec.both(vec.greater(q, 0.0), vec.at_most(q, vec.broadcast(rows, row + LARGEST_Q)))
     inverse_q = vec.select(hit, vec.quick_div(1.0, q), 0.0)
-    e = vec.fma(
-        vec.broadcast(rows, row + surfel_layout.U_X), d_x, vec.mul(vec.broadcast(rows, row + surfel_layout.U_Y), d_y)
-    )
-    f = vec.fma(
-        vec.broadcast(rows, row + surfel_layout.V_X), d_x, vec.mul(vec.broadcast(rows, row + surfel_layout.V_Y), d_y)
-    )
+    e, f = vec.fma(u_x, d_x, vec.mul(u_y, d_y)), vec.fma(v_x, d_x, vec.mul(v_y, d_y))
     return d_x, d_y, vec.select(hit, q, 0.0), inverse_q, vec.mul(e, inverse_q), vec.mul(f, inverse_q), hit

@@ -16,7 +16,7 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     CHUNK,
     OFFSET_E,
     OFFSET_F,
-    block_corner,
+    block_pixels,
     fetch_chunk,
     image_copies,
     inside,
@@ -41,9 +41,7 @@ INTEGERS = CHUNK
 
 
 @kernel
-def sweep_backward(
-    counters, projections, bins, view, grid, extras, channels, scratch, composited, of_images, entry_sums
-):
+def sweep(counters, projections, bins, view, grid, channels, extras, scratch, composited, of_images, entry_sums):
     """Write the gradient sums over the pixels of each entry: see ``layout``. Empty ``of_images`` are 0."""
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
@@ -63,12 +61,11 @@ def sweep_backward(
 def _read_tile(tile, grid, extras, channels, of_images, state):
     """Fill the states of a tile's blocks; the derivative with respect to depth over alpha goes to ``_BEHIND``."""
     _, _, across, down = tile_corner(tile, grid)
-    half = 0.5 * layout.TILE - 0.5
     for block in range(layout.BLOCKS):
         at = _STATE * block
-        block_x, block_y = block_corner(block)
-        vec.store(state, at + _X, vec.add(vec.lane_columns(), block_x - half))
-        vec.store(state, at + _Y, vec.add(vec.lane_rows(), block_y - half))
+        x, y = block_pixels(block)
+        vec.store(state, at + _X, x)
+        vec.store(state, at + _Y, y)
         vec.store(state, at + _TRANSMITTANCE, vec.select(inside(block, across, down), 1.0, 0.0))
         vec.store(state, at + _BEHIND, 0.0)
         vec.store(state, at + _ALPHA, 0.0)
@@ -96,9 +93,8 @@ def _prepare_tile(tile, channels, view, has_depth, composited, state):
     for block in range(layout.BLOCKS):
         at, source = _STATE * block, size * (layout.BLOCKS * tile + block)
         alpha, sums = vec.load(composited, source), vec.load_all(composited, source + 16, channels)
-        of_alpha = vec.sub(
-            vec.load(state, at + _ALPHA), vec.dot(vec.load_all(state, at + _CHANNELS, (0, 0, 0)), background, 0.0)
-        )
+        shaded = vec.dot(vec.load_all(state, at + _CHANNELS, (0, 0, 0)), background, 0.0)
+        of_alpha = vec.sub(vec.load(state, at + _ALPHA), shaded)
         if has_depth:
             covered = vec.greater(alpha, 0.0)
             share = vec.select(covered, vec.div(vec.load(state, at + _BEHIND), alpha), 0.0)
@@ -106,9 +102,8 @@ def _prepare_tile(tile, channels, view, has_depth, composited, state):
             depth = vec.load(composited, source + 64)
             of_alpha = vec.sub(of_alpha, vec.select(covered, vec.mul(share, vec.div(depth, alpha)), 0.0))
         vec.store(state, at + _ALPHA, of_alpha)
-        vec.store(
-            state, at + _BEHIND, vec.dot(vec.load_all(state, at + _CHANNELS, channels), sums, vec.mul(of_alpha, alpha))
-        )
+        given = vec.load_all(state, at + _CHANNELS, channels)
+        vec.store(state, at + _BEHIND, vec.dot(given, sums, vec.mul(of_alpha, alpha)))
 
 
 @inline

@@ -17,7 +17,7 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_E,
     OFFSET_F,
     TRANSMITTANCE,
-    block_corner,
+    block_pixels,
     fetch_chunk,
     image_copies,
     tile_sweep,
@@ -36,15 +36,14 @@ INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 
 @kernel
-def sweep_forward(counters, projections, bins, view, grid, extras, channels, median, scratch, composited, images):
+def sweep(counters, projections, bins, view, grid, channels, extras, scratch, composited, images):
     """Composite all tiles; writes ``bins.reached``, the images that are not empty, and ``composited``.
 
-    The last is for the backward sweep: alpha and channels without background, a vector each, by tile and block. ``median`` is
-    a tuple with one element where the median depth is wanted, an empty one where it is not.
+    The last is for the backward sweep: alpha and channels without background, a vector each, by tile and block.
     """
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
-    state = rows[CHUNK * layout.ROW :]
+    state, median = rows[CHUNK * layout.ROW :], extras.median
     blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
     for place in pieces(counters, 0, grid.tiles):
         tile = bins.order[place]
@@ -56,14 +55,8 @@ def sweep_forward(counters, projections, bins, view, grid, extras, channels, med
 @part
 def _sweep_block(block, count, listed, rows, channels, median, view, state):
     """Composite the first ``count`` rows listed into one block; whether any pixel has transmittance left."""
-    block_x, block_y = block_corner(block)
-    half = 0.5 * layout.TILE - 0.5
-    x, y = vec.add(vec.lane_columns(), block_x - half), vec.add(vec.lane_rows(), block_y - half)
-    log2_alpha_min, alpha_max = (
-        vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN),
-        vec.broadcast(view, layout.VIEW_ALPHA_MAX),
-    )
-    transmittance_min = vec.broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
+    x, y = block_pixels(block)
+    log2_alpha_min, alpha_max, transmittance_min = vec.broadcast_all(view, layout.VIEW_LOG2_ALPHA_MIN, (0, 0, 0))
     at = _STATE * block
     transmittance, alpha_sum = vec.load(state, at + TRANSMITTANCE), vec.load(state, at + ALPHA)
     sums = vec.load_all(state, at + _CHANNELS, channels)

@@ -66,6 +66,14 @@ def block_corner(block):
 
 
 @inline
+def block_pixels(block):
+    """Columns and rows of a block's pixel centres from the middle of its tile."""
+    x, y = block_corner(block)
+    half = 0.5 * layout.TILE - 0.5
+    return vec.add(vec.lane_columns(), x - half), vec.add(vec.lane_rows(), y - half)
+
+
+@inline
 def inside(block, across, down):
     """Which pixels of a block are among the first ``across`` columns and ``down`` rows of its tile."""
     x, y = block_corner(block)
