@@ -22,9 +22,9 @@ from websockets.typing import Subprotocol
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.export.baking.averages import mean_gaussians
+from coliags_plugin.export.baking.baking import mean_gaussians
 from coliags_plugin.export.viewer.content import spread
-from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
+from coliags_plugin.export.viewer.serving import import_viser, start_server, stop_server
 from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, ViewDecoder, on_wire, shown, wire_unit
 
 

@@ -8,7 +8,7 @@ from typing import Literal, cast, get_args
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.text_files import read_text
-from coliags_plugin.geometry.poses.text import shortened
+from coliags_plugin.geometry.poses.formats import shortened
 
 Unit = Literal["mm", "unknown"]
 

@@ -83,9 +83,8 @@ def _poses(name: str) -> Callable[[Path], None]:
 
 def _mesh(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from coliags_plugin.geometry.meshes.comparison import compare_meshes
         from coliags_plugin.geometry.meshes.files import read_mesh
-        from coliags_plugin.geometry.meshes.truth import read_true_surface
+        from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 
         surface = read_true_surface(folder / name)
         if not np.abs(surface.mesh.vertices).max() <= 2e6:

@@ -39,7 +39,7 @@ def read_and_log(path: Path, name: str | None) -> tuple[Format, Trajectory]:
 def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | None:
     """``fx,fy,cx,cy`` and ``WxH`` -> intrinsics; None where neither is given."""
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.geometry.poses.text import prefixed_errors
+    from coliags_plugin.geometry.poses.formats import prefixed_errors
 
     if intrinsics is None and size is None:
         return None

@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFF
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.colmap import read_pinholes
-from coliags_plugin.geometry.poses.text import shortened
+from coliags_plugin.geometry.poses.formats import shortened
 from coliags_plugin.geometry.poses.trajectory import natural_order
 
 IMAGE_FOLDERS = ("rgb", "color", "images")

@@ -1,24 +1,141 @@
-"""Fields that decode or light their Gaussians for each view, as one cloud for all views."""
+"""Fields that decode or light their Gaussians for each view, averaged over views to one cloud for all."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
-from coliags_plugin.contracts import gaussians_under
+from coliags_plugin.contracts import GaussianField, gaussians_under
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.averages import GaussianAverages, blending_weights
-from coliags_plugin.export.baking.explicit import cloud_of_field
-from coliags_plugin.export.baking.harmonics import SeenColors, fit_harmonics
 from coliags_plugin.export.baking.refinement import adjusted_camera, needs_refinement, refine
-from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
-from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field
+from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
+from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
 from coliags_plugin.lighting.lamps import HeldLight
+from coliags_plugin.renderers.splatting import SplattingRenderer
+
+#: A Gaussian is kept whose blending weights add up to so many pixels over the views, and which is on average at least
+#: so opaque: others are invisible.
+_LEAST_WEIGHT, _LEAST_OPACITY = 0.02, 1.0 / 255.0
+#: Below it a weight is no weight, pixels.
+_NONE = 1e-12
+
+
+def blending_weights(renderer: SplattingRenderer, gaussians: Gaussians, camera: Camera) -> Float[Tensor, "N"]:
+    """How many pixels each Gaussian fills in a view: its blending weights, summed over the pixels. [N]
+
+    These are the gradients of the image's sum with respect to the colours.
+    """
+    colors = gaussians.colors.detach().clone().requires_grad_()
+    output = renderer.draw(replace(gaussians, colors=colors, features={}), camera, ("rgb", "alpha"))
+    (gradients,) = torch.autograd.grad(output.rgb.sum(), colors)
+    return gradients.mean(dim=1)
+
+
+class GaussianAverages:
+    """Running averages of the Gaussians of a field over views, each weighted by what a view shows of it.
+
+    Centres, colours and logarithms of scales are means, rotations the main axes of the quaternions' outer products.
+    Opacities are weighted by the weight of the whole element: a child that an anchor does not yield in a view counts
+    with 0. Each element has ``per_element`` slots, each slot so many scales: three, two for surfels.
+    """
+
+    def __init__(self, elements: int, per_element: int, scales: int, device: torch.device) -> None:
+        self._per_element = per_element
+        slots = elements * per_element
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(shape, device=device)
+
+        self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
+        self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, scales), zeros(slots, 4, 4)
+        self._colors = zeros(slots, 3)
+
+    def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
+        """Add a view's Gaussians by their :func:`blending_weights`, or other weights."""
+        slots = gaussians.source_index
+        elements = slots // self._per_element
+        shown = torch.zeros_like(self._element_weights).index_add_(0, elements, weights)
+        quats = torch.nn.functional.normalize(gaussians.quats_wxyz, dim=1)
+        products = quats[:, :, None] * quats[:, None]
+        self._element_weights += shown
+        self._opacities.index_add_(0, slots, shown[elements] * gaussians.opacities)
+        self._weights.index_add_(0, slots, weights)
+        self._means.index_add_(0, slots, weights[:, None] * gaussians.means)
+        self._colors.index_add_(0, slots, weights[:, None] * gaussians.colors)
+        self._log_scales.index_add_(0, slots, weights[:, None] * gaussians.scales.log())
+        self._rotations.index_add_(0, slots, weights[:, None, None] * products)
+
+    def visible(self) -> Int[Tensor, "N"]:
+        """Slots of the Gaussians that are visible in a view, ascending. [N]"""
+        visible = (self._weights >= _LEAST_WEIGHT) & (self._mean_opacities() >= _LEAST_OPACITY)
+        return visible.nonzero().squeeze(1)
+
+    def kept(self) -> Int[Tensor, "N"]:
+        """The same, at least one; refuses a run of which nothing is visible. [N]"""
+        visible = self.visible()
+        if not len(visible):
+            raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
+        return visible
+
+    def gaussians(self, kept: Int[Tensor, "N"]) -> Gaussians:
+        """The averages of some slots, of no view in particular."""
+        weights = self._weights[kept][:, None]
+        return Gaussians(
+            means=self._means[kept] / weights,
+            quats_wxyz=torch.linalg.eigh(self._rotations[kept]).eigenvectors[:, :, -1],
+            scales=(self._log_scales[kept] / weights).exp(),
+            opacities=self._mean_opacities()[kept],
+            colors=self._colors[kept] / weights,
+            source_index=kept,
+            visible_sources=kept,
+        )
+
+    def _mean_opacities(self) -> Float[Tensor, "L"]:
+        shown = self._element_weights.repeat_interleave(self._per_element)
+        return self._opacities / shown.clamp_min(_NONE)
+
+    def field(self, kept: Int[Tensor, "N"], harmonics: Float[Tensor, "N B 3"]) -> ExplicitGaussians:
+        """The averages of some slots as an explicit field, with colours to degree D, B = (D + 1)^2."""
+        degree = round(harmonics.shape[1] ** 0.5) - 1
+        made = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
+        mean = self.gaussians(kept)
+        with torch.no_grad():
+            made.means.copy_(mean.means)
+            made.scales.copy_(self._log_scales[kept] / self._weights[kept][:, None])
+            made.quats.copy_(mean.quats_wxyz)
+            made.opacities.copy_(torch.logit(mean.opacities.clamp(1e-4, 1.0 - 1e-4)))
+            made.sh0.copy_(harmonics[:, :1])
+            made.shN.copy_(harmonics[:, 1:])
+            made.degree.fill_(degree)
+        return made
+
+
+@torch.no_grad()
+def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldLight | None = None) -> Gaussians:
+    """The Gaussians of a field for no view in particular: averages over views, weighted by their opacities there.
+
+    Without a light to hold, the lamp of each camera lights them, so that colours are of the average light.
+    """
+    views = [gaussians_under(field, camera, light) for camera in cameras]
+    slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
+    per_element, scales = field.slots_per_element, views[0].scales.shape[1]
+    averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
+    for view in views:
+        averages.add(view, view.opacities)
+    return averages.gaussians(averages.visible())
+
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
 _VIEWS, _COLOR_VIEWS = 120, 30
@@ -55,3 +172,61 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
             progress.update(index + 1)
     kept = averages.kept()
     return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, MAX_DEGREE))
+
+
+#: Added to the normal equations of coefficients above degree 0, whose weights add up to 1: a Gaussian seen along one
+#: direction has no information about others, and keeps its mean colour there.
+RIDGE = 0.01
+#: Gaussians whose normal equations are solved at a time.
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class SeenColors:
+    """Colours (RGB) of some Gaussians in one view, how much it shows of each, and unit directions from the camera."""
+
+    slots: Int[Tensor, "V"]
+    weights: Float[Tensor, "V"]
+    directions: Float[Tensor, "V 3"]
+    colors: Float[Tensor, "V 3"]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, weights: Float[Tensor, "N"], camera: Camera) -> SeenColors:
+        """The colours of those that a view shows."""
+        shown = weights > 0
+        directions = torch.nn.functional.normalize(gaussians.means[shown] - camera.center, dim=1)
+        return cls(gaussians.source_index[shown], weights[shown], directions, gaussians.colors[shown])
+
+
+def fit_harmonics(
+    views: Sequence[SeenColors], kept: Int[Tensor, "N"], mean_colors: Float[Tensor, "N 3"], degree: int
+) -> Float[Tensor, "N B 3"]:
+    """Coefficients that reproduce the colours best: weighted least squares per Gaussian, ridge above degree 0.
+
+    Of ascending slots, with B = (degree + 1)^2 each; ``mean_colors`` are theirs where no view shows them.
+    """
+    bases = (degree + 1) ** 2
+    rows = torch.full((int(kept[-1]) + 1,), -1, dtype=torch.int64, device=kept.device)
+    rows[kept] = torch.arange(len(kept), device=kept.device)
+    ridge = torch.full((bases,), RIDGE, device=kept.device)
+    ridge[0] = 0.0
+    parts = []
+    for start in range(0, len(kept), _CHUNK):
+        count = min(_CHUNK, len(kept) - start)
+        normal = torch.zeros(count, bases, bases, device=kept.device)
+        right = torch.zeros(count, bases, 3, device=kept.device)
+        total = torch.zeros(count, device=kept.device)
+        for view in views:
+            row = rows[view.slots.clamp_max(len(rows) - 1)] - start
+            here = (view.slots < len(rows)) & (row >= 0) & (row < count)
+            row, weights = row[here], view.weights[here]
+            values = basis(view.directions[here], degree)
+            weighted = weights[:, None] * values
+            normal.index_add_(0, row, weighted[:, :, None] * values[:, None])
+            right.index_add_(0, row, weighted[:, :, None] * (view.colors[here] - mean_colors[start + row])[:, None])
+            total.index_add_(0, row, weights)
+        scale = total.clamp_min(1e-12)[:, None, None]
+        parts.append(torch.linalg.solve(normal / scale + torch.diag(ridge + 1e-6 * Y0**2), right / scale))
+    coefficients = torch.cat(parts)
+    coefficients[:, 0] += (mean_colors - 0.5) / Y0
+    return coefficients

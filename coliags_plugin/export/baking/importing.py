@@ -18,8 +18,7 @@ from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.provenance import run_provenance
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.export.baking.explicit import load_cloud
-from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.splats.cloud import SplatCloud, load_cloud
 from coliags_plugin.export.splats.files import read_splats
 from coliags_plugin.renderers.choice import choose_renderer
 
@@ -42,14 +41,8 @@ def import_run(
 ) -> None:
     """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
 
-    Args:
-        file: PLY, SPZ or splat, in the frame and unit of the scene.
-        data: The scene's folder.
-        output: The run folder to make.
-        device: What the run is recorded to compute on.
-        data_format: Name of a data manager; None: the one that recognises the folder.
-        overwrite: Replace an existing run folder.
-        anonymous: Keep absolute paths out of the run.
+    The file is in the frame and unit of the scene in the folder ``data``, which the named data manager reads, or the
+    one that recognises it; ``device`` is recorded. An anonymous run holds no absolute paths.
     """
     output.check_free(overwrite)
     cloud = read_splats(file)

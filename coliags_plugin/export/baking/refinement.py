@@ -51,9 +51,6 @@ def refine(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> i
 
     Frames are brought to that light as the held-out ones are that a file is compared with: the run's render there, plus
     what the run's render as recorded misses of the frame. Returns the steps taken.
-
-    Raises:
-        NotFiniteError: The loss became NaN or infinite.
     """
     renderer = splatting_of(trained.model)
     unit = trained.scene.pixel_footprint

@@ -1,4 +1,4 @@
-"""Gaussians of a file or of a browser: a world frame, plain numbers, colours as spherical harmonics."""
+"""Gaussians of a file, a browser or an explicit field: a world frame, plain numbers, colours as spherical harmonics."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32
 from coliags_plugin.core import bounds
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
 #: Opacities are kept this far from 0 and 1, where their logits would be infinite.
@@ -117,3 +118,34 @@ def sigmoid(logits: Float32[np.ndarray, "N"]) -> Float32[np.ndarray, "N"]:
 def harmonics_of_colors(colors: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:
     """Coefficients of degree 0 of colours in [0, 1] that do not depend on the direction. [N, 1, 3]"""
     return ((colors - 0.5) / Y0)[:, None].astype(np.float32)
+
+
+def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:
+    """The Gaussians, or surfels, of a field, with the harmonics that are active."""
+    active = (int(field.degree) + 1) ** 2
+    harmonics = torch.cat([field.sh0, field.shN], dim=1)[:, :active]
+    parts = (field.means, field.quats, field.scales.exp(), field.opacities.sigmoid(), harmonics)
+    means, quats, scales, opacities, coefficients = (
+        np.ascontiguousarray(part.detach().cpu().float().numpy()) for part in parts
+    )
+    return SplatCloud(means, quats, scales, opacities, coefficients)
+
+
+def load_cloud(field: ExplicitGaussians, cloud: SplatCloud) -> None:
+    """Put a cloud, all finite, into a field of as many Gaussians, of at least its degree, and as many scales."""
+    first, higher = cloud.harmonics[:, :1], cloud.harmonics[:, 1:]
+    with torch.no_grad():
+        field.means.copy_(torch.from_numpy(cloud.means))
+        field.quats.copy_(torch.from_numpy(cloud.unit_quats_wxyz))
+        field.scales.copy_(torch.from_numpy(cloud.log_scales))
+        field.opacities.copy_(torch.from_numpy(cloud.logits))
+        field.sh0.copy_(torch.from_numpy(np.ascontiguousarray(first)))
+        field.shN[:, : higher.shape[1]] = torch.from_numpy(np.ascontiguousarray(higher))
+        field.degree.fill_(cloud.degree)
+
+
+def field_of_cloud(cloud: SplatCloud) -> ExplicitGaussians:
+    """A cloud of Gaussians with three scales each as a field."""
+    field = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=cloud.degree), len(cloud))
+    load_cloud(field, cloud)
+    return field

@@ -65,8 +65,8 @@ def read_splat_ply(path: Path) -> SplatCloud:
     if len(rest) % 3 or per_channel not in counts or set(rest) != {f"f_rest_{index}" for index in range(len(rest))}:
         known = ", ".join(str(3 * count) for count in counts)
         raise InputError(f"{path}: {len(rest)} properties f_rest_*", f"f_rest_0 and so on, {known} of them")
-    higher = _stacked(columns, tuple(f"f_rest_{index}" for index in range(len(rest))))
-    higher = higher.reshape(len(higher), 3, per_channel).transpose(0, 2, 1)
+    higher = np.array([columns[f"f_rest_{index}"] for index in range(len(rest))], np.float32)
+    higher = higher.reshape(3, per_channel, len(columns["x"])).transpose(2, 1, 0)
     scales = _SCALES if "scale_2" in columns else _SCALES[:2]
     with np.errstate(over="ignore"):
         return SplatCloud(
@@ -97,9 +97,4 @@ def _refuse_other_kinds(path: Path) -> None:
 
 def _stacked(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
     """Columns side by side. [N, C]"""
-    count = len(next(iter(columns.values())))
-    return (
-        np.stack([columns[name] for name in names], axis=1).astype(np.float32)
-        if names
-        else np.empty((count, 0), np.float32)
-    )
+    return np.stack([columns[name] for name in names], axis=1).astype(np.float32)

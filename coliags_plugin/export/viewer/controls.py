@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.export.viewer.content import ViewerContent, mesh_files
+from coliags_plugin.export.viewer.content import Picture, ViewerContent, mesh_files
 from coliags_plugin.export.viewer.layers import add_cameras, add_mesh
-from coliags_plugin.export.viewer.pictures import Picture
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.outputs.image_files import as_array
 

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.export.viewer.content import ViewerContent, vertical_fov
-from coliags_plugin.export.viewer.library import import_viser
 from coliags_plugin.geometry.meshes.files import encode_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
@@ -72,9 +71,10 @@ def frustum_size(cameras: Sequence[Camera], distance: float) -> float:
 
 def pose(camera: Camera) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
     """Rotation (wxyz) and position of a camera in the world, in OpenCV's axes as viser has them."""
-    viser = import_viser()
+    from viser.transforms import SO3
+
     matrix = camera.camera_to_world.double().cpu().numpy()
-    return viser.transforms.SO3.from_matrix(matrix[:3, :3]).wxyz, matrix[:3, 3]
+    return SO3.from_matrix(matrix[:3, :3]).wxyz, matrix[:3, 3]
 
 
 def add_mesh(scene: Any, name: str, mesh: TriangleMesh) -> Any:

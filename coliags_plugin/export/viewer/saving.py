@@ -15,10 +15,8 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.content import ViewerContent
 from coliags_plugin.export.viewer.layers import add_cameras
-from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
-from coliags_plugin.export.viewer.merging import merged_to
-from coliags_plugin.export.viewer.serving import set_start
-from coliags_plugin.export.viewer.splats import on_wire
+from coliags_plugin.export.viewer.serving import import_viser, set_start, start_server, stop_server
+from coliags_plugin.export.viewer.splats import merged_to, on_wire
 from coliags_plugin.reporting.html_page import refuse_folder
 
 logger = logging.getLogger(__name__)

@@ -22,16 +22,7 @@ class Undistortion:
     Where one pixel of the result covers several source pixels, its colour is the mean of ``supersampling`` x
     ``supersampling`` bilinear samples spread over it, which avoids aliasing. Values that must not be mixed (depth,
     masks) are taken from the nearest source pixel, in their own type. z-depth needs no conversion: both cameras share
-    their optical axis.
-
-    Args:
-        lens: The lens of the source images.
-        pinhole: The camera of the result.
-        source_mask: Source pixels with image content; None: all.
-
-    Attributes:
-        supersampling: Bilinear samples per result pixel, along each side.
-        valid: Result pixels made only of source pixels with image content. [height, width]
+    their optical axis. ``valid`` are result pixels made only of source pixels with image content, ``source_mask``.
     """
 
     def __init__(

@@ -54,17 +54,11 @@ class RayScene:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh in the world frame, scene units (mm for C3VD).
-
-    Attributes:
-        vertices: [V, 3]
-        triangles: Vertex indices, counter-clockwise seen from the side that the camera was on. [F, 3]
-        colors: RGB of the vertices; None where there are none. [V, 3]
-    """
+    """A triangle mesh in the world frame, scene units (mm for C3VD)."""
 
     vertices: Float[np.ndarray, "V 3"]
-    triangles: Int[np.ndarray, "F 3"]
-    colors: UInt8[np.ndarray, "V 3"] | None = None
+    triangles: Int[np.ndarray, "F 3"]  # vertices, counter-clockwise seen from the side that the camera was on
+    colors: UInt8[np.ndarray, "V 3"] | None = None  # RGB of the vertices
 
     def __len__(self) -> int:
         return len(self.triangles)

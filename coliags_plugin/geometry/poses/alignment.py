@@ -1,22 +1,161 @@
 """Evaluation of an estimated trajectory against a reference: alignment, ATE, rotation error and RPE.
 
 Absolute trajectory error and relative pose error: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", IROS 2012.
+systems", IROS 2012. Transforms: S. Umeyama, "Least-squares estimation of transformation parameters between two point
+patterns", IEEE TPAMI 13(4), 1991. Chordal mean: R. Hartley et al., "Rotation averaging", International Journal of
+Computer Vision 103, 2013.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.association import FrameMatches
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
-from coliags_plugin.geometry.poses.similarity import Similarity, WorldRotation, umeyama, world_rotation
 from coliags_plugin.geometry.poses.trajectory import Trajectory
+
+#: Least ratio of the paths' extents (standard deviations) across and along their main direction for which the rotation
+#: about that direction is determined.
+OFF_LINE_SHARE = 1e-3
+#: Extents below this share of the coordinates are rounding errors.
+_ROUNDING = 1e-9
+#: Spread of a path (:attr:`Similarity.spread`) below which it is nearly straight: the rotation about it is taken from
+#: orientations, as errors of positions are a large part of what little they deviate from a line.
+NEARLY_STRAIGHT = 0.1
+
+By = Literal["positions", "orientations about the path", "orientations"]
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float  # 1 for a rigid transform
+    rotation: Float[np.ndarray, "3 3"]  # rotation matrix, det 1
+    translation: Float[np.ndarray, "3"]  # units of the target
+    # Why the points do not determine the rotation, or an empty string. The rotation is then the smallest among those
+    # that fit equally well.
+    undetermined: str = ""
+    # Main direction of the target's points, unit length; zero where they do not determine one
+    axis: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    # Extent of the points across that direction relative to that along it (standard deviations), 0 to 1.
+    spread: float = 1.0
+
+    def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        """Transformed points. [N, 3]"""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], with_scale: bool = False) -> Similarity:
+    """Least-squares rigid or similarity transform between corresponding points (Umeyama's method).
+
+    The rotation is unique only if d2 + s d3 > 0, with d1 >= d2 >= d3 the singular values of the covariance and s the
+    sign of its determinant (Umeyama 1991, section III). Otherwise, as for points on a line, the smallest rotation that
+    fits is returned, and :attr:`Similarity.undetermined` gives the reason.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    centered, wanted = source - source_mean, target - target_mean
+    covariance = wanted.T @ centered / len(source)
+    left, values, right = np.linalg.svd(covariance)
+    sign = 1.0 if np.linalg.det(left) * np.linalg.det(right) > 0.0 else -1.0
+    still = _still(source, centered) or _still(target, wanted)
+    rotation = left @ np.diag([1.0, 1.0, sign]) @ right
+    undetermined, axis = "", left[:, 0]
+    if still or values[0] <= _ROUNDING * np.sqrt((centered**2).sum() * (wanted**2).sum()) / len(source):
+        rotation, axis = np.eye(3), np.zeros(3)
+        undetermined = (
+            "the camera does not move, so that positions determine no rotation"
+            if still
+            else "the two paths are uncorrelated, so that positions determine no rotation"
+        )
+    elif values[1] + sign * values[2] <= OFF_LINE_SHARE**2 * values[0]:
+        rotation = _shortest_rotation(right[0], left[:, 0], right[1])
+        undetermined = (
+            "the positions lie on a line, about which the rotation is undetermined"
+            if values[1] <= 2.0 * OFF_LINE_SHARE**2 * values[0]
+            else "one path is the mirror image of the other, so that several rotations fit equally well"
+        )
+    scale = 1.0
+    if with_scale:
+        if still or not values[0] > 0.0:
+            raise InputError(
+                "a scale cannot be estimated: the camera of one trajectory does not move",
+                "two cameras that move",
+                "Align without --scale",
+            )
+        scale = float((values * (1.0, 1.0, sign)).sum() / (centered**2).sum(axis=1).mean())
+    spread = float(np.sqrt(max(values[1] + sign * values[2], 0.0) / values[0])) if axis.any() else 0.0
+    translation = target_mean - scale * rotation @ source_mean
+    return Similarity(scale, rotation, translation, undetermined, axis, spread)
+
+
+def _shortest_rotation(start: np.ndarray, end: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """The smallest rotation from one unit vector to another; ``beside`` is perpendicular to the first.
+
+    The product of two half turns, about the first vector and about the bisector of both. (scipy 1.17's
+    ``align_vectors`` of one vector is off by degrees if the two are nearly opposite.)
+    """
+    if start @ end < -0.9999:
+        about = _half_turn(beside)
+        return np.asarray(_shortest_rotation(-start, end, beside) @ about)
+    middle = (start + end) / np.linalg.norm(start + end)
+    return np.asarray(_half_turn(middle) @ _half_turn(start))
+
+
+def _half_turn(axis: np.ndarray) -> np.ndarray:
+    return 2.0 * np.outer(axis, axis) - np.eye(3)
+
+
+def _still(points: np.ndarray, centered: np.ndarray) -> bool:
+    return bool(np.abs(centered).max() <= _ROUNDING * np.abs(points).max())
+
+
+@dataclass(frozen=True, eq=False)
+class WorldRotation:
+    """Rotation from the estimate's world to the reference's, with which rotation errors are computed."""
+
+    rotation: Float[np.ndarray, "3 3"]  # rotation matrix, det 1
+    # What determined it. ``positions``: those alone. ``orientations about the path``: positions determined the
+    # direction of the path, the cameras' orientations the rotation about it. ``orientations``: those alone.
+    by: By
+    reason: str = ""  # why positions alone did not, or an empty string
+
+
+def world_rotation(
+    estimated: Float[np.ndarray, "N 3 3"], true: Float[np.ndarray, "N 3 3"], transform: Similarity
+) -> WorldRotation:
+    """The rotation between two worlds, of the camera-to-world rotations of the same cameras in both.
+
+    The rotation of ``transform``, from positions, if the path is not nearly straight; else that rotation, turned about
+    the path by the angle that minimises the chordal distances of the orientations; and without any path the chordal
+    mean of the relative orientations.
+    """
+    total = np.einsum("nij,nkj->ik", true, estimated)
+    if not transform.axis.any():
+        return WorldRotation(_nearest_rotation(total), "orientations", transform.undetermined)
+    if transform.spread >= NEARLY_STRAIGHT:
+        return WorldRotation(transform.rotation, "positions")
+    # tr(R(angle)^T M) = constant + cos(angle) (tr M - a^T M a) + sin(angle) a . w, with w the antisymmetric part of M.
+    rest, axis = total @ transform.rotation.T, transform.axis
+    antisymmetric = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
+    angle = np.arctan2(axis @ antisymmetric, np.trace(rest) - axis @ rest @ axis)
+    about = Rotation.from_rotvec(angle * axis).as_matrix()
+    reason = transform.undetermined or (
+        f"the path is nearly straight: its extent across is {100.0 * transform.spread:.2g} % of that along it"
+    )
+    return WorldRotation(about @ transform.rotation, "orientations about the path", reason)
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation with the largest tr(R^T M)."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
 
 
 @dataclass(frozen=True)

@@ -35,19 +35,12 @@ class FrameMatches:
 
 
 def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tolerance: float = 0.02) -> FrameMatches:
-    """Match the frames of two trajectories, the estimate usually first.
+    """Match at least three frames of two trajectories, the estimate usually first.
 
-    Args:
-        first: One trajectory.
-        second: The other.
-        match: ``name``: equal image names, or equal file stems. ``time``: timestamps within ``tolerance``, nearest
-            pairs first, each frame once. ``index``: by index, for equal counts. ``endogslam-train``: the k-th pose of
-            the first with the k-th training frame of the second by EndoGSLAM's split, all but 7, 15, 23, ...
-            ``auto``: the first of name, time and index that matches at least three frames.
-        tolerance: s.
-
-    Raises:
-        InputError: Fewer than three frames match.
+    ``name``: equal image names, or equal file stems. ``time``: timestamps within ``tolerance`` (s), nearest pairs
+    first, each frame once. ``index``: by index, for equal counts. ``endogslam-train``: the k-th pose of the first with
+    the k-th training frame of the second by EndoGSLAM's split, all but 7, 15, 23, ... ``auto``: the first of name,
+    time and index that matches at least three frames.
     """
     has = {
         "name": first.names is not None and second.names is not None,
@@ -77,8 +70,7 @@ def nearest_in_time(
 ) -> Int[np.ndarray, "N"]:
     """Match timestamps, in any order, one to one, closest pairs first, as TUM's tools do.
 
-    Returns:
-        Indices into ``known``, -1 without a match within the tolerance. [N]
+    Returns indices into ``known``, -1 without a match within the tolerance. [N]
     """
     order = np.argsort(known, kind="stable")
     low = np.searchsorted(known[order], wanted - tolerance, side="left")

@@ -14,9 +14,8 @@ from coliags_plugin.core.files import atomic_folder, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scratch import final_place
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
-from coliags_plugin.geometry.poses.formats import Format
+from coliags_plugin.geometry.poses.formats import Format, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.text import prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 if TYPE_CHECKING:
@@ -128,25 +127,19 @@ def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: boo
     import pycolmap
 
     make_folder(folder)
+    seen = f"the COLMAP model written to {final_place(folder)} is incomplete"
+    incomplete = InputError(seen, "a disk with space left", "Free some, or choose another output")
     try:
         (model.write_text if text else model.write_binary)(str(folder))
         written = pycolmap.Reconstruction(str(folder))
     except Exception as error:  # what pycolmap raises depends on where the file ends
-        raise _incomplete(folder) from error
+        raise incomplete from error
     if _counts(written) != _counts(model):
-        raise _incomplete(folder)
+        raise incomplete
 
 
 def _counts(model: pycolmap.Reconstruction) -> tuple[int, ...]:
     return model.num_cameras(), model.num_images(), model.num_points3D(), model.compute_num_observations()
-
-
-def _incomplete(folder: Path) -> InputError:
-    return InputError(
-        f"the COLMAP model written to {final_place(folder)} is incomplete",
-        "a disk with space left",
-        "Free some, or choose another output",
-    )
 
 
 def read_pinholes(path: Path) -> dict[int, Intrinsics | str]:

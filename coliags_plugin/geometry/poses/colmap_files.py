@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import text_lines
-from coliags_plugin.geometry.poses.text import EXPECTED, shortened
+from coliags_plugin.geometry.poses.formats import EXPECTED, shortened
 
 _Record = TypeVar("_Record")
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])

@@ -16,9 +16,8 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.poses.formats import Format
+from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.text import head, prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 #: Key -> allowed shapes; a letter is the same size throughout the file, F the number of poses.
@@ -57,12 +56,7 @@ class EndoGslamParams:
 
 
 def read_params(path: Path) -> EndoGslamParams:
-    """Read all contents of a ``params.npz``; ``log_scales`` and ``keyframe_time_indices`` may be missing.
-
-    Raises:
-        InputError: It is not an NPZ file, or keys are missing or have invalid shapes or values (all of them are named);
-            a pose is not rigid; or the intrinsics are not a pinhole's.
-    """
+    """Read all contents of a ``params.npz``; ``log_scales`` and ``keyframe_time_indices`` may be missing."""
     arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
     keyframes = arrays.get("keyframe_time_indices")
     return EndoGslamParams(

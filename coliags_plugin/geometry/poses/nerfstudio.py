@@ -15,9 +15,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import read_json, read_number
-from coliags_plugin.geometry.poses.formats import Format
+from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.geometry.poses.text import head, prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")

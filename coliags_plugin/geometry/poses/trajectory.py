@@ -17,24 +17,17 @@ from coliags_plugin.geometry.poses.rigid import check_rigid
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses in video order.
+    """Camera poses in video order, rigid, with OpenCV axes (x right, y down, z forward).
 
-    Attributes:
-        camera_to_world: Rigid, OpenCV axes (x right, y down, z forward); lengths and world as in the file, unless a
-            remark says otherwise. float64.
-        names: Image name of each pose in the file, or None.
-        timestamps: Capture time of each image, s, or None. float64.
-        intrinsics: The pinhole that took all images, or None where it is unknown or there are several.
-        stored_as: Convention of the file, for messages.
-        remarks: Changes and omissions when the file was read.
+    Lengths and world are as in the file, unless a remark says otherwise.
     """
 
-    camera_to_world: Float[np.ndarray, "N 4 4"]
-    names: tuple[str, ...] | None = None
-    timestamps: Float[np.ndarray, "N"] | None = None
-    intrinsics: Intrinsics | None = None
-    stored_as: str = ""
-    remarks: tuple[str, ...] = ()
+    camera_to_world: Float[np.ndarray, "N 4 4"]  # float64
+    names: tuple[str, ...] | None = None  # image name of each pose in the file
+    timestamps: Float[np.ndarray, "N"] | None = None  # capture time of each image, s. float64
+    intrinsics: Intrinsics | None = None  # the pinhole that took all images; None: unknown, or there are several
+    stored_as: str = ""  # convention of the file, for messages
+    remarks: tuple[str, ...] = ()  # changes and omissions when the file was read
 
     def __post_init__(self) -> None:
         """Refuse no poses, those not rigid, right-handed and finite, and other than one name or finite time each."""

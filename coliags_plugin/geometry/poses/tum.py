@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.geometry.poses.formats import Format
+from coliags_plugin.geometry.poses.formats import Format, count_first_numbers, read_numbers
 from coliags_plugin.geometry.poses.rigid import rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 

@@ -3,22 +3,105 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface
 from coliags_plugin.surface.coverage.centreline import LumenSection, find_centreline, find_section
-from coliags_plugin.surface.coverage.levels import Level
-from coliags_plugin.surface.coverage.measure import WallCoverage
-from coliags_plugin.surface.coverage.regions import neighbours
-from coliags_plugin.surface.coverage.scores import CoverageScores, score_unseen
+from coliags_plugin.surface.coverage.measure import WallCoverage, large_regions, neighbours
 from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import RayGrids, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import Level, RayGrids, facing_cameras, see_faces
+
+
+@dataclass(frozen=True)
+class CoverageScores:
+    """How well unseen surface was found; shares of area in [0, 1], None where there is no such surface."""
+
+    face_iou: float | None  # intersection over union of predicted and true unseen surface
+    # Intersection over union of each true region with the predicted regions that overlap it, other true regions left
+    # out; mean weighted by area.
+    region_iou: float | None
+    mean_region_iou: float | None  # the same, every region counting alike
+    recall: float | None  # share of the true regions of whose area at least half is predicted unseen
+    false_reassurance: float | None  # share of the unseen surface that is called seen
+    false_alarm: float | None  # share of the surface called unseen that was seen
+    unseen_among_called_seen: float | None  # share of the surface called seen that is unseen
+    called_unseen_among_seen: float | None  # share of the seen surface that is called unseen
+    true_regions: int  # their number, and that of the predicted ones
+    predicted_regions: int
+
+    @property
+    def main_scores(self) -> dict[str, float | None]:
+        """Those of texts and tables, by their names."""
+        return {
+            "face IoU": self.face_iou,
+            "region IoU": self.region_iou,
+            "recall": self.recall,
+            "false reassurance": self.false_reassurance,
+            "false alarm": self.false_alarm,
+        }
+
+
+def score_unseen(
+    predicted: Bool[np.ndarray, "F"],
+    true: Bool[np.ndarray, "F"],
+    areas: Float[np.ndarray, "F"],
+    pairs: Int[np.ndarray, "E 2"],
+    smallest: float,
+) -> CoverageScores:
+    """Compare predicted with true unseen triangles; only regions larger than ``smallest`` mm^2 are regions.
+
+    Triangles of area 0 do not count; ``pairs`` are those with a common edge.
+    """
+    counted = areas > 0.0
+    predicted, true = predicted & counted, true & counted
+
+    def share(part: Bool[np.ndarray, "F"], whole: Bool[np.ndarray, "F"]) -> float | None:
+        total = float(areas[whole].sum())
+        return float(areas[part & whole].sum()) / total if total else None
+
+    truth = large_regions(true, pairs, areas, smallest)
+    called = large_regions(predicted, pairs, areas, smallest)
+    caught = [float(areas[region[predicted[region]]].sum()) >= 0.5 * float(areas[region].sum()) for region in truth]
+    ious = _region_ious(truth, called, areas)
+    return CoverageScores(
+        face_iou=share(predicted & true, predicted | true),
+        region_iou=float(np.average(ious, weights=[areas[region].sum() for region in truth])) if ious else None,
+        mean_region_iou=float(np.mean(ious)) if ious else None,
+        recall=float(np.mean(caught)) if caught else None,
+        false_reassurance=share(~predicted, true),
+        false_alarm=share(~true, predicted),
+        unseen_among_called_seen=share(true, counted & ~predicted),
+        called_unseen_among_seen=share(predicted, counted & ~true),
+        true_regions=len(truth),
+        predicted_regions=len(called),
+    )
+
+
+def _region_ious(
+    truth: Sequence[Int[np.ndarray, "K"]], called: Sequence[Int[np.ndarray, "K"]], areas: Float[np.ndarray, "F"]
+) -> list[float]:
+    """Of each true region with all predicted regions that overlap it, leaving out the surface of other true regions.
+
+    The adjusted sIoU of Chan et al., SegmentMeIfYouCan, NeurIPS 2021 Datasets and Benchmarks.
+    """
+    owner = np.full(len(areas), -1)
+    for number, region in enumerate(truth):
+        owner[region] = number
+    common, more = np.zeros(len(truth)), np.zeros(len(truth))
+    for region in called:
+        inside = region[owner[region] >= 0]
+        overlap = np.bincount(owner[inside], areas[inside], minlength=len(truth))
+        common += overlap
+        more[overlap > 0.0] += areas[region[owner[region] < 0]].sum()
+    whole = np.array([areas[region].sum() for region in truth])
+    return [float(value) for value in common / (whole + more)]
+
 
 #: Farthest that a triangle of the measured wall may be from the true one that it stands for, mm: the tolerance of
 #: the F-score of meshes.
@@ -50,7 +133,7 @@ class CoverageEvaluation:
         return {
             "section_mm": [round(self.section.start, 2), round(self.section.end, 2)],
             "unseen_share": self.unseen_share,
-            **{name: getattr(self, name).as_json() for name in ("surface", "rays", "all_unseen", "random")},
+            **{name: asdict(getattr(self, name)) for name in ("surface", "rays", "all_unseen", "random")},
         }
 
 
@@ -58,8 +141,7 @@ def evaluate_coverage(coverage: WallCoverage, truth: TrueSurface, views: Sequenc
     """Compare measured coverage with the truth of the same world; what was seen is measured where it does not say."""
     mesh = facing_cameras(truth.mesh, views, coverage.settings)
     seen = truth.seen if truth.seen_by else see_faces(mesh, views, coverage.settings).seen
-    poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
-    line = find_centreline(mesh, poses)
+    line = find_centreline(mesh, [view.camera_to_world for view in views])
     arc, clock, _ = line.unroll(mesh.centers)
     along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
     section = find_section(arc[along], mesh.areas[along], seen[along])
@@ -123,7 +205,7 @@ def _random_cells(
 
 def _mean(draws: Sequence[CoverageScores]) -> CoverageScores:
     """Means of the scores of several draws; numbers of regions are rounded."""
-    rows = [draw.as_json() for draw in draws]
+    rows = [asdict(draw) for draw in draws]
     means: dict[str, Any] = {}
     for name in rows[0]:
         values = [float(value) for row in rows if (value := row[name]) is not None]

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 from coliags_plugin.surface.coverage.centreline import STEP
-from coliags_plugin.surface.coverage.levels import GUESS_COLOR, GUESS_LABEL, Level
 from coliags_plugin.surface.coverage.measure import WallCoverage
+from coliags_plugin.surface.coverage.visibility import GUESS_COLOR, GUESS_LABEL, Level
 
 _SOFT, _GRID, _NOTHING = (110, 110, 110), (225, 225, 225), (245, 245, 245)
 #: Edges of the axes rectangle, px: left, top, and what is right of and below it.

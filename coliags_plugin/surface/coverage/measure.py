@@ -1,4 +1,4 @@
-"""Coverage of a recording: how each piece of the wall was seen, and the regions that were missed."""
+"""Coverage of a recording: how each piece of the wall was seen, and the connected regions that were missed."""
 
 from __future__ import annotations
 
@@ -7,16 +7,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.centreline import STEP, Centreline, LumenSection, find_centreline, find_section
-from coliags_plugin.surface.coverage.levels import Level, classify
-from coliags_plugin.surface.coverage.regions import large_regions, near_pairs, neighbours
+from coliags_plugin.surface.coverage.centreline import (
+    STEP,
+    Centreline,
+    LumenSection,
+    TubeGrid,
+    find_centreline,
+    find_section,
+    guessed_wall,
+    wall_around,
+)
 from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.tube import TubeGrid, guessed_wall, wall_around
 from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import FaceViews, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import FaceViews, Level, classify, facing_cameras, see_faces
 
 #: Guessed wall continues a region of reconstructed wall whose centroids are as near as this, mm.
 _TOUCHING = 2.0
@@ -26,29 +35,17 @@ _SAMPLES, _NEAR = 200, 20.0
 
 @dataclass(frozen=True, eq=False)
 class MissedRegion:
-    """A connected piece of the section that no frame shows.
+    """A connected piece of the section that no frame shows."""
 
-    Attributes:
-        triangles: Indices in :attr:`WallCoverage.mesh`.
-        area: mm^2.
-        guessed_area: Area of it whose place is a guess, mm^2.
-        centroid: World, mm.
-        arc: Place of the centroid along the centreline, mm.
-        clock: Its clock angle, degrees; 0 is up.
-        reach: From where to where along the centreline, mm.
-        at_end: Whether it reaches an end of the section, beyond which nothing is counted.
-        nearest: Index of the frame that looks where it is from nearest, whether it is hidden there or not.
-    """
-
-    triangles: Int[np.ndarray, "K"]
-    area: float
-    guessed_area: float
-    centroid: Float[np.ndarray, "3"]
-    arc: float
-    clock: float
-    reach: tuple[float, float]
-    at_end: bool
-    nearest: int
+    triangles: Int[np.ndarray, "K"]  # indices in :attr:`WallCoverage.mesh`
+    area: float  # mm^2
+    guessed_area: float  # area of it whose place is a guess, mm^2
+    centroid: Float[np.ndarray, "3"]  # world, mm
+    arc: float  # place of the centroid along the centreline, mm
+    clock: float  # clock angle of the centroid, degrees; 0 is up
+    reach: tuple[float, float]  # from where to where along the centreline, mm
+    at_end: bool  # whether it reaches an end of the section, beyond which nothing is counted
+    nearest: int  # index of the frame that looks where it is from nearest, whether it is hidden there or not
 
     @property
     def diameter(self) -> float:
@@ -58,34 +55,20 @@ class MissedRegion:
 
 @dataclass(frozen=True, eq=False)
 class WallCoverage:
-    """What a recording shows of a lumen's wall, F triangles.
+    """What a recording shows of a lumen's wall, F triangles."""
 
-    Attributes:
-        mesh: The reconstructed wall and, behind it in the order of triangles, the guessed wall.
-        guessed: Triangles whose place is a guess, because nothing was reconstructed there.
-        views: How the frames saw each triangle; guessed ones are unseen.
-        level: The values of :class:`Level`.
-        line: Centreline of the lumen.
-        arc, clock: Place along it, mm, and clock angle, degrees, of each triangle.
-        section: What part of the lumen is measured.
-        grid: The wall, guessed or not, around the centreline.
-        regions: Missed regions of the section, the largest first.
-        names: Of the frames.
-        settings: What counts as seen.
-    """
-
-    mesh: TriangleMesh
-    guessed: Bool[np.ndarray, "F"]
-    views: FaceViews
-    level: UInt8[np.ndarray, "F"]
-    line: Centreline
-    arc: Float[np.ndarray, "F"]
-    clock: Float[np.ndarray, "F"]
-    section: LumenSection
-    grid: TubeGrid
-    regions: list[MissedRegion]
-    names: list[str]
-    settings: CoverageSettings
+    mesh: TriangleMesh  # the reconstructed wall and, behind it in the order of triangles, the guessed wall
+    guessed: Bool[np.ndarray, "F"]  # triangles whose place is a guess, because nothing was reconstructed there
+    views: FaceViews  # how the frames saw each triangle; guessed ones are unseen
+    level: UInt8[np.ndarray, "F"]  # the values of :class:`Level`
+    line: Centreline  # of the lumen
+    arc: Float[np.ndarray, "F"]  # place of each triangle along the centreline, mm
+    clock: Float[np.ndarray, "F"]  # clock angle of each triangle, degrees
+    section: LumenSection  # what part of the lumen is measured
+    grid: TubeGrid  # the wall, guessed or not, around the centreline
+    regions: list[MissedRegion]  # of the section, the largest first
+    names: list[str]  # of the frames
+    settings: CoverageSettings  # what counts as seen
 
     @property
     def inside(self) -> Bool[np.ndarray, "F"]:
@@ -107,15 +90,11 @@ def measure_coverage(
 
     Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
     can be called unseen; guessed wall always is. ``progress`` is called after every frame.
-
-    Raises:
-        InputError: There is no frame, the mesh is empty, is not where the cameras look or is no tube around them.
     """
     settings = settings or CoverageSettings()
     mesh = facing_cameras(mesh, views, settings)
     face_views = see_faces(mesh, views, settings, progress)
-    poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
-    line = find_centreline(mesh, poses)
+    line = find_centreline(mesh, [view.camera_to_world for view in views])
     guess = guessed_wall(wall_around(mesh, line))
     whole, guessed = _joined(mesh, guess)
     seen = _extended(face_views, len(guess))
@@ -194,3 +173,52 @@ def _nearest_view(points: Float[np.ndarray, "N 3"], views: Sequence[CoverageView
             inside = inside & view.mask[row, column]
         merits.append(inside.mean() / (_NEAR + np.linalg.norm(local, axis=1).mean()))
     return int(np.argmax(merits))
+
+
+def neighbours(mesh: TriangleMesh) -> Int[np.ndarray, "E 2"]:
+    """Pairs of triangles with a common edge; an edge of more than two joins them in a chain. [E, 2]"""
+    corners = mesh.triangles.astype(np.int64)
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    owners = np.tile(np.arange(len(corners)), 3)
+    keys = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
+    order = np.argsort(keys, kind="stable")
+    keys, owners = keys[order], owners[order]
+    same = np.flatnonzero(keys[1:] == keys[:-1])
+    return np.stack([owners[same], owners[same + 1]], axis=1)
+
+
+def near_pairs(
+    centers: Float[np.ndarray, "F 3"], one: Bool[np.ndarray, "F"], other: Bool[np.ndarray, "F"], within: float
+) -> Int[np.ndarray, "E 2"]:
+    """Each triangle of one set and the nearest of the other, where their centroids are within a distance, mm. [E, 2]"""
+    first, second = np.flatnonzero(one), np.flatnonzero(other)
+    if not len(first) or not len(second):
+        return np.zeros((0, 2), np.int64)
+    distance, nearest = cKDTree(centers[second]).query(centers[first], distance_upper_bound=within)
+    near = np.isfinite(distance)
+    return np.stack([first[near], second[np.asarray(nearest)[near]]], axis=1)
+
+
+def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "F"]:
+    """Number of the connected region of each chosen triangle, from 0; -1 for the others. [F]"""
+    both = chosen[pairs[:, 0]] & chosen[pairs[:, 1]]
+    first, second = pairs[both].T
+    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(len(chosen), len(chosen)))
+    _, labels = connected_components(graph, directed=False)
+    numbers = np.full(len(chosen), -1, np.int64)
+    _, numbers[chosen] = np.unique(labels[chosen], return_inverse=True)
+    return numbers
+
+
+def large_regions(
+    chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"], areas: Float[np.ndarray, "F"], smallest: float
+) -> list[Int[np.ndarray, "K"]]:
+    """Connected regions above an area, mm^2, the largest first, each as the indices of its triangles."""
+    numbers = connected(chosen, pairs)
+    inside = np.flatnonzero(numbers >= 0)
+    if not len(inside):
+        return []
+    area = np.bincount(numbers[inside], areas[inside])
+    kept = np.flatnonzero(area > smallest)
+    kept = kept[np.argsort(-area[kept], kind="stable")]
+    return [np.flatnonzero(numbers == number) for number in kept]

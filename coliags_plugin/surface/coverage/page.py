@@ -22,10 +22,10 @@ from coliags_plugin.reporting.model import (
     simple_table,
 )
 from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation
-from coliags_plugin.surface.coverage.levels import Level
 from coliags_plugin.surface.coverage.map import draw_map, legend_entries
 from coliags_plugin.surface.coverage.measure import MissedRegion, WallCoverage
 from coliags_plugin.surface.coverage.views import CoverageView
+from coliags_plugin.surface.coverage.visibility import Level
 
 #: Said wherever a clinician could read the results.
 RESEARCH_USE = "Research use only: not a medical device, and not for decisions about a patient."

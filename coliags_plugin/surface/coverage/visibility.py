@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import CoverageView, RayGrid
@@ -83,11 +84,7 @@ def _visible_centroids(
 def facing_cameras(
     mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings | None = None
 ) -> TriangleMesh:
-    """The mesh with its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it.
-
-    Raises:
-        InputError: There is no frame, the mesh is empty, or no ray hits it.
-    """
+    """The mesh, its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it."""
     settings = settings or CoverageSettings()
     if not views:
         raise InputError("a recording without frames", "one frame or more")
@@ -122,11 +119,9 @@ def see_faces(
     settings = settings or CoverageSettings()
     _check_not_empty(mesh)
     grids, tally = RayGrids(settings.rays), _Tally(len(mesh))
-    for number, view in enumerate(views):
+    for number, view in enumerate(with_progress(views, "cast viewing rays", progress)):
         grid = grids.of(view)
         tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
-        if progress is not None:
-            progress("cast viewing rays", number + 1, len(views))
     between = np.flatnonzero(tally.counts[0] == 0)
     for number, view in enumerate(views):
         grid = grids.of(view)
@@ -196,3 +191,42 @@ class _Tally:
         )
         brightness = np.where(self.brightness >= 0.0, self.brightness, np.nan).astype(np.float32)
         return FaceViews(frames, clear, good, distance, incidence, fineness, brightness, self.best)
+
+
+class Level(IntEnum):
+    """How well a piece of surface was seen."""
+
+    UNSEEN = 0
+    POOR = 1
+    GLANCE = 2
+    SEEN = 3
+
+    @property
+    def label(self) -> str:
+        """For legends and tables."""
+        return _LABELS[self]
+
+    @property
+    def color(self) -> tuple[int, int, int]:
+        """RGB of maps and meshes; told apart with any colour vision."""
+        return _COLORS[self]
+
+
+_LABELS = ("not seen", "seen too dark or too far", "seen only at a glance", "seen")
+_COLORS = ((213, 62, 0), (95, 75, 139), (240, 200, 66), (150, 200, 190))
+#: Not seen and not reconstructed either: a guess of where the surface is.
+GUESS_LABEL = "not seen, place guessed"
+GUESS_COLOR = (122, 20, 20)
+
+
+def classify(views: FaceViews, settings: CoverageSettings) -> UInt8[np.ndarray, "F"]:
+    """Level of each triangle, the values of :class:`Level`. [F]
+
+    Seen: ``glance_frames`` frames or more saw it near and bright enough, at an angle to its normal of at most
+    ``grazing``. At a glance: fewer did, but some saw it near and bright enough. Too dark or too far: no frame did.
+    """
+    level = np.full(len(views.frames), int(Level.UNSEEN), np.uint8)
+    level[views.frames > 0] = Level.POOR
+    level[views.clear_frames > 0] = Level.GLANCE
+    level[views.good_frames >= settings.glance_frames] = Level.SEEN
+    return level

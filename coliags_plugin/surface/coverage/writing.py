@@ -23,27 +23,21 @@ from coliags_plugin.geometry.meshes.truth import find_true_surface, read_true_su
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation, evaluate_coverage
-from coliags_plugin.surface.coverage.levels import Level
 from coliags_plugin.surface.coverage.map import draw_map, face_colors
 from coliags_plugin.surface.coverage.measure import WallCoverage, measure_coverage
 from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import recorded_views
+from coliags_plugin.surface.coverage.visibility import Level
 
 
 @dataclass(frozen=True)
 class MeasuredCoverage:
-    """A measurement of coverage and the folder that it was written to.
+    """A measurement of coverage and the folder that it was written to."""
 
-    Attributes:
-        folder: With ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``.
-        coverage: The measurement.
-        evaluation: Against the truth; None without one.
-    """
-
-    folder: Path
+    folder: Path  # with ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``
     coverage: WallCoverage = field(repr=False)
-    evaluation: CoverageEvaluation | None = field(repr=False, default=None)
+    evaluation: CoverageEvaluation | None = field(repr=False, default=None)  # against the truth, where there is one
 
 
 def measure_scene(
@@ -54,16 +48,10 @@ def measure_scene(
     truth: Path | None = None,
     overwrite: bool = False,
 ) -> MeasuredCoverage:
-    """Measure the coverage of a recording and write it.
+    """Measure the coverage of a recording and write it; the mesh is the wall, mm, in the world of the scene.
 
-    Args:
-        scene: The recording.
-        mesh: The wall, mm, in the world of the scene.
-        output: The folder to make.
-        settings: What counts as seen.
-        truth: True surface: a mesh in the world of the scene, mm, or the folder of a scene with one; None: that of the
-            scene, where there is one.
-        overwrite: Replace the folder where it exists.
+    ``truth`` is a true surface, in that world and mm, or the folder of a scene with one; None: that of the scene, where
+    there is one.
     """
     check_free(output, overwrite)
     views = recorded_views(scene)

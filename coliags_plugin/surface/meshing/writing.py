@@ -17,10 +17,15 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
-from coliags_plugin.geometry.meshes.comparison import SurfaceComparison, compare_meshes
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.geometry.meshes.truth import TrueSurface, find_true_surface, read_true_surface
+from coliags_plugin.geometry.meshes.truth import (
+    SurfaceComparison,
+    TrueSurface,
+    compare_meshes,
+    find_true_surface,
+    read_true_surface,
+)
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
 from coliags_plugin.surface.meshing.fusion import fuse_run
@@ -33,17 +38,11 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class MeshedRun:
-    """The mesh of a run and the folder it was written to.
+    """The mesh of a run and the folder it was written to."""
 
-    Attributes:
-        folder: With ``mesh.ply`` and so on, and ``mesh.json``.
-        mesh: World of the poses, scene units.
-        comparison: With the true surface; None where there is none.
-    """
-
-    folder: Path
-    mesh: TriangleMesh
-    comparison: SurfaceComparison | None
+    folder: Path  # with ``mesh.ply`` and so on, and ``mesh.json``
+    mesh: TriangleMesh  # world of the poses, scene units
+    comparison: SurfaceComparison | None  # with the true surface, where there is one
 
 
 def mesh_run(
@@ -57,16 +56,8 @@ def mesh_run(
     """Fuse a run into a mesh and write it, with a comparison where there is a true surface.
 
     The folder gets the mesh in each format; ``mesh.json`` with settings, counts and figures; and, with a true surface,
-    ``comparison.png``, ``mesh_error.ply`` and ``truth_error.ply``, coloured by distance.
-
-    Args:
-        trained: The run.
-        output: The folder to make.
-        settings: Options; None: the defaults.
-        formats: Of the files, see :data:`~coliags_plugin.geometry.meshes.files.MESH_FORMATS`.
-        truth: The true surface: a mesh in the world of the scene in mm, or the folder of a scene with one. None: that
-            of the run's own scene, where there is one.
-        overwrite: Replace ``output`` where it exists.
+    ``comparison.png``, ``mesh_error.ply`` and ``truth_error.ply``, coloured by distance. ``truth`` is that surface, in
+    the world of the scene and mm, or the folder of a scene with one; None: that of the run's scene, where there is one.
     """
     scene = trained.scene
     settings = settings or MeshSettings()

@@ -12,8 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.engine.held_light import mean_camera
-from coliags_plugin.export.baking.averages import GaussianAverages, blending_weights
-from coliags_plugin.export.baking.harmonics import SeenColors, fit_harmonics
+from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings

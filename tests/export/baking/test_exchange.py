@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.export.baking import refinement
 from coliags_plugin.export.baking.baking import bake
-from coliags_plugin.export.baking.explicit import field_of_cloud
+from coliags_plugin.export.splats.cloud import field_of_cloud
 from coliags_plugin.export.splats.files import read_splats, write_splats
 from coliags_plugin.export.splats.ply import write_splat_ply
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from coliags_plugin.export.baking.averages import mean_gaussians
+from coliags_plugin.export.baking.baking import mean_gaussians
 from coliags_plugin.export.viewer.content import VIEWS, spread
 from coliags_plugin.export.viewer.splats import MARGIN, ViewDecoder, in_view, shown, widened
 from tests.export.viewer.made import Scripted, some_gaussians

@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors
-from coliags_plugin.export.viewer import merging
-from coliags_plugin.export.viewer.merging import merged, merged_to
-from coliags_plugin.export.viewer.splats import shown
+from coliags_plugin.export.viewer.splats import merged, merged_to, shown
 from tests.export.viewer.made import some_gaussians
 
 
@@ -36,7 +34,7 @@ def test_discs_at_one_place_are_as_opaque_as_one_behind_the_other():
 
 
 def test_moments_of_two_equal_discs(monkeypatch):
-    monkeypatch.setattr(merging, "_SPREAD", 1.0)
+    monkeypatch.setattr("coliags_plugin.export.viewer.splats._SPREAD", 1.0)
     pair = flat(1, 0.5, 0.5, (100, 0, 0), (-1.0, 0, 0)).concat(flat(1, 0.5, 0.5, (0, 200, 0), (1.0, 0, 0)))
     one = merged(pair, np.zeros(2, np.int64))
     np.testing.assert_allclose(one.means, [[0, 0, 0]], atol=1e-7)

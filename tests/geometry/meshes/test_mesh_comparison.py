@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.meshes.comparison import angles_between, compare_meshes, sample_surface
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.geometry.meshes.truth import TrueSurface
+from coliags_plugin.geometry.meshes.truth import TrueSurface, angles_between, compare_meshes, sample_surface
 from tests.surface.coverage.tubes import plane as square
 
 COUNT = 100_000

@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses import c3vd, nerfstudio
-from coliags_plugin.geometry.poses.alignment import ErrorStatistics, align
+from coliags_plugin.geometry.poses.alignment import ErrorStatistics, Similarity, align, umeyama, world_rotation
 from coliags_plugin.geometry.poses.association import FrameMatches, associate
 from coliags_plugin.geometry.poses.rigid import rigid
-from coliags_plugin.geometry.poses.similarity import Similarity, umeyama, world_rotation
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.geometry.poses.winding import some_transform, trajectories, winding
 

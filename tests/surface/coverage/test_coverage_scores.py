@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.surface.coverage.regions import connected, large_regions, near_pairs, neighbours
-from coliags_plugin.surface.coverage.scores import score_unseen
+from coliags_plugin.surface.coverage.evaluation import score_unseen
+from coliags_plugin.surface.coverage.measure import connected, large_regions, near_pairs, neighbours
 from tests.surface.coverage.tubes import plane
 
 N = 20

@@ -7,12 +7,11 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.centreline import find_centreline, find_section
-from coliags_plugin.surface.coverage.levels import Level
+from coliags_plugin.surface.coverage.centreline import find_centreline, find_section, guessed_wall, wall_around
 from coliags_plugin.surface.coverage.map import draw_map
 from coliags_plugin.surface.coverage.measure import measure_coverage
 from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.tube import guessed_wall, wall_around
+from coliags_plugin.surface.coverage.visibility import Level
 from tests.surface.coverage.tubes import grid_mesh, pinhole, plane, tube, view_at
 
 FEW_RAYS = CoverageSettings(rays=20_000)

@@ -9,10 +9,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import validated
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.levels import Level, classify
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import RayGrid
-from coliags_plugin.surface.coverage.visibility import facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import Level, classify, facing_cameras, see_faces
 from tests.surface.coverage.tubes import joined, pinhole, plane, sphere, tube, view_at
 
 

@@ -10,7 +10,7 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.surface.meshing.volume import Volume
+from coliags_plugin.surface.meshing.fusion import Volume
 from tests.scenes import wall_scene
 
 
@@ -65,7 +65,7 @@ def test_places_of_few_views_are_left_out():
 
 
 def test_voxels_too_small_for_the_memory_are_refused(monkeypatch):
-    monkeypatch.setattr("coliags_plugin.surface.meshing.volume._MAX_BLOCKS", 1000)
+    monkeypatch.setattr("coliags_plugin.surface.meshing.fusion._MAX_BLOCKS", 1000)
     volume = Volume(0.1, 4.0)
     with pytest.raises(InputError, match=r"larger voxels\. Try --voxel 0.2"):
         volume.add(np.full((90, 120), 20.0, np.float32), np.zeros((90, 120, 3), np.uint8), turned(0.0))
