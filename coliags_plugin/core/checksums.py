@@ -14,11 +14,7 @@ _BLOCK = 1 << 20
 
 
 def file_sha256(file: Path) -> str:
-    """SHA-256 of a file, in hexadecimal.
-
-    Raises:
-        InputError: It cannot be read.
-    """
+    """SHA-256 of a file, in hexadecimal."""
     digest = hashlib.sha256()
     try:
         with file.open("rb") as stream:
@@ -36,11 +32,7 @@ def write_checksums(folder: Path) -> None:
 
 
 def differing_files(folder: Path) -> list[str]:
-    """Names of files that are missing from a folder or are not those of its list of checksums; without a list, none.
-
-    Raises:
-        InputError: The list, or a file, cannot be read.
-    """
+    """Names of files that are missing from a folder or are not those of its list of checksums; without a list, none."""
     try:
         lines = (folder / CHECKSUMS).read_text(encoding="ascii").splitlines()
     except FileNotFoundError:

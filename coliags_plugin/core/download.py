@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from coliags_plugin._version import __version__
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import make_folder, not_writable
+from coliags_plugin.core.files import make_folder, reporting_unwritable
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 
@@ -32,29 +32,20 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
     """Fetch a file by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set; nothing where ``target`` exists.
 
     What arrives is written to ``target`` with ``.part`` appended, which is kept when the transfer fails or is
-    interrupted, continued by the next call, and renamed once its checksum is right.
-
-    Args:
-        url: Where the file is.
-        target: The file to write.
-        sha256: Its SHA-256 in hexadecimal, or the first digits of it.
-        progress: Called with what has arrived and all there is, MiB.
-        otherwise: What the user can do where the server cannot be reached.
+    interrupted, continued by the next call, and renamed once its checksum is right. ``sha256`` is hexadecimal, or the
+    first digits of it; progress is in MiB; ``otherwise`` says what the user can do where the server cannot be reached.
     """
     make_folder(target.parent)
     part, lock = (target.with_name(f"{target.name}.{suffix}") for suffix in ("part", "lock"))
-    try:
-        with locked(lock, part):
-            try:
-                if not target.exists():
-                    _fetch(url, part, sha256, progress, otherwise)
-                    os.replace(part, target)
-            finally:
-                # Nothing of the download is touched from here on, and filelock grants no lock of an unlinked file.
-                with suppress(OSError):  # on Windows a locked file
-                    lock.unlink()
-    except OSError as error:
-        raise not_writable(part.parent, error) from error
+    with reporting_unwritable(part.parent), locked(lock, part):
+        try:
+            if not target.exists():
+                _fetch(url, part, sha256, progress, otherwise)
+                os.replace(part, target)
+        finally:
+            # Nothing of the download is touched from here on, and filelock grants no lock of an unlinked file.
+            with suppress(OSError):  # on Windows a locked file
+                lock.unlink()
 
 
 def _fetch(url: str, part: Path, sha256: str, progress: Progress, otherwise: str) -> None:

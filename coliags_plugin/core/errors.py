@@ -28,15 +28,9 @@ class InputError(ReportedError):
     exit_status = 2
 
     def __init__(self, seen: str, expected: str = "", do: str = "") -> None:
-        self.seen = seen
-        self.expected = expected
-        self.do = do
-        parts = [seen.rstrip(".")]
-        if expected:
-            parts.append(f"Expected {expected.rstrip('.')}")
-        if do:
-            parts.append(do.rstrip("."))
-        text = ". ".join(parts)
+        self.seen, self.expected, self.do = seen, expected, do
+        parts = (seen, f"Expected {expected}" if expected else "", do)
+        text = ". ".join(part.rstrip(".") for part in parts if part)
         super().__init__(text if text.endswith("?") else f"{text}.")
 
 

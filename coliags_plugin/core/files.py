@@ -49,7 +49,7 @@ def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     durable = not is_in_scratch(target)
     make_folder(target.parent)
     with ExitStack() as scratches:
-        with _reported(target.parent):
+        with reporting_unwritable(target.parent):
             if durable:
                 sweep(target)
             if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -57,9 +57,9 @@ def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
                     f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite"
                 )
             scratch = scratches.enter_context(scratch_folder(target))
-        with _full_disk_reported(target.parent):
+        with reporting_unwritable(target.parent, only_full=True):
             yield scratch
-        with _reported(target.parent):
+        with reporting_unwritable(target.parent):
             if durable:
                 sync_tree(scratch)
             put_in_place(scratch, target)
@@ -68,41 +68,29 @@ def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def atomic_write(target: Path, data: bytes | str) -> None:
-    """Write a file under a temporary name, then rename it to ``target``.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Write a file under a temporary name, then rename it to ``target``."""
     with _renamed_at_the_end(target) as file:
         file.write(data.encode() if isinstance(data, str) else data)
 
 
 @contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """A path of the same suffix for a library to write to; it becomes ``target`` when the block ends without an error.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """A path of the same suffix for a library to write; it becomes ``target`` when the block ends without an error."""
     make_folder(target.parent)
     with ExitStack() as scratches:
-        with _reported(target.parent):
+        with reporting_unwritable(target.parent):
             sweep(target)
             path = scratches.enter_context(scratch_folder(target)) / target.name
-        with _full_disk_reported(target.parent):
+        with reporting_unwritable(target.parent, only_full=True):
             yield path
-        with _reported(target.parent):
+        with reporting_unwritable(target.parent):
             sync(path)
             os.replace(path, target)
             sync(target.parent)
 
 
 def atomic_copy(source: Path, target: Path) -> None:
-    """Copy a file under a temporary name, then rename that to ``target``.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Copy a file under a temporary name, then rename that to ``target``."""
     with source.open("rb") as original, _renamed_at_the_end(target) as file:
         shutil.copyfileobj(original, file)
 
@@ -112,7 +100,7 @@ def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
     durable, scratch = not is_in_scratch(target), None
     make_folder(target.parent)
     try:
-        with _reported(target.parent):
+        with reporting_unwritable(target.parent):
             if durable:
                 sweep(target)
             handle, scratch = scratch_file(target)
@@ -130,30 +118,18 @@ def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
 
 
 @contextmanager
-def _reported(folder: Path) -> Iterator[None]:
+def reporting_unwritable(folder: Path, only_full: bool = False) -> Iterator[None]:
+    """Report that a folder cannot be written; or only a full disk, where other errors may not be about the folder."""
     try:
         yield
     except OSError as error:
-        raise not_writable(folder, error) from error
-
-
-@contextmanager
-def _full_disk_reported(folder: Path) -> Iterator[None]:
-    """Report a full disk; the caller's other errors may not be about this folder."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in _FULL:
+        if only_full and error.errno not in _FULL:
             raise
         raise not_writable(folder, error) from error
 
 
 def write_arrays(target: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as NPZ, atomically and without pickle.
-
-    Raises:
-        InputError: It cannot be written.
-    """
+    """Write named arrays as NPZ, atomically and without pickle."""
     import numpy as np
 
     data = io.BytesIO()
@@ -167,15 +143,9 @@ def write_json(target: Path, data: object) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents.
-
-    Raises:
-        InputError: It cannot be created.
-    """
-    try:
+    """Create a folder and its parents."""
+    with reporting_unwritable(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(folder, error) from error
 
 
 def not_writable(folder: Path, error: OSError) -> NotWritableError:

@@ -54,12 +54,9 @@ class GlbArray:
 
 
 def encode_glb(document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "") -> bytes:
-    """The bytes of a GLB file.
+    """The bytes of a GLB file of a glTF document without asset, buffers, views and accessors; accessor i is array i.
 
-    Args:
-        document: The glTF document without asset, buffers, views and accessors; accessor i is array i.
-        arrays: Each of rows of a multiple of four bytes.
-        extras: A comment.
+    Rows of arrays have a multiple of four bytes; ``extras`` is a comment.
     """
     views, chunks, offset = [], [], 0
     for array in arrays:

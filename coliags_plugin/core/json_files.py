@@ -29,20 +29,14 @@ def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> 
 
 
 def json_text(path: Path) -> str:
-    """The text of a JSON file.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: It is larger than :data:`coliags_plugin.core.bounds.JSON_BYTES`, or is not UTF-8.
-    """
+    """The text of a JSON file; ValueError if it is too large or not UTF-8."""
     return whole_text(path, bounds.JSON_BYTES)
 
 
 def parse_json(text: str | bytes, finite: bool = False) -> Any:
     """The value of a JSON text; ``finite`` refuses infinity and NaN, which cannot be written again.
 
-    Raises:
-        ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits; or see ``finite``.
+    What is not JSON, is nested too deeply or has a number of thousands of digits is a ValueError.
     """
     try:
         return json.loads(text, **(_FINITE if finite else {}))

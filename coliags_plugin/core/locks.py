@@ -30,16 +30,8 @@ class LockedError(InputError):
 def locked(file: Path, what: str | Path, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock of a file, which ends with the process, however that ends.
 
-    The file is created, names the process that has the lock, and stays.
-
-    Args:
-        file: Of the lock.
-        what: What the lock protects, for messages.
-        wait: Seconds to wait for another process; infinity: without end.
-
-    Raises:
-        LockedError: Another process still holds it.
-        InputError: The file cannot be written.
+    The file is created, names the process that has the lock, and stays. ``what`` it protects is for messages. Another
+    process is waited for so many seconds, or without end; LockedError if it still holds the lock.
     """
     make_folder(file.parent)
     lock = FileLock(file, poll_interval=_POLL_INTERVAL_S)

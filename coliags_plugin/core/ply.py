@@ -91,11 +91,7 @@ def write_ply(
 ) -> None:
     """Write vertices and triangles atomically; the folder is made.
 
-    Args:
-        path: Where to.
-        vertices: Properties by name, in their order: uint8 is kept, everything else becomes float32. Each [V]
-        triangles: Indices of vertices, counted from 0.
-        comment: A line for the header.
+    Vertices are properties by name, [V] each: uint8 is kept, everything else becomes float32.
     """
     kinds = {name: "u1" if values.dtype == np.uint8 else "<f4" for name, values in vertices.items()}
     rows = np.empty(len(next(iter(vertices.values()))), list(kinds.items()))

@@ -19,12 +19,9 @@ _SHARE, _FEWEST = 500, 20
 def point_normals(
     points: Float[Tensor, "P 3"], neighbours: int, at: Float[Tensor, "N 3"] | None = None
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals, of either sign: the direction in which the points nearest to a position vary least.
+    """Unit normals, of either sign: the direction in which so many points nearest to a position vary least.
 
-    Args:
-        points: Scene units.
-        neighbours: Points that count at each position.
-        at: Positions, scene units; None: those of the points, each of which does not count at its own.
+    Without positions, at the points themselves, each of which does not count at its own.
     """
     least = neighbours + (at is None)
     if len(points) < least:

@@ -154,15 +154,9 @@ class Frame(_MaskedImage):
         def taken(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[row, column][:, None]
 
-        image, chosen = self.image[row, column][:, None], pixel_ids(self.index, row * self.image.shape[1] + column)
-        return Target(
-            self.name,
-            image,
-            taken(self.mask),
-            taken(self.depth),
-            chosen=chosen[:, None],
-            depth_confidence=taken(self.depth_confidence),
-        )
+        image, mask, depth = self.image[row, column][:, None], taken(self.mask), taken(self.depth)
+        chosen = pixel_ids(self.index, row * self.image.shape[1] + column)[:, None]
+        return Target(self.name, image, mask, depth, chosen=chosen, depth_confidence=taken(self.depth_confidence))
 
     @property
     def true_depth(self) -> Float[Tensor, "H W"] | None:
@@ -251,11 +245,9 @@ class Scene:
 
     def with_near_plane(self, near_plane: float) -> Scene:
         """The scene with another near plane of all cameras, scene units."""
-        sets = {
-            name: [frame.with_near_plane(near_plane) for frame in frames]
-            for name, frames in {"": self.train, **self.test_sets}.items()
-        }
-        return replace(self, train=sets.pop(""), test_sets=sets)
+        train = [frame.with_near_plane(near_plane) for frame in self.train]
+        tests = {name: [frame.with_near_plane(near_plane) for frame in part] for name, part in self.test_sets.items()}
+        return replace(self, train=train, test_sets=tests)
 
     @property
     def extent(self) -> float:

@@ -44,9 +44,6 @@ def scratch_folder(target: Path) -> Iterator[Path]:
     """A new, locked, empty folder beside ``target``, with the permissions that the umask leaves.
 
     It is removed at the end, with what it then holds, unless it was renamed.
-
-    Raises:
-        OSError: It cannot be made.
     """
     while True:
         path = _name(target, _PARTIAL)
@@ -65,11 +62,7 @@ def scratch_folder(target: Path) -> Iterator[Path]:
 
 
 def scratch_file(target: Path) -> tuple[int, Path]:
-    """A new, locked, empty file beside ``target``, with the permissions that the umask leaves: descriptor and path.
-
-    Raises:
-        OSError: It cannot be made.
-    """
+    """A new, locked, empty file beside ``target``, with the permissions that the umask leaves: descriptor and path."""
     while True:
         path = _name(target, _PARTIAL)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -132,10 +125,8 @@ def _remove(path: Path) -> None:
 def put_in_place(scratch: Path, target: Path) -> None:
     """Rename a scratch folder to ``target``; what was there takes the scratch's name.
 
-    Atomic on Linux; elsewhere, a process killed between two renames leaves what :func:`sweep` restores.
-
-    Raises:
-        OSError: It cannot be renamed; then ``target`` is as it was.
+    Atomic on Linux; elsewhere, a process killed between two renames leaves what :func:`sweep` restores. After
+    an OSError, ``target`` is as it was.
     """
     if not os.path.lexists(target):
         os.rename(scratch, target)
@@ -170,11 +161,7 @@ def _renameat2() -> Any:
 
 
 def sync(path: Path) -> None:
-    """Force a file, or the names in a folder, onto the disk.
-
-    Raises:
-        OSError: The disk is full or broken.
-    """
+    """Force a file, or the names in a folder, onto the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -186,11 +173,7 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Force a folder with all its content onto the disk.
-
-    Raises:
-        OSError: The disk is full or broken.
-    """
+    """Force a folder with all its content onto the disk."""
     for parent, _, files in os.walk(folder):
         for name in files:
             sync(Path(parent, name))

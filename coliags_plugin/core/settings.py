@@ -29,40 +29,26 @@ class Settings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _refuse_huge_integers(cls, data: object) -> object:
+    def _refuse_unknown_keys_and_huge_integers(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        huge = [key for key, value in data.items() if _is_huge(value)]
-        if huge:
-            problem = PydanticCustomError("huge_integer", "an integer of more than 64 bits")
-            raise ValidationError.from_exception_data(
-                cls.__name__, [InitErrorDetails(type=problem, loc=(key,), input=data[key]) for key in huge]
+        known = ", ".join(cls.model_fields) or "none"
+        problems = {
+            key: PydanticCustomError(
+                "unknown_key",
+                "unknown key '{key}'; known keys: {known}. {hint}",
+                {"key": str(key), "known": known, "hint": did_you_mean(str(key), cls.model_fields)},
             )
-        return data
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unknown_keys(cls, data: object) -> object:
-        if not isinstance(data, dict):
-            return data
-        unknown = [key for key in data if key not in cls.model_fields]
-        if unknown:
-            known = ", ".join(cls.model_fields) or "none"
-            raise ValidationError.from_exception_data(
-                cls.__name__,
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError(
-                            "unknown_key",
-                            "unknown key '{key}'; known keys: {known}. {hint}",
-                            {"key": str(key), "known": known, "hint": did_you_mean(str(key), cls.model_fields)},
-                        ),
-                        loc=(key,),
-                        input=data[key],
-                    )
-                    for key in unknown
-                ],
-            )
+            for key in data
+            if key not in cls.model_fields
+        } or {
+            key: PydanticCustomError("huge_integer", "an integer of more than 64 bits")
+            for key, value in data.items()
+            if _is_huge(value)
+        }
+        if problems:
+            details = [InitErrorDetails(type=why, loc=(key,), input=data[key]) for key, why in problems.items()]
+            raise ValidationError.from_exception_data(cls.__name__, details)
         return data
 
 

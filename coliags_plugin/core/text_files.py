@@ -10,12 +10,7 @@ from coliags_plugin.core.errors import InputError
 
 
 def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
-    """The content of a file in UTF-8, with or without a byte order mark, of at most so many bytes.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: It is larger, or is not UTF-8.
-    """
+    """The content of a file in UTF-8, with or without a byte order mark, of at most so many bytes; else ValueError."""
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
@@ -23,11 +18,7 @@ def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The content of a file, as :func:`whole_text`, for readers of what users wrote.
-
-    Raises:
-        InputError: The file cannot be read, is not text, or is too large.
-    """
+    """The content of a file, as :func:`whole_text`, for readers of what users wrote."""
     try:
         return whole_text(path)
     except (OSError, ValueError) as error:
@@ -35,11 +26,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
-    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large.
-
-    Raises:
-        InputError: The file cannot be read, or is not text.
-    """
+    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             yield from enumerate(file, start=1)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel, ConfigDict, NonNegativeInt
+from pydantic import ConfigDict, NonNegativeInt
+from pydantic.dataclasses import dataclass
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -39,34 +40,15 @@ class DamagedCheckpointError(InputError):
     """A file of a checkpoint is missing or is not what was written."""
 
 
-class _State(BaseModel):
-    """Content of ``state.json`` besides the format; see :class:`Checkpoint`."""
-
-    model_config = ConfigDict(strict=True)
-
-    step: NonNegativeInt
-    method: str
-    frame_queue: list[NonNegativeInt]
-    cost: TrainingCost | None = None
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
 class Checkpoint:
-    """Content of a checkpoint.
+    """Content of a checkpoint: of ``state.json``, and the tensors."""
 
-    Attributes:
-        step: Steps taken.
-        method: Name of the method it belongs to.
-        tensors: By ``<part>/<name>``, the parts being field, modules, optimizer, strategy and generator.
-        queue: Frames that the sampler has planned, the last being next.
-        cost: What the run had cost; None where it was not measured.
-    """
-
-    step: int
+    step: NonNegativeInt  # taken
     method: str
-    tensors: Mapping[str, Tensor]
-    queue: list[int]
-    cost: TrainingCost | None = None
+    frame_queue: list[NonNegativeInt]  # that the sampler has planned, the last being next
+    tensors: dict[str, Tensor]  # by ``<part>/<name>``: field, modules, optimizer, strategy and generator
+    cost: TrainingCost | None = None  # of the run so far; None where it was not measured
 
     def part(self, name: str) -> dict[str, Tensor]:
         """The tensors of one part."""
@@ -112,11 +94,7 @@ def save_checkpoint(
 
 
 def save_tensors(tensors: Mapping[str, Tensor], file: Path) -> None:
-    """Write named tensors as safetensors, with the permissions that the umask leaves.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """Write named tensors as safetensors, with the permissions that the umask leaves."""
     file.touch()
     permissions = file.stat().st_mode & 0o777  # safetensors itself gives them to the owner only
     try:
@@ -169,11 +147,7 @@ def take_newest(folder: Path, method: str, device: torch.device) -> Checkpoint |
 
 
 def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint of the highest step.
-
-    Raises:
-        InputError: There is none.
-    """
+    """The checkpoint of the highest step; refused where there is none."""
     found = newest_checkpoint(folder)
     if found is None:
         raise InputError(f"no checkpoint in {folder}", "at least one step-* folder", "Train first: `coliags train`")
@@ -181,12 +155,7 @@ def latest_checkpoint(folder: Path) -> Path:
 
 
 def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint:
-    """Read one checkpoint; generator states stay on the CPU.
-
-    Raises:
-        DamagedCheckpointError: A file of it is not what was written.
-        InputError: It is of another format, or of another method.
-    """
+    """Read one checkpoint of a method; generator states stay on the CPU."""
     differing = differing_files(path)
     if differing:
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
@@ -197,41 +166,40 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
             raise InputError(
                 f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version"
             )
-        state = _State.model_validate(content)
         tensors = load_file(path / "state.safetensors")
+        placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
+        saved = Checkpoint(**{**content, "tensors": placed})
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise _damaged(path, str(error)) from error
-    if state.method != method:
+    if saved.method != method:
         raise InputError(
-            f"checkpoint {path} is of method '{state.method}'", f"one of method '{method}'", "Name its own method"
+            f"checkpoint {path} is of method '{saved.method}'", f"one of method '{method}'", "Name its own method"
         )
-    placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
-    return Checkpoint(state.step, state.method, placed, state.frame_queue, state.cost)
+    return saved
+
+
+@contextmanager
+def _fitting(what: str) -> Iterator[None]:
+    """Report that a part of a checkpoint is not of this run; ``what`` begins the message."""
+    try:
+        yield
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{what}: {error}", "one of this run") from error
 
 
 def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:
     """The model of a checkpoint; the scene is that of the run, for view modules with parameters per frame."""
-    try:
+    with _fitting(f"the checkpoint does not fit field '{config.field.name}'"):
         field = config.field.target.from_state(checkpoint.part("field"), config.field.settings)
-    except (KeyError, RuntimeError) as error:
-        raise InputError(
-            f"the checkpoint does not fit field '{config.field.name}': {error}", "one of this run"
-        ) from error
     modules = make_view_modules(config, scene, torch.Generator())
     for name, module in modules.items():
-        try:
+        with _fitting(f"the checkpoint's module '{name}' does not fit"):
             module.load_state_dict(checkpoint.part(f"modules/{name}"))
-        except RuntimeError as error:
-            raise InputError(f"the checkpoint's module '{name}' does not fit: {error}", "one of this run") from error
     return Model(field, renderer, modules, config.near_plane)
 
 
 def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> None:
-    """Load a strategy's counters.
-
-    Raises:
-        InputError: The checkpoint lacks one.
-    """
+    """Load a strategy's counters."""
     try:
         strategy.load_state_dict(checkpoint.part("strategy"))
     except KeyError as error:
@@ -243,35 +211,24 @@ def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> N
 
 
 def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
-    """Load Adam's moments.
-
-    Raises:
-        InputError: They are of other parameters.
-    """
-    try:
+    """Load Adam's moments."""
+    with _fitting("the checkpoint's moments are of another optimizer"):
         for key, value in checkpoint.part("optimizer").items():
             group, index, name = key.split("/")
             adam = optimizers.adam[group]
             adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
         optimizers.check_moments()
-    except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"the checkpoint's moments are of another optimizer: {error}", "one of this run") from error
 
 
 def restore_sampling(checkpoint: Checkpoint, sampler: Sampler, generators: Mapping[str, torch.Generator]) -> None:
-    """Load the frames that were planned, and the states of the random generators.
-
-    Raises:
-        InputError: Frames or states are none of this run.
-    """
-    if any(frame >= len(sampler.sizes) for frame in checkpoint.queue):
-        raise InputError(f"the checkpoint plans frame {max(checkpoint.queue)}", f"one of {len(sampler.sizes)} frames")
-    sampler.queue = list(checkpoint.queue)
-    try:
+    """Load the frames that were planned, and the states of the random generators."""
+    queue, count = list(checkpoint.frame_queue), len(sampler.sizes)
+    if any(frame >= count for frame in queue):
+        raise InputError(f"the checkpoint plans frame {max(queue)}", f"one of {count} frames")
+    sampler.queue = queue
+    with _fitting("the checkpoint's random state does not fit"):
         for name, state in checkpoint.part("generator").items():
             generators[name].set_state(state)
-    except (KeyError, RuntimeError, TypeError) as error:
-        raise InputError(f"the checkpoint's random state does not fit: {error}", "one of this run") from error
 
 
 def _damaged(path: Path, reason: str) -> DamagedCheckpointError:

@@ -24,20 +24,16 @@ PSNR_MARKS = (25, 30, 32, 34, 36, 38, 40)
 class TrainingCost(BaseModel):
     """What training cost up to a checkpoint, all resumptions together; kept in the checkpoint. None: not measured.
 
-    Attributes:
-        device: Name of the processor or GPU.
-        threads: CPU threads of torch.
-        seconds: Time in the training loop: steps, logging and earlier checkpoints. What a kill threw away is not in it.
-        processor_seconds: CPU time of the process in the same, all threads together.
-        peak_memory_mib: Largest resident memory of the process; on a GPU, largest memory allocated there in the loop.
+    Time is that in the training loop: steps, logging and earlier checkpoints, without what a kill threw away. Memory is
+    the largest resident memory of the process; on a GPU, the largest memory allocated there in the loop.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    device: str
-    threads: int | None = None
+    device: str  # name of the processor or GPU
+    threads: int | None = None  # of torch, on the CPU
     seconds: float | None = None
-    processor_seconds: float | None = None
+    processor_seconds: float | None = None  # all threads together
     peak_memory_mib: float | None = None
 
 

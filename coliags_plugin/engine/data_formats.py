@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
@@ -46,11 +45,7 @@ def load_method_for(
 
 
 def load_scene(config: MethodConfig, path: Path) -> Scene:
-    """Read the data with the method's data manager and near plane, reporting progress when it takes long.
-
-    Raises:
-        InputError: It cannot be read.
-    """
+    """Read the data with the method's data manager and near plane, reporting progress when it takes long."""
     with progress_callback(after=READING_IS_LONG) as progress:
         scene = data_manager(config.datamanager, path).load(path, progress)
     return scene.with_near_plane(config.near_plane)
@@ -72,22 +67,17 @@ def open_scene(
 ) -> Scene:
     """Read a scene without a method, also one that has nothing to make initial points from.
 
-    Args:
-        path: Its folder.
-        data_format: A data manager's name; None: the one that recognises the folder.
-        options: ``key=value`` options of that data manager.
-        progress: Called with ``(what, done, total)`` while images are read.
-        stored_size: Read images at their stored size, each when it is used, and make no initial points.
+    The format is the name of a data manager, or else of the one that recognises the folder; options are ``key=value``
+    of it. With ``stored_size``, images are read at their stored size, each when it is used, and without initial points.
     """
     name = find_format(path) if data_format is None else data_format
-    given = override_all(Node({}, "options"), options).plain()
     if stored_size:
-        return _manager(name, given).at_stored_size().load(path, progress)
+        return _manager(name, options).at_stored_size().load(path, progress)
     try:
-        return _manager(name, given).load(path, progress)
+        return _manager(name, options).load(path, progress)
     except NoPointsError as error:
         log.warning("%s", error)
-        return _manager(name, {**given, "initial_points": "none"}).load(path, progress)
+        return _manager(name, options, initial_points="none").load(path, progress)
 
 
 def open_video(
@@ -96,15 +86,12 @@ def open_video(
     """Read all frames of a video as training frames, to estimate their poses; arguments as of :func:`open_scene`.
 
     The folder is a scene, or one of a format that can do without poses (``rgbd``); split and initial points are not
-    to be chosen.
-
-    Returns:
-        The scene, and whether it has poses; where not, all its cameras are at the origin.
+    to be chosen. The scene, and whether it has poses; where not, all its cameras are at the origin.
     """
     options = (*options, "split=all-train", "initial_points=none")
     name = data_format or unposed_format(path)
     if name is not None and registry.datamanagers.get(name).recognise_unposed(path):
-        manager = _manager(name, override_all(Node({}, "options"), options).plain())
+        manager = _manager(name, options)
         unposed = manager.without_poses()
         if unposed is not manager:
             log.info("%s: format %s without poses", path, name)
@@ -112,9 +99,10 @@ def open_video(
     return open_scene(path, data_format, options, progress), True
 
 
-def _manager(name: str, options: Mapping[str, Any]) -> DataManager:
+def _manager(name: str, options: Sequence[str], **more: str) -> DataManager:
+    given = override_all(Node({}, "options"), options).plain()
     try:
-        component = make_component("datamanagers", {**options, "name": name})
+        component = make_component("datamanagers", {**given, **more, "name": name})
     except ValidationError as error:
         key, message, _ = first_error(error)
         raise InputError(f"--set {key}: {message}", f"an option of the format {name}") from error

@@ -15,11 +15,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
-from coliags_plugin.engine.evaluated_set import EvaluatedSet
 from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.run_result import run_result
+from coliags_plugin.engine.run_result import EvaluatedSet, run_result
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
@@ -48,13 +47,9 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and
     of it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available,
     with the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains;
-    and the images. An earlier evaluation under the same protocol is replaced once the new one is complete.
-
-    Args:
-        trained: The run, which must not be relit.
-        protocol_name: Name of the protocol.
-        other: A scene with the true depth, whose frames take the place of the run's own
-            (:func:`~coliags_plugin.engine.truth.match_truth`); the folder is then ``eval/<protocol>-truth/``.
+    and the images. An earlier evaluation under the same protocol is replaced once the new one is complete. Frames of
+    another scene with the true depth take the place of the run's own (:mod:`coliags_plugin.engine.truth`); the folder
+    is then ``eval/<protocol>-truth/``.
     """
     if trained.relit:
         raise InputError(

@@ -31,11 +31,6 @@ def mean_camera(cameras: Sequence[Camera]) -> Camera:
     return replace(cameras[0], camera_to_world=pose)
 
 
-def light_of_mean_camera(model: Model, cameras: Sequence[Camera]) -> HeldLight:
-    """The lamp of the mean training camera."""
-    return LightOfCamera(mean_camera(cameras))
-
-
 @torch.no_grad()
 def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
     """The median distance and the median angle to the optical axis of what the training cameras see, for everything."""
@@ -53,7 +48,7 @@ def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
 
 #: Ways to hold the light, by the names that users give them.
 LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight]] = {
-    "mean": light_of_mean_camera,
+    "mean": lambda _, cameras: LightOfCamera(mean_camera(cameras)),
     "flattened": flattened_light,
 }
 
@@ -72,33 +67,21 @@ def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[
 
 
 def gaussians_of(model: Model) -> GaussianField:
-    """The model's field of Gaussians.
-
-    Raises:
-        InputError: It has none.
-    """
+    """The model's field of Gaussians."""
     if not isinstance(model.field, GaussianField):
         raise InputError(f"a field of '{model.field.primitive}'", "Gaussians", "Choose a splatting method")
     return model.field
 
 
 def splatting_of(model: Model) -> SplattingRenderer:
-    """The model's splatting renderer.
-
-    Raises:
-        InputError: It is another one.
-    """
+    """The model's splatting renderer."""
     if not isinstance(model.renderer, SplattingRenderer):
         raise InputError(f"renderer {type(model.renderer).__name__}", "one of this package's splatting renderers")
     return model.renderer
 
 
 def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
-    """The run under another lamp; it shares the parameters.
-
-    Raises:
-        InputError: The run's field does not model the lamp apart from the tissue.
-    """
+    """The run under another lamp; it shares the parameters."""
     model = trained.model
     if not isinstance(model.field, LitField):
         lit = ", ".join(name for name in fields if issubclass(fields.get(name), LitField))
@@ -116,9 +99,6 @@ def flatten(trained: TrainedRun) -> TrainedRun:
     """The run in the same light everywhere: at the median distance and angle of what the training cameras see.
 
     View modules are left out, so that no gain is applied; it shares the parameters.
-
-    Raises:
-        InputError: The method does not make Gaussians that are drawn by this package.
     """
     splatting_of(trained.model)
     gaussians_of(trained.model)

@@ -33,25 +33,16 @@ _MAX_COLOR = 1.5
 
 @dataclass(frozen=True)
 class TrueLight:
-    """Lamp, vignetting, camera response and gains of a phantom.
+    """Lamp, vignetting, camera response and gains of a phantom."""
 
-    Attributes:
-        offset: Of the lamp in camera axes, mm.
-        axis: Unit direction of the beam in camera axes.
-        spread_law, spread: Angular fall-off of the beam (docs/phantom.md 2).
-        vignetting: Exponent of cos theta at the lens, in linear light.
-        gamma, knee: Of the camera's response; a soft shoulder bends what is above the knee, in linear light.
-        gains: Red, green and blue gain in linear light by the frame's index in the video.
-    """
-
-    offset: tuple[float, float, float]
-    axis: tuple[float, float, float]
-    spread_law: SpreadLaw
+    offset: tuple[float, float, float]  # of the lamp in camera axes, mm
+    axis: tuple[float, float, float]  # unit direction of the beam in camera axes
+    spread_law: SpreadLaw  # angular fall-off of the beam (docs/phantom.md 2)
     spread: float
-    vignetting: float
-    gamma: float
-    knee: float
-    gains: Mapping[int, tuple[float, float, float]]
+    vignetting: float  # exponent of cos theta at the lens, in linear light
+    gamma: float  # of the camera's response
+    knee: float  # a soft shoulder of the response bends what is above it, in linear light
+    gains: Mapping[int, tuple[float, float, float]]  # red, green, blue in linear light, by the frame's index
 
     @property
     def distance_exponent(self) -> float:

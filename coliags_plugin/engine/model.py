@@ -71,13 +71,9 @@ class Model(nn.Module):
     ) -> list[RenderOutput]:
         """A view as rendered, and as shaded by each module in turn: what a module is given, and at last the result.
 
-        Args:
-            camera: Camera before adjustment by view modules.
-            wants: Names of outputs; rgb, alpha and the outputs that modules need are always included.
-            view: Which frame of the video it is; None for a free camera.
-            pixels: Columns and rows of the only pixels to render. [P, 2]
-            generator: In training, of the random samples of renderers and fields that have any; None renders without
-                chance.
+        Modules adjust the camera first. Outputs always include rgb, alpha and what modules need; ``view`` is None for a
+        free camera; ``pixels`` are columns and rows of the only ones to render, [P, 2]; ``generator``, in training, is
+        of the random samples of renderers and fields that have any, and None renders without chance.
         """
         camera, modules = self.placed(camera), self.view_modules.values()
         for module in modules:
@@ -110,18 +106,10 @@ class Model(nn.Module):
     @property
     def outputs(self) -> frozenset[str]:
         """Names of all available outputs."""
-        return self.renderer.outputs_of(self.field.primitive) | self.feature_channels
-
-    @property
-    def feature_channels(self) -> frozenset[str]:
-        """Names of the field's feature channels."""
-        return self.field.feature_channels
+        return self.renderer.outputs_of(self.field.primitive) | self.field.feature_channels
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
-        """Refuse outputs that the renderer does not have for this field, wanted by a view module or by ``asking``.
-
-        ``asking`` is the subject of the message about ``wants``.
-        """
+        """Refuse outputs that the renderer lacks for this field, wanted by a module or by ``asking`` (a subject)."""
         wanted = {asking: frozenset(wants)}
         wanted |= {f"module '{name}'": module.wants for name, module in self.view_modules.items()}
         for subject, names in wanted.items():

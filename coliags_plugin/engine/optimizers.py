@@ -21,13 +21,8 @@ _COUNT = "step"
 class Optimizers:
     """One Adam optimizer per parameter group of the model, with consistent changes of rows and moments.
 
-    Implements :class:`coliags_plugin.contracts.ParameterRows`.
-
-    Args:
-        model: Whose parameters to train.
-        settings: Rates by group name; must name exactly the model's groups.
-        steps: Over which scheduled rates fall.
-        extent: The scene's, for groups whose rates scale with it, scene units.
+    Implements :class:`coliags_plugin.contracts.ParameterRows`. Settings, by group, name exactly the model's groups;
+    scheduled rates fall over so many steps; the scene's extent, scene units, is for rates that scale with it.
     """
 
     def __init__(self, model: Model, settings: Mapping[str, OptimizerSettings], steps: int, extent: float) -> None:
@@ -114,8 +109,8 @@ class Optimizers:
         new = nn.Parameter(change("value", old.detach()), requires_grad=old.requires_grad)
         if old.grad is not None:
             new.grad = change(_GRADIENT, old.grad)
-        owner, attribute = _owner(self.model, old)
-        setattr(owner, attribute, new)
+        owner, _, attribute = next(n for n, value in self.model.named_parameters() if value is old).rpartition(".")
+        setattr(self.model.get_submodule(owner), attribute, new)
         optimizer = self.adam[group]
         optimizer.param_groups[0]["params"] = [new]
         state = optimizer.state.pop(old, None)
@@ -140,12 +135,3 @@ def _check_groups(there: set[str], named: set[str]) -> None:
             f"exactly its parameter groups: {', '.join(sorted(there))}",
             f"Remove it with --set 'optimizers.\"{unknown[0]}\"=null'",
         )
-
-
-def _owner(model: nn.Module, parameter: nn.Parameter) -> tuple[nn.Module, str]:
-    """The module that holds a parameter, and the attribute's name."""
-    for module in model.modules():
-        for name, value in module.named_parameters(recurse=False):
-            if value is parameter:
-                return module, name
-    raise KeyError("a parameter of no module")

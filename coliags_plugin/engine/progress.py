@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -23,19 +23,9 @@ PLAIN_LINE_EVERY = 10.0
 NOTEBOOK_LINE_EVERY = 0.5
 
 
-class Display(Protocol):
-    """Protocol of what shows the progress towards a total."""
-
-    def update(self, done: int, facts: str) -> None:
-        """Show how much is done, with facts."""
-
-    def close(self) -> None:
-        """Leave what was shown last."""
-
-
 def open_display(
     console: Console, title: str, total: int, start: int, plain_every: float = PLAIN_LINE_EVERY
-) -> Display:
+) -> TerminalBar | TextDisplay:
     """The display that fits where the console writes to; plain lines come every ``plain_every`` seconds."""
     if console.is_terminal:
         return TerminalBar(console, title, total, start)
@@ -61,11 +51,11 @@ class TerminalBar:
         self._task = self._bar.add_task(title, total=total, completed=start, facts="")
 
     def update(self, done: int, facts: str) -> None:
-        """See :class:`Display`."""
+        """Show how much is done, with facts."""
         self._bar.update(self._task, completed=done, facts=facts)
 
     def close(self) -> None:
-        """See :class:`Display`."""
+        """Leave what was shown last."""
         self._bar.stop()
 
 
@@ -80,14 +70,14 @@ class TextDisplay:
         self._last = -math.inf if at_once else self._began
 
     def update(self, done: int, facts: str) -> None:
-        """See :class:`Display`."""
+        """Show how much is done, with facts, where it is time to."""
         now = time.monotonic()
         if now - self._last >= self._every or done == self._total:
             self._last = now
             self._show(self._line(done, facts, now - self._began))
 
     def close(self) -> None:
-        """See :class:`Display`."""
+        """Nothing: what was shown last stays."""
 
     def _line(self, done: int, facts: str, seconds: float) -> str:
         """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
@@ -130,7 +120,7 @@ class ProgressReport:
     ) -> None:
         self.title = title
         self._total, self._start, self._plain_every, self._console = total, start, plain_every, console
-        self._display: Display | None = None
+        self._display: TerminalBar | TextDisplay | None = None
 
     def __enter__(self) -> ProgressReport:
         console = self._console or Console(file=sys.stderr)

@@ -54,20 +54,10 @@ def render_run(
 ) -> None:
     """Render colour, depth and error images of a set of frames, and a video along the trajectory.
 
-    A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth is
-    hatched where alpha is below 0.5, and has no errors where the scene's own is estimated.
-
-    Args:
-        trained: The run.
-        output: The folder to make.
-        frames: See :func:`choose_frames`.
-        video: Also write ``trajectory.mp4``: every frame's view in video order, rgb beside depth.
-        fps: Of the video.
-        overwrite: Replace ``output`` where it exists.
-        channels: Feature channels of one or three numbers to write as images too, 1 as white.
-        depth_kind: Which depth (docs/conventions.md 3).
-        depth_tiff: Also write depth as float32 TIFF, scene units, of every pixel.
-        light_map: Also write the learned light, ``light.html`` and ``light.json``.
+    A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
+    of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
+    is estimated; as float32 TIFF it has scene units and all pixels. Feature channels have one or three numbers, 1 is
+    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth.
     """
     chosen = choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
@@ -105,11 +95,7 @@ def render_run(
 
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:
-    """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name.
-
-    Raises:
-        InputError: There are none.
-    """
+    """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name."""
     groups = {"train": scene.train, **scene.test_sets}
     groups["all"] = scene.video
     if not groups.get(frames):
@@ -119,7 +105,7 @@ def choose_frames(scene: Scene, frames: str) -> list[Frame]:
 
 
 def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
-    known = sorted(trained.model.feature_channels)
+    known = sorted(trained.model.field.feature_channels)
     for channel in channels:
         if channel not in known:
             raise InputError(

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import math
 import os
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.method_config import LoadedMethod, load_method
+from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, atomic_write, not_writable, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
 from coliags_plugin.core.json_files import JsonObject, parse_json, read_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
+
+if TYPE_CHECKING:
+    from coliags_plugin.core.scenes import Scene  # with torch, which commands about runs do without
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 1
 #: Of the end of a training log, more than a row has.
@@ -27,23 +34,14 @@ _TAIL_BYTES = 8192
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What a run is, from its provenance.
-
-    Attributes:
-        method: Name of its method.
-        scene_name: Name of its scene.
-        scene_path: Where that was read from.
-        fingerprint: Hash of its files.
-        seed: Of all random generators.
-        steps: Length of its training.
-    """
+    """What a run is, from its provenance."""
 
     method: str
     scene_name: str
-    scene_path: Path
-    fingerprint: str | None
+    scene_path: Path  # that it was read from
+    fingerprint: str | None  # of the scene's files
     seed: int
-    steps: int
+    steps: int  # of the whole training
 
 
 @dataclass(frozen=True)
@@ -105,11 +103,7 @@ class RunFolder:
 
     @classmethod
     def newest(cls, scene: str, method: str) -> RunFolder:
-        """The latest run of a method on a scene under the working directory.
-
-        Raises:
-            InputError: There is none.
-        """
+        """The latest run of a method on a scene under the working directory."""
         parent = Path("runs") / scene / method
         found = sorted(path for path in parent.glob("*") if (path / "config.yaml").is_file())
         if not found:
@@ -118,11 +112,7 @@ class RunFolder:
 
     @classmethod
     def existing(cls, path: Path) -> RunFolder:
-        """An existing run.
-
-        Raises:
-            InputError: This is no run folder.
-        """
+        """An existing run."""
         folder = cls(path)
         if not folder.config_file.is_file() or not folder.provenance_file.is_file():
             raise InputError(f"{path} is not a run folder", "a folder with config.yaml and provenance.json")
@@ -161,20 +151,12 @@ class RunFolder:
         return load_method(str(self.config_file.resolve()))
 
     def provenance(self) -> JsonObject:
-        """Content of the provenance file.
-
-        Raises:
-            InputError: The file is damaged.
-        """
+        """Content of the provenance file."""
         found: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
         return found
 
     def identity(self) -> RunIdentity:
-        """What the run is.
-
-        Raises:
-            InputError: The provenance file is damaged or lacks some of it.
-        """
+        """What the run is."""
         found = self.provenance()
         try:
             scene = found["scene"]
@@ -189,25 +171,63 @@ class RunFolder:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error
 
+    def resume_command(self, method: str, data: str) -> str:
+        """Command line that resumes the run."""
+        return shlex.join(["coliags", "train", method, "--data", data, "--output", str(self.path), "--resume"])
+
+    def check_method(self, name: str) -> None:
+        """Refuse to resume with another method."""
+        owner = self.provenance().get("method")
+        if owner != name:
+            raise InputError(f"{self.path} is a run of method '{owner}'", f"one of '{name}'")
+
+    def check_same(self, method: LoadedMethod, scene: Scene, scene_path: str) -> None:
+        """Refuse to resume with another method, other settings (the schedule apart) or other data."""
+        self.check_method(method.name)
+        ignored = {"schedule", "description"}
+        saved, now = (config.model_dump(exclude=ignored) for config in (self.method().config, method.config))
+        differing = [key for key in now if now[key] != saved[key]]
+        if differing:
+            raise InputError(
+                f"{self.path} was trained with other settings of {', '.join(differing)}",
+                "the settings it was started with",
+                f"Compare with {self.config_file}",
+            )
+        if self.provenance()["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
+            raise InputError(f"{scene_path} is not the data this run was started on", "unchanged data")
+
+    def record_schedule(self, config: MethodConfig, step: int) -> None:
+        """Write a schedule that differs from the run's own into its config, and the change into its provenance."""
+        before, now = self.method().config.schedule, config.schedule
+        if now.steps < step:
+            raise InputError(f"{self.path} has taken {step} steps already", f"--steps {step} or more, not {now.steps}")
+        if now == before:
+            return
+        provenance = self.provenance()
+        change = {"at_step": step, "from": before.model_dump(), "to": now.model_dump()}
+        changes = [*provenance.get("schedule_changes", []), change]
+        self.rewrite(config.to_yaml(), {**provenance, "steps": now.steps, "schedule_changes": changes})
+        if (now.steps, now.written_for) != (before.steps, before.written_for):
+            logger.warning(
+                "the schedule changes at step %d from %d to %d steps: rates and weights jump there, and the result is "
+                "not that of a run of %d steps",
+                step,
+                before.steps,
+                now.steps,
+                now.steps,
+            )
+
     @contextmanager
     def log_writer(self) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-        """What appends rows to the training log.
-
-        Raises:
-            InputError: It cannot be written.
-        """
-        try:
+        """What appends rows to the training log."""
+        with reporting_unwritable(self.path):
             file = self.log_file.open("a", encoding="utf-8")
-        except OSError as error:
-            raise not_writable(self.path, error) from error
 
         def append(row: Mapping[str, Any]) -> None:
             text = json.dumps(row, allow_nan=False) + "\n"
-            try:
+            with reporting_unwritable(self.path):
                 file.write(text)
                 file.flush()
-            except OSError as error:
-                raise not_writable(self.path, error) from error
 
         try:
             yield append
@@ -222,11 +242,7 @@ class RunFolder:
         return int(next(rows, {"step": 0})["step"])
 
     def log_rows(self, until: float = math.inf) -> list[JsonObject]:
-        """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
-
-        Raises:
-            InputError: The log cannot be read.
-        """
+        """Rows of the training log up to a step, without lines that a kill cut short; none without a log."""
         try:
             with self.log_file.open(encoding="utf-8") as lines:
                 return [row for row in map(_log_row, lines) if row and row["step"] <= until]

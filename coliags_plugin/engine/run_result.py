@@ -1,28 +1,116 @@
-"""The result of an evaluated run, composed of the run's folder, its scene and its scores."""
+"""What the evaluation of a run collects frame by frame, and the result that is composed of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from coliags_plugin._version import __version__
+from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.render_output import OPAQUE_ALPHA
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.checkpoints import checkpoint_folder
 from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_psnr
 from coliags_plugin.engine.devices import device_name
-from coliags_plugin.engine.evaluated_set import SEEN_METRICS, EvaluatedSet
 from coliags_plugin.engine.provenance import software
-from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth
-from coliags_plugin.results.hashing import metrics_sha256, plain_config, result_key
-from coliags_plugin.results.record import SEEN_SUFFIX, CostRecord, MetricRecord, ProtocolRecord, Result, SceneRecord
+from coliags_plugin.results.hashing import ArraysHash, metrics_sha256, plain_config, result_key
+from coliags_plugin.results.profiles import ErrorProfiles
+from coliags_plugin.results.record import (
+    SEEN_SUFFIX,
+    CostRecord,
+    MetricRecord,
+    ProtocolRecord,
+    Result,
+    SceneRecord,
+    SetRecord,
+)
+
+#: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
+SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
 
 #: Keys of the provenance of a run and of its scene that a result has in another place, or that name a local path.
 _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint")
+
+
+class EvaluatedSet:
+    """Scores, error profiles and hashes of one test set."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, dict[str, float]] = {}
+        self._reasons: dict[str, str] = {}
+        self._predictions, self._truth = ArraysHash(), ArraysHash()
+        self._profiles = ErrorProfiles()
+        self._optional: tuple[str, ...] = ()
+        self._pixels = self._transparent = 0
+
+    def add(self, frame: Frame, comparison: Comparison, scorer: Scorer, alpha: Float[Tensor, "H W"]) -> None:
+        """Score a frame under its protocol and take it up, with its rendered alpha."""
+        self._pixels += int(frame.valid.sum())
+        self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
+        self._add_scores(frame.name, scorer.score(comparison))
+        self._optional = tuple(scorer.optional_metrics)
+        if frame.seen is not None:
+            self._add_scores(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
+        _hash(self._predictions, frame.name, rgb=comparison.rgb, depth=comparison.depth)
+        _hash(
+            self._truth,
+            frame.name,
+            rgb=comparison.true_rgb,
+            valid=comparison.valid,
+            depth=comparison.true_depth,
+            depth_valid=comparison.depth_valid,
+            seen=frame.seen,
+        )
+        self._profiles.add(comparison, frame)
+
+    def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
+        row = self._rows.setdefault(frame, {})
+        row.update({name + suffix: value for name, value in scores.values.items()})
+        for name, reason in scores.reasons.items():
+            self._reasons.setdefault(name + suffix, reason)
+
+    @property
+    def seen_metrics(self) -> list[str]:
+        """Names of the metrics over seen pixels that some frame has."""
+        return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in self._scored]
+
+    @property
+    def optional_metrics(self) -> list[str]:
+        """Names of the protocol's optional metrics that some frame has."""
+        return [name for name in self._optional if name in self._scored]
+
+    @property
+    def _scored(self) -> set[str]:
+        return {name for row in self._rows.values() for name in row}
+
+    def record(self, metrics: Iterable[str]) -> SetRecord:
+        """The set's record; the protocol's ``metrics`` are listed even where no frame has one."""
+        rows = self._rows.values()
+        lacking = set(self._optional) - set(self.optional_metrics)
+        names = [*metrics, *self.optional_metrics, *self.seen_metrics]
+        return SetRecord(
+            frames=tuple(self._rows),
+            values={name: tuple(row.get(name) for row in rows) for name in names},
+            reasons={name: reason for name, reason in self._reasons.items() if name not in lacking},
+            predictions_sha256=self._predictions.hexdigest(),
+            truth_sha256=self._truth.hexdigest(),
+            profiles=self._profiles.records(),
+            transparent=self._transparent / self._pixels if self._pixels else None,
+        )
+
+
+def _hash(target: ArraysHash, frame: str, **parts: Tensor | None) -> None:
+    for name, values in parts.items():
+        if values is not None:
+            target.add(frame, name, values.detach().cpu().numpy())
 
 
 def run_result(
@@ -75,12 +163,8 @@ def run_result(
 
 
 def _described(truth: Truth, own: Scene) -> JsonObject:
-    trained_on = {key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")}
-    return {
-        "scene": truth.scene.name,
-        "matched_by": truth.matched_by,
-        "trained_on": {"name": own.name, **trained_on},
-    }
+    trained_on = {"name": own.name, **{key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")}}
+    return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
 
 
 def scene_record(scene: Scene) -> SceneRecord:

@@ -20,12 +20,7 @@ from coliags_plugin.engine.model import Model
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of one view.
-
-    Attributes:
-        values: By name.
-        reasons: Why others cannot be had, by name.
-    """
+    """Scores of one view by name, and the reasons why others cannot be had."""
 
     values: dict[str, float] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
@@ -48,11 +43,13 @@ class Scorer:
     def _made(
         self, table: Mapping[str, tuple[str, Mapping[str, Any]]], only: Sequence[str] | None
     ) -> dict[str, Metric]:
-        return {
-            key: _metric(name, options, f"protocol '{self.protocol.name}', metric '{key}'")
-            for key, (name, options) in table.items()
-            if only is None or key in only
-        }
+        made = {}
+        for key, (name, options) in table.items():
+            if only is None or key in only:
+                asking = f"protocol '{self.protocol.name}', metric '{key}'"
+                component = named_component("metrics", {"name": name, **options}, asking)
+                made[key] = component.target(component.settings)
+        return made
 
     @torch.no_grad()
     def render(self, model: Model, frame: Frame) -> RenderOutput:
@@ -93,9 +90,3 @@ def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
     seen = frame.seen.to(comparison.valid.device)
     depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & seen
     return replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
-
-
-def _metric(name: str, options: Mapping[str, Any], asking: str) -> Metric:
-    component = named_component("metrics", {"name": name, **options}, asking)
-    metric: Metric = component.target(component.settings)
-    return metric

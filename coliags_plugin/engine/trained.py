@@ -24,22 +24,7 @@ from coliags_plugin.renderers.choice import choose_renderer
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """Scene and model of a run at its latest checkpoint.
-
-    Attributes:
-        run: Its folder.
-        config: Its method config.
-        method: Name of the method.
-        scene: What it was trained on.
-        model: The trained model.
-        step: Of the checkpoint.
-        device: Where it computes.
-        seed: Of the run.
-        provenance: As recorded by training.
-        cost: What training cost up to the checkpoint; None where it was not measured.
-        lamp: What it was relit with; None under the lamp that the data were recorded with.
-        held: Light that stays as it is, in which views are rendered; None under a lamp that moves with the camera.
-    """
+    """Scene and model of a run at its latest checkpoint, with the provenance that training recorded."""
 
     run: RunFolder
     config: MethodConfig = field(repr=False)
@@ -50,9 +35,9 @@ class TrainedRun:
     device: torch.device
     seed: int
     provenance: Mapping[str, Any] = field(repr=False)
-    cost: TrainingCost | None = None
-    lamp: Lamp | None = None
-    held: HeldLight | None = None
+    cost: TrainingCost | None = None  # up to the checkpoint; None where it was not measured
+    lamp: Lamp | None = None  # that it was relit with; None under the one that the data were recorded with
+    held: HeldLight | None = None  # that stays as it is in all views; None under a lamp that moves with the camera
 
     @property
     def relit(self) -> bool:
@@ -73,14 +58,10 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     method, folder = identity.method, data or identity.scene_path
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
     scene = load_scene(config, folder)
-    _check_same_data(scene, identity.fingerprint, folder)
+    if scene.provenance.get("fingerprint") != identity.fingerprint:
+        raise InputError(
+            f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
+        )
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
     model = restore_model(saved, config, scene, renderer).to(device).eval()
     return TrainedRun(run, config, method, scene, model, saved.step, device, identity.seed, provenance, saved.cost)
-
-
-def _check_same_data(scene: Scene, fingerprint: str | None, path: Path) -> None:
-    if scene.provenance.get("fingerprint") != fingerprint:
-        raise InputError(
-            f"{path} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
-        )

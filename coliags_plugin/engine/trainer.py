@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep
@@ -21,7 +20,7 @@ from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, Noth
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.masked import masked_mean
-from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
+from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
@@ -32,7 +31,6 @@ from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import run_provenance
 from coliags_plugin.engine.randomness import generators
-from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
@@ -87,11 +85,7 @@ class Trainer:
         self.costs = CostMeter(device)
 
     def start(self, overwrite: bool = False) -> None:
-        """Make the run folder.
-
-        Raises:
-            InputError: It exists, or cannot be written.
-        """
+        """Make the run folder."""
         self.run.create(self.method.config.to_yaml(), self.provenance(), overwrite)
 
     def resume(self) -> None:
@@ -99,10 +93,10 @@ class Trainer:
 
         A schedule that differs from the run's own is taken as a change on purpose and recorded.
         """
-        check_same_run(self.run, self.method, self.scene, self.scene_path)
+        self.run.check_same(self.method, self.scene, self.scene_path)
         saved = checkpoints.take_newest(self.run.checkpoints, self.method.name, self.device)
         cost = None if saved is None else self._restore(saved)
-        record_schedule(self.run, self.method.config, self.step)
+        self.run.record_schedule(self.method.config, self.step)
         rows = self._cut_log()
         if cost is None and saved is not None:  # of a version that measured seconds alone
             cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)
@@ -126,15 +120,9 @@ class Trainer:
         return self.costs.seconds
 
     def train(self, save_seconds: float = math.inf, keep: int | None = None) -> None:
-        """Train to the last step, logging and saving on the way.
+        """Train to the last step, logging and saving on the way, or until a signal of :data:`STOPPING` comes.
 
-        Args:
-            save_seconds: Largest time between two checkpoints, besides those of the schedule.
-            keep: How many checkpoints to keep, the newest; None: all.
-
-        Raises:
-            InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP; what was done is saved.
-            NotFiniteError: A loss term or a parameter is NaN or infinite.
+        Besides those of the schedule, a checkpoint is written after so many seconds; of all, so many newest are kept.
         """
         schedule = self.method.config.schedule
         logger.info("%s", self.strategy.plan())
@@ -162,17 +150,14 @@ class Trainer:
                 if stop and self.step < self.steps:
                     raise InterruptedRunError(
                         f"stopped after step {self.step} of {self.steps}, which is saved; go on with "
-                        f"{resume_command(self.run, self.method.name, self.scene_path)}"
+                        f"{self.run.resume_command(self.method.name, self.scene_path)}"
                     )
 
     def take_step(self) -> JsonObject:
         """Train on the next frame; the row of the log.
 
-        Step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did.
-
-        Raises:
-            NotFiniteError: A loss term, or a parameter as the step before left it, is NaN or infinite.
-            NothingDrawnError: Views stay empty.
+        Step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did. NotFiniteError if a loss
+        term, or a parameter as the step before left it, is NaN or infinite; NothingDrawnError if views stay empty.
         """
         step = self.step + 1
         self.model.field.before_step(step, self.schedule)
@@ -183,15 +168,17 @@ class Trainer:
         terms = {key: loss(seen) for key, loss in active.items()}
         weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in active.items()}
         total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
-        # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves.
-        sums = _parameter_sums(self.model)
-        # Everything the log and the checks need, in one wait for the device.
-        error_and_alpha = [_squared_error(output, target), output.alpha.detach().mean()]
-        scalars = [total, *error_and_alpha, *terms.values(), *sums.values()]
-        loss, error, alpha, *rest = torch.stack(scalars).tolist()
-        values, totals = rest[: len(terms)], rest[len(terms) :]
-        self._check_parameters(dict(zip(sums, totals, strict=True)), step)
-        self._check_terms(dict(zip(terms, values, strict=True)), step, target)
+        with torch.no_grad():
+            # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves: their
+            # sum is finite if all of a group are.
+            groups = self.model.parameter_groups()
+            sums = [torch.stack([value.sum() for value in group]).sum() for group in groups.values()]
+            squared_error = masked_mean((output.rgb - target.rgb).square(), target.mask)
+            # Everything the log and the checks need, in one wait for the device.
+            scalars = torch.stack([total, squared_error, output.alpha.mean(), *terms.values(), *sums])
+        loss, error, alpha, *rest = scalars.tolist()
+        values = dict(zip(terms, rest[: len(terms)], strict=True))
+        _check_finite(dict(zip(groups, rest[len(terms) :], strict=True)), values, step, target.name)
         self._check_drawn(alpha, step)
         if total.requires_grad:
             torch.autograd.backward(total)
@@ -202,13 +189,14 @@ class Trainer:
             for module, given in zip(self.model.view_modules.values(), stages, strict=False):
                 module.after_step(view, given)
         self.step = step
-        drawn = output.splats
+        drawn = None if output.splats is None else output.splats.gaussians
         return {
             "step": step,
             "loss": loss,
-            "terms": dict(zip(terms, values, strict=True)),
+            "terms": values,
             "psnr": min(MAX_PSNR, -10.0 * math.log10(max(error, 1e-30))),
-            **({} if drawn is None else _counts(drawn)),
+            # Of Gaussians, and of the field's elements that they come from.
+            **({} if drawn is None else {"gaussians": len(drawn), "visible": len(drawn.visible_sources)}),
             **done,
         }
 
@@ -242,14 +230,6 @@ class Trainer:
         """Provenance of the run."""
         return run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
 
-    def _check_parameters(self, sums: dict[str, float], step: int) -> None:
-        for group, total in sums.items():
-            if not math.isfinite(total):
-                raise NotFiniteError(
-                    f"step {step - 1} left parameters of group '{group}' that are not finite. "
-                    f"The last checkpoint is whole; look for too large a learning rate of {group}."
-                )
-
     def _check_drawn(self, alpha: float, step: int) -> None:
         self.blank_views = 0 if alpha >= BLANK_ALPHA else self.blank_views + 1
         if self.blank_views >= MAX_BLANK_VIEWS:
@@ -259,14 +239,6 @@ class Trainer:
                 f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
                 "into poses and units."
             )
-
-    def _check_terms(self, terms: dict[str, float], step: int, target: Target) -> None:
-        for key, term in terms.items():
-            if not math.isfinite(term):
-                raise NotFiniteError(
-                    f"step {step}, frame {target.name}: loss term '{key}' is {term}. "
-                    "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
-                )
 
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
@@ -280,22 +252,20 @@ class Trainer:
         return rows
 
 
-@torch.no_grad()
-def _parameter_sums(model: Model) -> dict[str, Tensor]:
-    """The sum of every parameter group: finite if all of the group is. []"""
-    groups = model.parameter_groups()
-    return {name: torch.stack([value.sum() for value in group]).sum() for name, group in groups.items()}
-
-
-@torch.no_grad()
-def _squared_error(output: RenderOutput, target: Target) -> Tensor:
-    """Mean squared colour error of a training view. []"""
-    return masked_mean((output.rgb - target.rgb).square(), target.mask)
-
-
-def _counts(drawn: Splats) -> dict[str, int]:
-    """Number of rendered Gaussians, and of the field's elements that they come from."""
-    return {"gaussians": len(drawn.gaussians), "visible": len(drawn.gaussians.visible_sources)}
+def _check_finite(sums: dict[str, float], terms: dict[str, float], step: int, frame: str) -> None:
+    """Refuse sums of parameter groups, and loss terms, that are not finite."""
+    for group, total in sums.items():
+        if not math.isfinite(total):
+            raise NotFiniteError(
+                f"step {step - 1} left parameters of group '{group}' that are not finite. "
+                f"The last checkpoint is whole; look for too large a learning rate of {group}."
+            )
+    for key, term in terms.items():
+        if not math.isfinite(term):
+            raise NotFiniteError(
+                f"step {step}, frame {frame}: loss term '{key}' is {term}. "
+                "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
+            )
 
 
 def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:

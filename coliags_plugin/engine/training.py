@@ -11,11 +11,11 @@ from typing import Literal
 
 import torch
 
+from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.evaluator import check_evaluable
-from coliags_plugin.engine.resuming import resumed_method
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
@@ -28,29 +28,17 @@ IfExists = Literal["refuse", "overwrite", "resume", "continue"]
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train on what.
+    """What to train on what."""
 
-    Attributes:
-        method: Name of a method or path of a method config.
-        data: The scene's folder.
-        overrides: ``key.path=value`` assignments.
-        seed: Of all random generators; None: 0, or that of the resumed run.
-        data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
-        anonymous: Keep absolute paths out of the run, so that ``--data`` has to name the scene afterwards.
-        method_name: Name of the method in the run; None: its own.
-        scene_name: Name of the scene in the run; None: its own.
-        protocol: Evaluation protocol that has to fit the run; None: not checked.
-    """
-
-    method: str
-    data: Path
-    overrides: Sequence[str] = ()
-    seed: int | None = None
-    data_format: str | None = None
-    anonymous: bool = False
-    method_name: str | None = None
-    scene_name: str | None = None
-    protocol: str | None = None
+    method: str  # name of a method, or path of a method config
+    data: Path  # the scene's folder
+    overrides: Sequence[str] = ()  # ``key.path=value`` assignments
+    seed: int | None = None  # None: 0, or that of the resumed run
+    data_format: str | None = None  # a data manager; None: the method's, or the one that recognises the folder
+    anonymous: bool = False  # keep absolute paths out of the run; ``--data`` has to name the scene afterwards
+    method_name: str | None = None  # in the run; None: the method's own
+    scene_name: str | None = None  # in the run; None: the scene's own
+    protocol: str | None = None  # of evaluations that has to fit the run; None: not checked
 
 
 @contextmanager
@@ -79,8 +67,11 @@ def open_training(
     if resumes:
         folder = RunFolder.existing(folder.path)
         overrides, data_format = ((), None) if if_exists == "continue" else (request.overrides, request.data_format)
-        name = request.method_name or request.method
-        method = resumed_method(folder, name, request.data, overrides, data_format)
+        name = method_name(request.method_name or request.method)
+        folder.check_method(name)
+        # The config stored in the run, even if that of this name has changed since.
+        method = load_method_for(request.data, str(folder.config_file.resolve()), overrides, data_format)
+        method = replace(method, name=name)
         seed = int(folder.provenance()["seed"])
         if request.seed not in (None, seed):
             begun = f"{folder.path}, which was started with seed {seed}"

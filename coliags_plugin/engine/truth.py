@@ -36,10 +36,9 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     mine, theirs = own.video, other.video
     by_name = {frame.name: frame for frame in theirs}
     by_index = {frame.index: frame for frame in theirs}
-    found: dict[str, Frame]
-    matched_by: Literal["name", "index"]
+    matched_by: Literal["name", "index"] = "name"
     if all(frame.name in by_name for frame in mine):
-        found, matched_by = {frame.name: by_name[frame.name] for frame in mine}, "name"
+        found = {frame.name: by_name[frame.name] for frame in mine}
     elif len(mine) == len(theirs) and all(frame.index in by_index for frame in mine):
         found, matched_by = {frame.name: by_index[frame.index] for frame in mine}, "index"
     else:
@@ -56,7 +55,7 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     sets = {"test": [found[frame.name] for frame in own.test_sets.get("test", [])]}
     sets |= {name: frames for name, frames in other.test_sets.items() if name != "test"}
     if not same_split:  # seen masks tell what the other scene's training frames show
-        sets = {name: [_without_seen(frame) for frame in frames] for name, frames in sets.items()}
+        sets = {name: [replace(frame.to("cpu"), seen=None) for frame in frames] for name, frames in sets.items()}
     split = (other if same_split else own).provenance.get("split", "")
     provenance = {**other.provenance, "split": split}
     held_out = {name: frames for name, frames in sets.items() if frames}
@@ -72,7 +71,3 @@ def _refuse_other_world(frames: Sequence[Frame], found: dict[str, Frame], extent
                 "scenes with the same poses, in the same unit",
                 "Align the scenes first, or evaluate against the scene that the poses are from",
             )
-
-
-def _without_seen(frame: Frame) -> Frame:
-    return replace(frame.to("cpu"), seen=None)

@@ -62,7 +62,7 @@ def final_state(trainer):
 
 def assert_same(first, second):
     assert first.step == second.step
-    assert first.queue == second.queue
+    assert first.frame_queue == second.frame_queue
     assert first.tensors.keys() == second.tensors.keys()
     for name, tensor in first.tensors.items():
         assert torch.equal(tensor, second.tensors[name]), name

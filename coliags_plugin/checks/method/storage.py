@@ -60,7 +60,7 @@ def resumes(context: CheckContext) -> str:
 
 def _apart(first: Checkpoint, second: Checkpoint) -> str:
     """What differs between two checkpoints; empty where nothing does."""
-    if first.queue != second.queue:
+    if first.frame_queue != second.frame_queue:
         return "the sampler plans other frames"
     return difference(dict(first.tensors), dict(second.tensors))
 
