@@ -51,13 +51,12 @@ def sweep_frame(
     Correlation of log intensity in square windows, sampled on the surface itself, so that windows follow its slant;
     semi-global aggregation; a parabola between hypotheses. The neighbours, at least one, are all of one size.
     """
-    from coliags_plugin.reconstruction.depth.numba_kernels.aggregation import aggregate, pick
-    from coliags_plugin.reconstruction.depth.numba_kernels.sweep import sweep as match
+    from coliags_plugin.reconstruction.depth.numba_kernels import sweep as kernels
 
     shape = base.shape
     pairs = [guide.pose.homography(other.pose) for other in neighbours]
     cost = np.empty((*shape, len(factors)), np.float32)
-    match(
+    kernels.sweep(
         np.ascontiguousarray(base, np.float32),
         factors,
         guide.intensity,
@@ -72,7 +71,7 @@ def sweep_frame(
         cost,
     )
     total = np.empty_like(cost)
-    aggregate(
+    kernels.aggregate(
         cost,
         guide.intensity,
         np.float32(sweep.small_penalty),
@@ -81,6 +80,6 @@ def sweep_frame(
         total,
     )
     index, fit, margin = (np.empty(shape, np.float32) for _ in range(3))
-    pick(total, cost, math.ceil(_RIVALS / math.log1p(sweep.step)), index, fit, margin)
+    kernels.pick(total, cost, math.ceil(_RIVALS / math.log1p(sweep.step)), index, fit, margin)
     position = np.interp(index.ravel(), np.arange(len(factors)), np.log(factors)).reshape(shape)
     return Swept((base * np.exp(position)).astype(np.float32), fit, margin)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, fuse_frame
-from coliags_plugin.reconstruction.depth.numba_kernels.aggregation import aggregate, pick
 from coliags_plugin.reconstruction.depth.numba_kernels.fusion import vote
-from coliags_plugin.reconstruction.depth.numba_kernels.sweep import sweep
+from coliags_plugin.reconstruction.depth.numba_kernels.sweep import aggregate, pick, sweep
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.sweeping import ratios, sweep_frame
 from coliags_plugin.reconstruction.depth.views import Pose, guide_of

@@ -1,4 +1,4 @@
-"""Matching costs of depth hypotheses: zero-mean normalised cross-correlation with every neighbour."""
+"""Matching costs of depth hypotheses by zero-mean normalised cross-correlation, and their semi-global aggregation."""
 
 from __future__ import annotations
 
@@ -53,46 +53,29 @@ def _correlate(
     height, width = reference.shape
     sums = np.zeros((6, width))
     for y in range(-radius, height):
-        below, above = y + radius, y - radius - 1
-        if below < height:
-            for x in range(width):
-                s = visible[below, x]
-                a, b = s * reference[below, x], s * warped[below, x]
-                sums[0, x] += s
-                sums[1, x] += a
-                sums[2, x] += b
-                sums[3, x] += a * a
-                sums[4, x] += b * b
-                sums[5, x] += a * b
-        if above >= 0:
-            for x in range(width):
-                s = visible[above, x]
-                a, b = s * reference[above, x], s * warped[above, x]
-                sums[0, x] -= s
-                sums[1, x] -= a
-                sums[2, x] -= b
-                sums[3, x] -= a * a
-                sums[4, x] -= b * b
-                sums[5, x] -= a * b
+        for row, sign in ((y + radius, 1.0), (y - radius - 1, -1.0)):
+            if 0 <= row < height:
+                for x in range(width):
+                    s = visible[row, x]
+                    a, b = s * reference[row, x], s * warped[row, x]
+                    sums[0, x] += sign * s
+                    sums[1, x] += sign * a
+                    sums[2, x] += sign * b
+                    sums[3, x] += sign * (a * a)
+                    sums[4, x] += sign * (b * b)
+                    sums[5, x] += sign * (a * b)
         if y < 0:
             continue
         n, sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for x in range(-radius, width):
-            right, left = x + radius, x - radius - 1
-            if right < width:
-                n += sums[0, right]
-                sa += sums[1, right]
-                sb += sums[2, right]
-                saa += sums[3, right]
-                sbb += sums[4, right]
-                sab += sums[5, right]
-            if left >= 0:
-                n -= sums[0, left]
-                sa -= sums[1, left]
-                sb -= sums[2, left]
-                saa -= sums[3, left]
-                sbb -= sums[4, left]
-                sab -= sums[5, left]
+            for column, sign in ((x + radius, 1.0), (x - radius - 1, -1.0)):
+                if 0 <= column < width:
+                    n += sign * sums[0, column]
+                    sa += sign * sums[1, column]
+                    sb += sign * sums[2, column]
+                    saa += sign * sums[3, column]
+                    sbb += sign * sums[4, column]
+                    sab += sign * sums[5, column]
             if x < 0:
                 continue
             if n < least:
@@ -157,3 +140,90 @@ def sweep(
                 for rank in range(taken):
                     total += best[rank]
                 cost[y, x, d] = max(np.float32(0.0), np.float32(1.0) - total / np.float32(taken))
+
+
+@part
+def _path_step(cost: Array, before: Array, least: float, jump: float, small: float, into: Array, total: Array) -> float:
+    """One step of a path: Hirschmueller's recurrence. Returns the least value of ``into``."""
+    count = len(cost)
+    lowest = np.float32(np.inf)
+    for d in range(count):
+        value = min(before[d], least + jump)
+        if d > 0:
+            value = min(value, before[d - 1] + small)
+        if d + 1 < count:
+            value = min(value, before[d + 1] + small)
+        value = cost[d] + value - least
+        into[d] = value
+        total[d] += value
+        lowest = min(lowest, value)
+    return lowest
+
+
+@kernel
+def aggregate(
+    cost: Array, guide: Array, small: np.float32, large: np.float32, contrast: np.float32, total: Array
+) -> None:
+    """Sum of the path costs over eight directions.
+
+    ``guide``: image whose edges make jumps cheaper. Penalty of a change by one hypothesis: ``small`` (P1); of any
+    greater one: ``large`` (P2) divided by ``1 + contrast * |difference of the guide|``, and not less than ``small``.
+    Costs are float32 [H, W, D].
+    """
+    height, width, count = cost.shape
+    total[:] = 0.0
+    # Of the path before, by rows: this one and the one before it.
+    paths = np.empty((2, width, count), np.float32)
+    lowest = np.empty((2, width), np.float32)
+    start = np.zeros(count, np.float32)
+    for way in (1, -1):
+        rows = range(height) if way > 0 else range(height - 1, -1, -1)
+        columns = range(width) if way > 0 else range(width - 1, -1, -1)
+        # Along the row, and from the row before, straight and along both diagonals.
+        for down, right in ((0, way), (way, -1), (way, 0), (way, 1)):
+            for y in rows:
+                for x in columns:
+                    above, aside = y - down, x - right
+                    into, sums = paths[y % 2, x], total[y, x]
+                    if 0 <= above < height and 0 <= aside < width:
+                        edge = abs(guide[y, x] - guide[above, aside])
+                        jump = max(small, large / (np.float32(1.0) + contrast * edge))
+                        before, least = paths[above % 2, aside], lowest[above % 2, aside]
+                        lowest[y % 2, x] = _path_step(cost[y, x], before, least, jump, small, into, sums)
+                    else:
+                        lowest[y % 2, x] = _path_step(cost[y, x], start, np.float32(0.0), large, small, into, sums)
+
+
+@kernel
+def pick(total: Array, cost: Array, rivals: int, index: Array, match: Array, margin: Array) -> None:
+    """The hypothesis of the least aggregated cost, to a part of a step by a parabola.
+
+    ``rivals``: how many hypotheses before the best one must have been compared, where there are as many: at the rim of
+    an image, what is near leaves the neighbours' views, and what is left wins for want of rivals. Written, float32
+    [H, W]: ``index``, the fractional position; ``match``, the correlation at it before aggregation, -1 to 1, 0 without
+    its rivals; ``margin``, by how much the aggregated cost of any hypothesis more than two steps away is greater, of
+    those with a cost other than exactly 1, which says that nothing was compared.
+    """
+    height, width, count = total.shape
+    for y in range(height):
+        for x in range(width):
+            costs = total[y, x]
+            best = 0
+            for d in range(1, count):
+                if costs[d] < costs[best]:
+                    best = d
+            second = np.float32(np.inf)
+            for d in range(count):
+                if abs(d - best) > 2 and cost[y, x, d] != 1.0:
+                    second = min(second, costs[d])
+            offset = np.float32(0.0)
+            if 0 < best < count - 1:
+                bend = costs[best - 1] - np.float32(2.0) * costs[best] + costs[best + 1]
+                if bend > np.float32(1e-6):
+                    offset = np.float32(0.5) * (costs[best - 1] - costs[best + 1]) / bend
+            index[y, x] = np.float32(best) + offset
+            match[y, x] = np.float32(1.0) - cost[y, x, best]
+            for d in range(max(0, best - rivals), best):
+                if cost[y, x, d] == 1.0:
+                    match[y, x] = 0.0
+            margin[y, x] = second - costs[best] if second < np.inf else np.float32(0.0)
