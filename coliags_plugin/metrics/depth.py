@@ -168,8 +168,4 @@ def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
 
 def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
     """Maximum over the square window around every pixel; pixels outside the image do not count."""
-    from kornia.morphology import dilation
-
-    square = torch.ones(2 * reach + 1, 2 * reach + 1, dtype=values.dtype, device=values.device)
-    largest: Tensor = dilation(values[None, None], square, max_val=torch.finfo(values.dtype).max)
-    return largest[0, 0]
+    return torch.nn.functional.max_pool2d(values[None], 2 * reach + 1, stride=1, padding=reach)[0]

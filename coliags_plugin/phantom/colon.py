@@ -222,11 +222,6 @@ class ColonSurface:
         """Number of rows."""
         return len(self.arc)
 
-    @property
-    def clock(self) -> Float[np.ndarray, "C"]:
-        """Clock angle of each column, radians."""
-        return np.arange(self.columns) * (2.0 * np.pi / self.columns)
-
     def grid_coordinates(
         self, triangle: Int[np.ndarray, "N"], barycentric: Float[np.ndarray, "N 2"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:

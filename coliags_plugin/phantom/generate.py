@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from coliags_plugin._version import __version__
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, write_arrays
+from coliags_plugin.core.files import atomic_folder, write_arrays, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.progress import Progress
@@ -101,9 +100,8 @@ def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
     return settings.model_copy(update={**size, "rotation_views": views}).resolved()
 
 
-def prepare(settings: PhantomSettings, progress: Progress | None = None) -> PreparedPhantom:
+def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     """Generate the colon and the camera path, and solve for indirect light and exposure."""
-    report = progress or (lambda stage, done, total: None)
     layout: Layout = phantom_layouts.get(settings.layout)()
     settings = resolve(settings, layout)
     report("colon", 0, 4)
@@ -150,9 +148,7 @@ def generate(
         with atomic_folder(output, overwrite) as folder:
             phantom = prepare(settings, report)
             _write(phantom, folder, report)
-            (folder / "phantom.json").write_text(
-                _json({"version": __version__, "settings": phantom.settings.model_dump()})
-            )
+            write_json(folder / "phantom.json", {"version": __version__, "settings": phantom.settings.model_dump()})
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"cannot write to {output}: {reason}", "a writable folder", "Choose another output") from error
@@ -189,7 +185,9 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
     if len(rotated):
         layout.write_sequence(folder, "rotation", rotated, lens)
     if layout.has_points:
-        layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, lens)
+        positions, colors = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        points = WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
+        layout.write_points(folder, points, phantom.poses, lens)
     if layout.has_coverage_mesh:
         _write_coverage_mesh(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     report("truth", 0, 1)
@@ -231,14 +229,6 @@ def _draw_points(
     return phantom.wall(exposure, phantom.poses[index], chosen), color[chosen]
 
 
-def _wall_points(
-    phantom: PreparedPhantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
-) -> WallPoints:
-    positions = np.concatenate([positions for positions, _ in drawn])
-    colors = np.concatenate([colors for _, colors in drawn])
-    return WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
-
-
 def _write_truth(
     phantom: PreparedPhantom, folder: Path, trained_on: Bool[np.ndarray, "F"], observed: Bool[np.ndarray, "F"]
 ) -> None:
@@ -271,7 +261,7 @@ def _write_truth(
             {"frame": view.frame, "turn_degrees": round(view.turn, 6)} for view in phantom.rotation_views
         ],
     }
-    (folder / "light.json").write_text(_json(light))
+    write_json(folder / "light.json", light)
 
 
 def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V 3"]:
@@ -307,7 +297,3 @@ def _write_coverage_mesh(path: Path, surface: ColonSurface, observed: Bool[np.nd
 def _write_gains(path: Path, gains: Float[np.ndarray, "T 3"]) -> None:
     rows = np.column_stack([np.arange(len(gains)), gains])
     np.savetxt(path, rows, "%d,%.9g,%.9g,%.9g", header="frame,gain_r,gain_g,gain_b", comments="")
-
-
-def _json(value: object) -> str:
-    return json.dumps(value, indent=2) + "\n"

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.lighting.beams import beam
-from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, value_or_default
+from coliags_plugin.lighting.beams import SpreadLaw, beam
+from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0

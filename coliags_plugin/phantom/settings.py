@@ -20,6 +20,7 @@ from typing_extensions import Self
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.lighting.beams import SpreadLaw
 
 #: Fewest frames in which the camera moves.
 _MOVING = 9
@@ -28,7 +29,6 @@ _OF_PAUSES = ("pauses", "pause_frames")
 
 _T = TypeVar("_T")
 
-SpreadLaw = Literal["exponential", "cosine"]
 GainMode = Literal["auto", "fixed"]
 
 

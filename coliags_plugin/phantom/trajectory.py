@@ -26,8 +26,6 @@ _LOOK_AHEAD = 28.0
 _APPROACH_WIDTH = 0.07
 _ROTATION_TURN = (15.0, 30.0)
 
-Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
-
 
 @dataclass(frozen=True)
 class RotationView:
@@ -43,7 +41,7 @@ def camera_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Trac
     if settings.trajectory == "inspection":
         poses = inspecting_path(centre_line, settings, tracer)
     else:
-        poses = _withdrawing_path(centre_line, settings, tracer.clearance)
+        poses = _withdrawing_path(centre_line, settings, tracer)
     nearest = float(tracer.clearance(poses[:, :3, 3]).min())
     if nearest < NEAREST:
         raise InputError(
@@ -87,9 +85,7 @@ def turn_away(
     return views
 
 
-def _withdrawing_path(
-    centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance
-) -> Float[np.ndarray, "T 4 4"]:
+def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
     """Poses of the trajectories ``pullback`` and ``rotation``: along the centre line, and almost in place."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     preset = settings.preset
@@ -111,7 +107,7 @@ def _withdrawing_path(
         return np.asarray(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways))
 
     def distances(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T"]:
-        return clearance(centers(sideways))
+        return tracer.clearance(centers(sideways))
 
     for _ in range(30):
         if distances(sideways).min() >= NEAREST + 0.5:

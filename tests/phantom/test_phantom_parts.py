@@ -257,7 +257,7 @@ def test_grid_place_agrees_with_barycentric_interpolation(colon):
     row, column = surface.grid_coordinates(hits.triangle, hits.barycentric)
     number = np.repeat(np.arange(surface.rows), surface.columns)[:, None].astype(np.float32)
     np.testing.assert_allclose(row, tracer.interpolate(number, hits)[:, 0], atol=1e-3)
-    angle = np.tile(surface.clock, surface.rows)
+    angle = np.tile(np.arange(surface.columns) * (2.0 * np.pi / surface.columns), surface.rows)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rotated = tracer.interpolate(around, hits)
     apart = np.arctan2(rotated[:, 1], rotated[:, 0]) - column * (2 * np.pi / surface.columns)

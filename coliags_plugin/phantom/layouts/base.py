@@ -80,23 +80,11 @@ class Layout(ABC):
 
     @abstractmethod
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """Write one frame.
-
-        Args:
-            folder: Folder of the phantom.
-            frame: The frame.
-        """
+        """Write one frame into the folder of the phantom."""
 
     @abstractmethod
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """Write the poses and, if part of the layout, the camera of all frames of a part.
-
-        Args:
-            folder: Folder of the phantom.
-            part: Part that the frames belong to.
-            poses: Camera-to-world, OpenCV axes, mm. [N, 4, 4]
-            lens: Lens of all frames, from :meth:`lens`.
-        """
+        """Write the poses (camera-to-world, OpenCV axes, mm) of a part and, if in the layout, its lens, the camera."""
 
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """Write initial points; called if :attr:`has_points`. ``poses`` are those of the video."""
@@ -105,13 +93,6 @@ class Layout(ABC):
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
         """Path of the seen mask of a test frame."""
         return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
-
-
-def pinhole_of(lens: Lens) -> Intrinsics:
-    """Intrinsics of frames that are a pinhole's."""
-    if not isinstance(lens, PinholeLens):
-        raise TypeError(f"{type(lens).__name__} is no pinhole, and the layout holds a pinhole camera")
-    return lens.pinhole
 
 
 def part_folder(folder: Path, part: Part) -> Path:

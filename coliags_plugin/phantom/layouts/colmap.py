@@ -11,7 +11,7 @@ from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, wr
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.geometry.poses.rigid import inverse
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
 #: A point is observed in one of this many images that show it, like a detected feature.
 _SEEN_IN_ONE_OF = 3
@@ -32,7 +32,7 @@ class ColmapLayout(Layout):
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`. Points seen in fewer than two images are left out, as COLMAP leaves them out."""
         names = [_name(index) for index in range(len(poses))]
-        model = posed_model(colmap_poses(poses), names, [pinhole_of(lens)], [0] * len(poses))
+        model = posed_model(colmap_poses(poses), names, [lens.pinhole], [0] * len(poses))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _SEEN_IN_ONE_OF == 0) for index in range(len(poses))]
         kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)

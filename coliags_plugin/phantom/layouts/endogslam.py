@@ -18,7 +18,7 @@ from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder, pinhole_of
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
 from coliags_plugin.phantom.trajectory import TEST_EVERY
 
 #: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.
@@ -56,7 +56,7 @@ class EndoGSLAMLayout(Layout):
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
         training = [index for index in range(len(poses)) if not self.is_test(index)]
-        _write_params(folder / PARAMS, Trajectory(poses[training], intrinsics=pinhole_of(lens)), points)
+        _write_params(folder / PARAMS, Trajectory(poses[training], intrinsics=lens.pinhole), points)
 
 
 class PREndoLayout(EndoGSLAMLayout):
@@ -74,7 +74,7 @@ class PREndoLayout(EndoGSLAMLayout):
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
         results = folder / f"{_DATA}{OPTIMIZED}" / _SCENE
-        means = _write_params(results / PARAMS, Trajectory(poses, intrinsics=pinhole_of(lens)), points)
+        means = _write_params(results / PARAMS, Trajectory(poses, intrinsics=lens.pinhole), points)
         cloud = results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply"
         _write_gaussians(cloud, means, points.colors)
 

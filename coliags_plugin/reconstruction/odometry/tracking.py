@@ -39,7 +39,7 @@ class Tracking:
     """Result of tracking."""
 
     camera_to_world: Float[np.ndarray, "N 4 4"]  # OpenCV axes; world: the first camera; unit of the depth
-    tracked: Bool[np.ndarray, "N"]  # False where a pose is only a guess at constant velocity
+    tracked: Bool[np.ndarray, "N"]  # whether an edge reaches a frame; False: its pose is a guess at constant velocity
     term: Term  # residual used for registration
     edges: tuple[Edge, ...]  # odometry edges, lengths in units of the depth
     further: tuple[Edge, ...]  # edges over several frames and loop closures, without the dropped ones
@@ -67,18 +67,7 @@ class Tracking:
 def track(
     video: Sequence[RgbdFrame], intrinsics: Intrinsics, settings: TrackingSettings, progress: Progress | None = None
 ) -> Tracking:
-    """Estimate the poses of a video, read lazily, whose frames share a pinhole.
-
-    Args:
-        video: Frames, in order.
-        intrinsics: Of all of them.
-        settings: Options.
-        progress: Progress callback.
-
-    Raises:
-        InputError: There are fewer than two frames; their sizes differ; no depth is known; no two frames can be
-            registered; or open3d is missing.
-    """
+    """Estimate the poses of a video, read lazily, whose frames share a pinhole."""
     if len(video) < 2:
         raise InputError(f"{len(video)} frame" + "s" * (len(video) != 1), "two or more frames")
     _check_sizes(video, intrinsics)
@@ -106,7 +95,7 @@ def track(
     poses[:, :3, 3] *= unit
     return Tracking(
         camera_to_world=poses,
-        tracked=_tracked(path, len(video)),
+        tracked=np.isin(np.arange(len(video)), [(edge.source, edge.target) for edge in path.edges]),
         term=term,
         edges=_in_units(path.edges, unit),
         further=_in_units(further, unit),
@@ -167,13 +156,14 @@ class _Tracker:
         The second condition is needed because on a plane or in a smooth tube exact depth leaves no residual for motions
         along the surface.
         """
-        edges: dict[Term, list[Edge | None]] = {}
-        probes = np.unique(np.linspace(1, count - 1, min(_PROBES, count - 1)).round().astype(int))
-        for term in ("point-to-plane", "hybrid"):
+        probes = np.unique(np.linspace(1, count - 1, min(_PROBES, count - 1)).round().astype(int)).tolist()
+
+        def probed(term: Term) -> list[Edge]:
             self.use(term)
-            edges[term] = [self.verified_edge(int(frame), int(frame) - 1, np.eye(4)) for frame in probes]
-        planes = [edge for edge in edges["point-to-plane"] if edge is not None]
-        hybrids = [edge for edge in edges["hybrid"] if edge is not None]
+            edges = (self.verified_edge(frame, frame - 1, np.eye(4)) for frame in probes)
+            return [edge for edge in edges if edge is not None]
+
+        planes, hybrids = probed("point-to-plane"), probed("hybrid")
         if not planes or len(planes) < len(hybrids):
             return "hybrid"
         residual = float(np.median([edge.residual for edge in planes]))
@@ -235,14 +225,6 @@ def _check_sizes(video: Sequence[RgbdFrame], intrinsics: Intrinsics) -> None:
                     f"{width} x {height}, as the intrinsics and the other frames",
                     "Resize all to one size",
                 )
-
-
-def _tracked(path: Chain, count: int) -> Bool[np.ndarray, "N"]:
-    """Mask of the frames with an edge."""
-    tracked = np.zeros(count, bool)
-    for edge in path.edges:
-        tracked[[edge.source, edge.target]] = True
-    return tracked
 
 
 def _in_units(edges: Iterable[Edge], unit: float) -> tuple[Edge, ...]:
