@@ -21,22 +21,25 @@ class PhantomCommand:
     """Folder to create."""
     seed: int = 0
     """Random seed of the whole phantom."""
-    trajectory: Literal["pullback", "rotation", "inspection"] = "pullback"
-    """Withdrawal along the lumen, mostly rotation in place, or a withdrawal that approaches spots of the wall."""
-    frames: int = 120
-    """Frames of the sequence; every 8th is a test frame."""
+    preset: Literal["in-vivo"] | None = None
+    """Defaults of all settings: in-vivo looks like the video of a patient, whose wall moves (docs/phantom.md 4)."""
+    trajectory: Literal["pullback", "rotation", "inspection", "examination"] | None = None
+    """Withdrawal along the lumen (default), mostly rotation in place, a withdrawal that approaches spots of the wall,
+    or one back and forth with fast turns."""
+    frames: int | None = None
+    """Frames of the sequence, 120 by default; every 8th is a test frame."""
     size: arguments.OptionalText = None
     """Image size WxH, pixels; default: the layout's own, 338x270 for most."""
-    light: Literal["c3vd", "strong"] = "c3vd"
+    light: Literal["c3vd", "strong"] | None = None
     """Preset of light and motion: c3vd is the fair default, strong the stress case."""
     gain: Literal["auto", "fixed"] | None = None
     """Exposure; default: the preset's."""
     light_offset: arguments.OptionalText = None
     """Lamp position X,Y,Z in camera axes, mm; default: the preset's."""
-    polyps: int = 4
-    """Sessile polyps, 3 to 10 mm wide."""
-    rotation_views: int = 12
-    """Extra test views rotated by 15 to 30 degrees; none in layouts that cannot store them."""
+    polyps: int | None = None
+    """Sessile polyps, 3 to 10 mm wide; 4 by default."""
+    rotation_views: int | None = None
+    """Extra test views, 12 by default, rotated by 15 to 30 degrees; none in layouts that cannot store them."""
     set: arguments.Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
@@ -49,17 +52,10 @@ class PhantomCommand:
         from coliags_plugin.api.scenes import make_phantom
         from coliags_plugin.config.assignments import parse_assignments
 
-        options: dict[str, Any] = {
-            "seed": self.seed,
-            "layout": self.layout,
-            "trajectory": self.trajectory,
-            "frames": self.frames,
-            "light": self.light,
-            "gain": self.gain,
-            "polyps": self.polyps,
-            "rotation_views": self.rotation_views,
-            "overwrite": self.overwrite,
-        }
+        names = ("preset", "trajectory", "frames", "light", "gain", "polyps", "rotation_views")
+        given = {name: getattr(self, name) for name in names}
+        options: dict[str, Any] = {"seed": self.seed, "layout": self.layout, "overwrite": self.overwrite}
+        options |= {name: value for name, value in given.items() if value is not None}
         if self.size is not None:
             options["width"], options["height"] = arguments.parse_size(self.size)
         if self.light_offset is not None:

@@ -26,7 +26,7 @@ BEND_ANGLE = 1.65
 _STEP = 0.25
 RADIUS = 20.0
 #: Length over which the far end rounds off into a closed dome.
-_DOME = 18.0
+DOME = 18.0
 _TAENIAE = 2.0 * np.pi / 3.0 * np.arange(3)
 #: Size and standard deviation of the wall's unevenness, mm.
 _RELIEF = ((4.0, 0.2), (1.5, 0.05), (0.6, 0.015))
@@ -154,7 +154,7 @@ class Anatomy:
         for polyp in self.polyps:
             rows = slice(*np.searchsorted(arc[:, 0], [polyp.arc - polyp.width, polyp.arc + polyp.width]))
             wall[rows] -= polyp.height * polyp.nearness(arc[rows], clock) ** 0.75
-        into_dome = np.clip((arc - (LENGTH - _DOME)) / _DOME, 0.0, 1.0)
+        into_dome = np.clip((arc - (LENGTH - DOME)) / DOME, 0.0, 1.0)
         return np.asarray(np.clip(wall, 4.0, None) * np.sqrt(np.clip(1.0 - into_dome**2, 0.0, None)))
 
 
@@ -168,7 +168,7 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
     folds: list[Fold] = []
     stations: list[float] = []
     station = generator.uniform(6.0, 14.0)
-    while station < LENGTH - _DOME - 4.0:
+    while station < LENGTH - DOME - 4.0:
         stations.append(station)
         # Two or three of the sectors between taeniae carry a crescent; together they shape the opening.
         sectors = generator.permutation(3)[: generator.choice([2, 3])]
@@ -186,7 +186,7 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
                     sway=(generator.uniform(0.2, 0.8), generator.uniform(0.0, 2.0 * np.pi)),
                 )
             )
-        station += generator.normal(25.0, 3.0)
+        station += generator.normal(settings.fold_spacing, 0.12 * settings.fold_spacing)
     polyps = tuple(_draw_polyp(generator, stations) for _ in range(settings.polyps))
     return Anatomy(centre_line, tuple(folds), polyps, taenia_clock, twist, swell)
 
@@ -253,6 +253,13 @@ def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
         if scale > settings.mesh_spacing:
             radius -= height * np.clip(radius / RADIUS, 0.0, 1.0) * bumps
     grid = centres[:, None, :] + radius[:, :, None] * around
+    return surface_of(grid, frames, arc, row_length)
+
+
+def surface_of(
+    grid: Float[np.ndarray, "R C 3"], frames: Float[np.ndarray, "R 3 3"], arc: Float[np.ndarray, "R"], row_length: float
+) -> ColonSurface:
+    """The mesh of a grid of points; ``frames`` are the centre line's axes at its rows."""
     along = np.gradient(grid, axis=0)
     across = 0.5 * (np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1))
     normals = np.cross(along, across)
@@ -265,10 +272,10 @@ def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
         vertices=grid.reshape(-1, 3).astype(np.float32),
         normals=_unit(normals).reshape(-1, 3).astype(np.float32),
         tangents=_unit(along).reshape(-1, 3).astype(np.float32),
-        triangles=_grid_triangles(len(arc), columns),
+        triangles=_grid_triangles(*grid.shape[:2]),
         areas=areas.reshape(-1).astype(np.float32),
         arc=arc,
-        columns=columns,
+        columns=grid.shape[1],
         row_length=row_length,
     )
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +18,17 @@ from coliags_plugin.core.files import atomic_folder, write_arrays, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.geometry.poses.alignment import umeyama
 from coliags_plugin.lighting.tone_curve import KNEE
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 from coliags_plugin.phantom.light import CameraLight
+from coliags_plugin.phantom.living import WallMotion, frame_times, wall_motion
+from coliags_plugin.phantom.motion import poses_during
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
+from coliags_plugin.phantom.props import bodies_at, wet_lens
 from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
@@ -39,6 +43,10 @@ _METERED = 2500
 _AT_ONCE = 2
 #: Initial points of the layouts that have some: about as many as structure from motion finds in such a video.
 _POINTS = 20_000
+#: No closer to a moving wall than this, mm.
+_CLEAR = 0.5
+#: Pixels that tell how the wall in view has moved.
+_FITTED = 4000
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,7 @@ class PreparedPhantom:
     rotation_views: list[RotationView]  # test views with rotated cameras
     indirect: list[IndirectLight | None]  # for the sequence and then the rotation views
     gains: Float[np.ndarray, "T 3"]  # red, green, blue gain of every frame of the sequence
+    motion: WallMotion | None  # of the wall; None if it is rigid
 
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
@@ -65,26 +74,51 @@ class PreparedPhantom:
         A rotation view has the exposure of the frame at its position, as if the camera turned faster than the exposure
         adapts.
         """
-        frames = len(self.poses)
+        frames, settings, sensor = len(self.poses), self.settings, self.sensor
+        during: list[Float[np.ndarray, "4 4"]] = []
         if number < frames:
-            pose, gain = self.poses[number], self.gains[number]
+            frame, pose = number, self.poses[number]
+            if settings.shutter:
+                least = sensor.samples.shape[1]
+                during = poses_during(self.poses, number, settings.shutter, sensor.focal_length, least)
         else:
             view = self.rotation_views[number - frames]
-            pose, gain = view.camera_to_world, self.gains[view.frame]
-        exposure = expose(self.world, self.sensor, pose, self.indirect[number])
-        noise = stream(self.settings.seed, Purpose.SENSOR, number)
-        return exposure, develop(exposure.radiance, gain, self.settings, noise)
+            frame, pose = view.frame, view.camera_to_world
+        world = world_at(self.world, self.motion, settings, frame)
+        exposure = expose(world, sensor, pose, self.indirect[number], during)
+        if settings.washes:
+            radiance, cover = wet_lens(
+                sensor.image(exposure.radiance), sensor.image(exposure.cover), settings, frame / settings.frame_rate
+            )
+            exposure = replace(exposure, radiance=radiance[sensor.mask], cover=cover[sensor.mask])
+        if settings.softness:
+            exposure = replace(exposure, radiance=sensor.softened(exposure.radiance, settings.softness))
+        noise = stream(settings.seed, Purpose.SENSOR, number)
+        return exposure, develop(exposure.radiance, self.gains[frame], settings, noise)
 
     def wall(
         self, exposure: Exposure, pose: Float[np.ndarray, "4 4"], pixels: Int[np.ndarray, "N"]
     ) -> Float[np.ndarray, "N 3"]:
-        """Wall points of lit pixels, world frame."""
+        """Wall points of lit pixels, world frame; if the wall moves, where they are at rest."""
+        if self.motion is not None:
+            at_rest = self.world.tracer.interpolate(self.motion.rest.vertices, exposure.hits.only(pixels))
+            return np.asarray(at_rest, np.float64)
         local = self.sensor.centers[pixels] * exposure.z_depth[pixels, None]
         return np.asarray(local.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
 
     def seen(self, points: Float[np.ndarray, "N 3"], cameras: list[Float[np.ndarray, "4 4"]]) -> Bool[np.ndarray, "N"]:
         """Which points of the wall are seen from at least one of these poses."""
         return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.tracer)
+
+
+def world_at(world: World, motion: WallMotion | None, settings: PhantomSettings, frame: int) -> World:
+    """The world at a frame, from that of the wall at rest."""
+    if motion is not None:
+        surface = motion.at(frame)
+        world = replace(world, surface=surface, tracer=Tracer(surface))
+    if settings.covers:
+        world = replace(world, bodies=bodies_at(world.surface, settings, frame / settings.frame_rate))
+    return world
 
 
 def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
@@ -112,8 +146,10 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     report("colon", 2, 4)
     tracer = Tracer(surface)
     lamp = CameraLight.of(settings)
-    world = World(surface, mucosa, tracer, lamp, value_or_default(settings.vignetting, settings.preset.vignetting))
-    poses = camera_path(anatomy.centre_line, settings, tracer)
+    vignetting = value_or_default(settings.vignetting, settings.light_preset.vignetting)
+    world = World(surface, mucosa, tracer, lamp, vignetting)
+    motion = wall_motion(anatomy, surface, settings)
+    poses = camera_path(anatomy.centre_line, settings, tracer, motion)
     views = turn_away(poses, settings, layout.is_test) if layout.has_rotation else []
     everywhere = [*poses, *(view.camera_to_world for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(everywhere)
@@ -125,13 +161,28 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     lens, mask = layout.lens(*image_size(settings, layout))
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
-    ideal = [
-        exposure_for(meter(world, thin, pose, light), settings.target_grey, settings.gamma)
-        for pose, light in zip(poses, indirect[: len(poses)], strict=True)
-    ]
+    ideal = []
+    for frame, (pose, light) in enumerate(zip(poses, indirect[: len(poses)], strict=True)):
+        now = world_at(world, motion, settings, frame)
+        if motion is not None:
+            _check_clear(now, pose, frame)
+        ideal.append(exposure_for(meter(now, thin, pose, light), settings.target_grey, settings.gamma))
+        if settings.moves:
+            report("exposure", frame + 1, len(poses))
     gains = exposures(ideal, settings)[:, None] * white_balances(settings)
     report("colon", 4, 4)
-    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains)
+    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains, motion)
+
+
+def _check_clear(world: World, pose: Float[np.ndarray, "4 4"], frame: int) -> None:
+    """Refuse a wall that has moved over the camera."""
+    nearest = float(world.tracer.clearance(pose[None, :3, 3])[0])
+    if nearest < _CLEAR:
+        raise InputError(
+            f"the wall moves to {nearest:.1f} mm from the camera at frame {frame}",
+            f"at least {_CLEAR:g} mm",
+            "Choose a smaller wave or breathing, or another seed",
+        )
 
 
 def generate(
@@ -163,6 +214,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
     drawn = []
+    fits = []
     report("frames", 0, total)
     for number, (exposure, color) in enumerate(_rendered_frames(phantom, total)):
         image = phantom.sensor.image
@@ -171,6 +223,10 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         pose = phantom.poses[index] if part == "video" else rotated[index]
         taken = PhantomFrame(part, index, image(color), image(exposure.z_depth), image(exposure.normals))
         layout.write_frame(folder, taken)
+        if phantom.motion is not None:
+            fits.append(_to_rest(phantom, exposure, pose))
+        if phantom.settings.covers and part == "video":
+            write_image(folder / "truth" / "not_wall" / f"{index:04d}.png", image(exposure.cover))
         if part == "video":
             observed[exposure.triangles] = True
         if part == "video" and not layout.is_test(index):
@@ -192,6 +248,8 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         _write_coverage_mesh(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
+    if phantom.motion is not None:
+        _write_motion(phantom, phantom.motion, folder / "truth", fits)
     report("truth", 1, 1)
 
 
@@ -262,6 +320,30 @@ def _write_truth(
         ],
     }
     write_json(folder / "light.json", light)
+
+
+def _to_rest(
+    phantom: PreparedPhantom, exposure: Exposure, pose: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """The pose relative to the wall in view as it is at rest, by the best rigid fit, and its residual (RMS), mm."""
+    hit = np.flatnonzero(exposure.z_depth > 0.0)
+    hit = hit[:: max(len(hit) // _FITTED, 1)]
+    moved = exposure.z_depth[hit, None].astype(np.float64) * phantom.sensor.centers[hit] @ pose[:3, :3].T + pose[:3, 3]
+    at_rest = phantom.wall(exposure, pose, hit)
+    fit = umeyama(moved, at_rest)
+    relative = pose.copy()
+    relative[:3, :3], relative[:3, 3] = fit.rotation @ pose[:3, :3], fit.points(pose[None, :3, 3])[0]
+    return relative, float(np.sqrt(((fit.points(moved) - at_rest) ** 2).sum(axis=1).mean()))
+
+
+def _write_motion(
+    phantom: PreparedPhantom, motion: WallMotion, folder: Path, fits: Sequence[tuple[Float[np.ndarray, "4 4"], float]]
+) -> None:
+    relative, residuals = zip(*fits[: len(phantom.poses)], strict=True)
+    np.save(folder / "camera_to_wall.npy", np.stack(relative))
+    times = frame_times(phantom.settings)
+    displacement = {"radial": motion.radial, "wave_mm": motion.wave, "shift_mm": motion.shift}
+    write_arrays(folder / "wall_motion.npz", {**displacement, "time_s": times, "residual_mm": np.array(residuals)})
 
 
 def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V 3"]:

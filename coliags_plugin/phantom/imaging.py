@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.colon import ColonSurface
 from coliags_plugin.phantom.interreflection import IndirectLight
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.mucosa import Mucosa
+from coliags_plugin.phantom.props import Body
 from coliags_plugin.phantom.tracing import Hits, Tracer, rotated
 
 #: Samples shaded per batch, which bounds memory and fits the cache.
@@ -26,6 +29,11 @@ class Sensor:
     mask: Bool[np.ndarray, "H W"]  # lit pixels
     centers: Float[np.ndarray, "P 3"]  # ray direction through each lit pixel's centre
     samples: Float[np.ndarray, "P K 3"]  # directions of its K colour samples
+
+    @property
+    def focal_length(self) -> float:
+        """Pixels per radian near the middle of the image."""
+        return float(1.0 / np.sqrt(_pixel_solid_angle(self)))
 
     @classmethod
     def behind(cls, lens: Lens, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
@@ -53,6 +61,12 @@ class Sensor:
         chosen = self.centers[mask[self.mask]]
         return Sensor(self.lens, mask, chosen, chosen[:, None, :])
 
+    def softened(self, values: Float[np.ndarray, "P 3"], sigma: float) -> Float[np.ndarray, "P 3"]:
+        """Values blurred by a Gaussian among the lit pixels, sigma in pixels."""
+        weight = cv2.GaussianBlur(self.mask.astype(np.float32), (0, 0), sigma)
+        blurred = cv2.GaussianBlur(self.image(values), (0, 0), sigma)
+        return np.asarray(blurred[self.mask] / weight[self.mask][:, None])
+
     def image(self, values: np.ndarray) -> np.ndarray:
         """Scatter values of the lit pixels to an image that is 0 elsewhere."""
         image = np.zeros((*self.mask.shape, *values.shape[1:]), values.dtype)
@@ -69,6 +83,7 @@ class World:
     tracer: Tracer
     lamp: CameraLight
     vignetting: float
+    bodies: tuple[Body, ...] = ()  # over the wall, farther ones first
 
 
 @dataclass(frozen=True)
@@ -79,32 +94,70 @@ class Exposure:
     z_depth: Float[np.ndarray, "P"]  # mm at the pixel's centre; 0 where the ray hits nothing
     normals: Float[np.ndarray, "P 3"]  # unit, camera axes, towards the camera; 0 where the ray hits nothing
     triangles: Int[np.ndarray, "T"]  # indices of all triangles hit
+    hits: Hits  # of the pixels' centres
+    cover: UInt8[np.ndarray, "P"]  # what is over the wall there, see Cover
 
 
 def expose(
-    world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
+    world: World,
+    sensor: Sensor,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    indirect: IndirectLight | None,
+    during: Sequence[Float[np.ndarray, "4 4"]] = (),
 ) -> Exposure:
-    """Render one image. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre."""
+    """Render one image. Colour is the mean of a pixel's samples; z-depth, normal and cover are those of its centre.
+
+    With poses ``during`` the exposure, it is the mean over these, of one sample of a pixel each in turn.
+    """
     pixels, per_pixel = sensor.samples.shape[:2]
     radiance = np.empty((pixels, 3), np.float32)
     met = np.zeros(len(world.surface.triangles), bool)
     # Distance between neighbouring samples per mm of depth.
     spacing = float(np.sqrt(_pixel_solid_angle(sensor) / per_pixel))
     step = max(_CHUNK // per_pixel, 1)
-    for start in range(0, pixels, step):
-        directions = sensor.samples[start : start + step].reshape(-1, 3)
-        hits = world.tracer.cast(camera_to_world, directions)
+
+    def gathered(pose: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        hits = world.tracer.cast(pose, directions)
         met[hits.triangle[hits.found]] = True
-        light = np.zeros((len(directions), 3), np.float32)
-        light[hits.found] = shade(world, camera_to_world, directions[hits.found], hits.kept(), spacing, indirect)
-        radiance[start : start + step] = light.reshape(-1, per_pixel, 3).mean(axis=1)
+        return _seen(world, pose, directions, hits, spacing, indirect)[0]
+
+    for start in range(0, pixels, step):
+        samples = sensor.samples[start : start + step]
+        if during:
+            parts = [gathered(pose, samples[:, number % per_pixel]) for number, pose in enumerate(during)]
+            radiance[start : start + step] = np.mean(parts, axis=0)
+        else:
+            light = gathered(camera_to_world, samples.reshape(-1, 3))
+            radiance[start : start + step] = light.reshape(-1, per_pixel, 3).mean(axis=1)
     hits = world.tracer.cast(camera_to_world, sensor.centers)
     met[hits.triangle[hits.found]] = True
     z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
     normals = np.zeros((pixels, 3), np.float32)
     facing = _unit(world.tracer.interpolate(world.surface.normals, hits.kept()))
     normals[hits.found] = rotated(facing, camera_to_world[:3, :3].T)
-    return Exposure(radiance, z_depth, normals, np.flatnonzero(met))
+    cover = np.zeros(pixels, np.uint8)
+    if world.bodies:
+        cover = _seen(world, camera_to_world, sensor.centers, hits, spacing, None)[1]
+    return Exposure(radiance, z_depth, normals, np.flatnonzero(met), hits, cover)
+
+
+def _seen(
+    world: World,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    directions: Float[np.ndarray, "N 3"],
+    hits: Hits,
+    spacing: float,
+    indirect: IndirectLight | None,
+) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"]]:
+    """Radiance along rays, from the wall and from what is over it, and what that is."""
+    light = np.zeros((len(directions), 3), np.float32)
+    light[hits.found] = shade(world, camera_to_world, directions[hits.found], hits.kept(), spacing, indirect)
+    cover = np.zeros(len(directions), np.uint8)
+    z_depth = hits.z_depth.copy()
+    for body in world.bodies:
+        drawn = body.draw(world.lamp, world.vignetting, camera_to_world, directions, z_depth, light)
+        cover[drawn] = body.cover
+    return light, cover
 
 
 def meter(
@@ -112,10 +165,7 @@ def meter(
 ) -> Float[np.ndarray, "P 3"]:
     """Radiance of the pixels' centres only, for exposure metering."""
     hits = world.tracer.cast(camera_to_world, sensor.centers)
-    light = np.zeros((len(sensor.centers), 3), np.float32)
-    spacing = float(np.sqrt(_pixel_solid_angle(sensor)))
-    light[hits.found] = shade(world, camera_to_world, sensor.centers[hits.found], hits.kept(), spacing, indirect)
-    return light
+    return _seen(world, camera_to_world, sensor.centers, hits, float(np.sqrt(_pixel_solid_angle(sensor))), indirect)[0]
 
 
 def shade(

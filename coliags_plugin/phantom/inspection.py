@@ -71,7 +71,7 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     drift = draw_sway(generator), draw_sway(generator)
     roll = draw_sway(generator)
-    withdrawal = _Withdrawal(centre_line, settings.path_length, settings.preset.wobble[1], drift)
+    withdrawal = _Withdrawal(centre_line, settings.path_length, settings.light_preset.wobble[1], drift)
     spots = _choose_spots(withdrawal, tracer, settings.seed, generator)
 
     shifts, turns = np.zeros((2, 2 * APPROACHES + 1, 3))
@@ -83,7 +83,7 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
 
     time = times(settings)
     points, frames = withdrawal.at(time)
-    rolls = np.radians(settings.preset.turn[2]) * roll(time)
+    rolls = np.radians(settings.light_preset.turn[2]) * roll(time)
     poses = np.tile(np.eye(4), (settings.frames, 1, 1))
     poses[:, :3, :3] = frames @ _matrices(resting(turns, time)) @ _matrices(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
     poses[:, :3, 3] = points + np.einsum("tck,tk->tc", frames, resting(shifts, time))

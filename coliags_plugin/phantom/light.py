@@ -38,7 +38,7 @@ class CameraLight:
     @classmethod
     def of(cls, settings: PhantomSettings) -> CameraLight:
         """Lamp from settings; it is tilted downwards in the image."""
-        preset = settings.preset
+        preset = settings.light_preset
         tilt = np.radians(value_or_default(settings.tilt, preset.tilt))
         return cls(
             offset=value_or_default(settings.light_offset, preset.light_offset),

@@ -115,7 +115,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     color = np.empty((height, width, 4), np.float32)
     for channel, base in enumerate(settings.albedo):
         depth = _REDDENED[channel] * blood + _BLOOD[channel] * vessels - _MOTTLED[channel] * brightness
-        color[..., channel] = np.clip(base * np.exp(-depth), 0.02, 0.95)
+        color[..., channel] = np.clip(base * np.exp(-settings.texture * depth), 0.02, 0.95)
     color[..., 3] = 0.25 + 0.75 * smoothstep((noise(7.0) + 0.35 * noise(1.2) + 1.0) / 1.6)
 
     along = np.linalg.norm(np.gradient(positions, axis=0), axis=-1)
@@ -124,7 +124,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     for scale, slope in _MICRO_RELIEF:
         bumps = noise(scale)
         # A Gaussian process of kernel sigma has slopes of 1 / (sqrt(2) sigma); this keeps them uniform.
-        rise = slope * np.sqrt(2.0) * scale / 2.5
+        rise = settings.texture * slope * np.sqrt(2.0) * scale / 2.5
         relief[..., 0] += rise * np.gradient(bumps, axis=0) / np.maximum(along, 1e-3)
         relief[..., 1] += rise * np.gradient(bumps, axis=1) / np.maximum(across, 1e-3)
     relief[..., 2] = relief[..., 0] ** 2 + relief[..., 1] ** 2

@@ -38,7 +38,7 @@ def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.nda
     """
     wanted = np.log(np.asarray(ideal, np.float64))
     reference = float(np.median(wanted))
-    if value_or_default(settings.gain, settings.preset.gain) == "fixed":
+    if value_or_default(settings.gain, settings.light_preset.gain) == "fixed":
         return np.full(len(wanted), np.exp(reference))
     half_span = 0.5 * np.log(settings.gain_span)
     wanted = np.clip(wanted, reference - half_span, reference + half_span)
@@ -58,7 +58,7 @@ def white_balances(settings: PhantomSettings) -> Float[np.ndarray, "T 3"]:
     drift = scipy.ndimage.gaussian_filter1d(drift, _DRIFT_LENGTH, axis=0)[4 * int(_DRIFT_LENGTH) :][: settings.frames]
     # Scaled by the filter's known gain, not by the sample's deviation, since a short sequence covers only part of it.
     drift *= np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * value_or_default(
-        settings.white_balance_drift, settings.preset.white_balance_drift
+        settings.white_balance_drift, settings.light_preset.white_balance_drift
     )
     return np.exp(np.stack([drift[:, 0], np.zeros(settings.frames), drift[:, 1]], axis=1))
 

@@ -26,6 +26,26 @@ from coliags_plugin.lighting.beams import SpreadLaw
 _MOVING = 9
 #: Settings that only count with pauses.
 _OF_PAUSES = ("pauses", "pause_frames")
+#: Settings that are recorded only where they differ from their defaults, which earlier versions had.
+_LATER = (
+    "preset",
+    "frame_rate",
+    "turns",
+    "contacts",
+    "wave",
+    "wave_length",
+    "wave_speed",
+    "breathing",
+    "breathing_period",
+    "shutter",
+    "softness",
+    "fluid",
+    "bubbles",
+    "tool",
+    "washes",
+    "fold_spacing",
+    "texture",
+)
 
 _T = TypeVar("_T")
 
@@ -86,6 +106,34 @@ PRESETS: dict[str, Preset] = {
 }
 
 
+#: Settings of the preset ``in-vivo`` where none are given.
+IN_VIVO: dict[str, Any] = {
+    "trajectory": "examination",
+    "frames": 240,
+    "width": 384,
+    "height": 384,
+    "rotation_views": 0,
+    "light": "c3vd",
+    "light_offset": (0.0, 0.0, -1.5),
+    "interreflection": 0.1,
+    "roughness": 0.17,
+    "albedo": (0.74, 0.265, 0.15),
+    "gain_lag": 1.0,
+    "gain_span": 40.0,
+    "turns": 5,
+    "contacts": 1,
+    "wave": 2.0,
+    "breathing": 1.0,
+    "shutter": 0.3,
+    "softness": 1.0,
+    "fluid": 3.0,
+    "bubbles": 60,
+    "fold_spacing": 11.0,
+    "texture": 0.4,
+    "polyps": 1,
+}
+
+
 def value_or_default(value: _T | None, otherwise: _T) -> _T:
     """The value, or the default if it is None."""
     return otherwise if value is None else value
@@ -100,10 +148,13 @@ class PhantomSettings(Settings):
 
     seed: int = Field(0, ge=0, description="Seed of all random numbers of the phantom.")
     layout: str = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
-    trajectory: Literal["pullback", "rotation", "inspection"] = Field(
+    preset: Literal["in-vivo"] | None = Field(
+        None, description="Defaults of other settings. in-vivo: a phantom that looks like the video of a patient."
+    )
+    trajectory: Literal["pullback", "rotation", "inspection", "examination"] = Field(
         "pullback",
         description="pullback: withdrawal along the lumen. rotation: the camera mostly rotates in place. inspection: a "
-        "withdrawal that approaches three spots of the wall.",
+        "withdrawal that approaches three spots of the wall. examination: back and forth, with fast turns.",
     )
     frames: int = Field(120, ge=9, le=2000, description="Frames of the sequence; every 8th is a test frame.")
     width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: the layout's own.")
@@ -159,7 +210,7 @@ class PhantomSettings(Settings):
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
     )
     gain_span: float = Field(
-        3.0, ge=1.0, le=8.0, description="Largest over smallest automatic gain, linear; C3VD's cecum_t1_a spans 3."
+        3.0, ge=1.0, le=100.0, description="Largest over smallest automatic gain, linear; C3VD's cecum_t1_a spans 3."
     )
     white_balance_drift: float | None = Field(
         None, ge=0.0, le=0.2, description="Standard deviation of the slow drift of log red/green and blue/green gain."
@@ -173,8 +224,42 @@ class PhantomSettings(Settings):
     pauses: int = Field(0, ge=0, le=50, description="How often the camera stops, at even intervals of its path.")
     pause_frames: int = Field(10, ge=1, le=500, description="Frames of each pause beyond the one that reaches it.")
     path_length: float = Field(50.0, ge=0.0, le=60.0, description="Length of the pullback, mm; C3VD's median is 47.")
+    frame_rate: float = Field(15.0, ge=1.0, le=120.0, description="Frames per second, for all that moves in time.")
+    turns: int = Field(4, ge=0, le=50, description="Fast turns of an examination, 30 to 50 degrees within 0.35 s.")
+    contacts: int = Field(1, ge=0, le=20, description="How often the lens touches the wall in an examination.")
+    wave: float = Field(
+        0.0, ge=0.0, le=4.0, description="Amplitude of the peristaltic wave of the wall's radius, mm; 0 is none."
+    )
+    wave_length: float = Field(60.0, ge=20.0, le=300.0, description="Length of the wave along the centre line, mm.")
+    wave_speed: float = Field(
+        10.0,
+        ge=0.0,
+        le=100.0,
+        description="Speed of the wave towards the shallow end, mm/s; period: length/speed.",
+    )
+    breathing: float = Field(
+        0.0, ge=0.0, le=4.0, description="Amplitude with which breathing bends the centre line, mm; 0 is none."
+    )
+    breathing_period: float = Field(4.0, ge=1.0, le=30.0, description="Time of one breath, s.")
+    shutter: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the frame interval that is exposed: motion blur; 0 is none."
+    )
+    softness: float = Field(
+        0.0, ge=0.0, le=4.0, description="Standard deviation of the lens's blur, pixels; 0 is none."
+    )
+    fluid: float = Field(0.0, ge=0.0, le=8.0, description="Depth of a pool of fluid, mm; 0 is none.")
+    bubbles: int = Field(0, ge=0, le=1000, description="Number of bubbles that drift along the wall, in clusters.")
+    tool: bool = Field(False, description="Whether a tool moves in and out of the working channel.")
+    washes: int = Field(0, ge=0, le=20, description="How often a wash leaves drops on the lens for 1.2 s.")
+    fold_spacing: float = Field(25.0, ge=8.0, le=40.0, description="Mean distance of folds along the colon, mm.")
+    texture: float = Field(1.0, ge=0.0, le=1.0, description="Contrast of the mucosa's colours and fine relief.")
     mesh_spacing: float = Field(0.42, ge=0.2, le=4.0, description="Distance of mesh vertices, mm.")
     texture_spacing: float = Field(0.1, ge=0.05, le=2.0, description="Size of a texel of the mucosa, mm.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset_where_not_given(cls, given: Any) -> Any:
+        return {**IN_VIVO, **given} if isinstance(given, dict) and given.get("preset") == "in-vivo" else given
 
     @field_validator("layout")
     @classmethod
@@ -212,10 +297,24 @@ class PhantomSettings(Settings):
     def _records_of_earlier_versions(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # A phantom without pauses is recorded as it was before there were any: it is the same phantom.
         record: dict[str, Any] = serialize(self)
-        return record if self.pauses else {key: record[key] for key in record if key not in _OF_PAUSES}
+        fields = type(self).model_fields
+        later = () if self.preset else _LATER
+        left_out = {key for key in later if getattr(self, key) == fields[key].default}
+        left_out.update(() if self.pauses else _OF_PAUSES)
+        return {key: record[key] for key in record if key not in left_out}
 
     @property
-    def preset(self) -> Preset:
+    def moves(self) -> bool:
+        """Whether the wall moves."""
+        return self.wave > 0.0 or self.breathing > 0.0
+
+    @property
+    def covers(self) -> bool:
+        """Whether anything but the wall is in view."""
+        return bool(self.fluid or self.bubbles or self.tool or self.washes)
+
+    @property
+    def light_preset(self) -> Preset:
         """The preset for settings left at None."""
         return PRESETS[self.light]
 
@@ -223,7 +322,7 @@ class PhantomSettings(Settings):
         """Settings with None replaced by the preset's values; sizes are left to the layout."""
         names = ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift")
         return self.model_copy(
-            update={name: value_or_default(getattr(self, name), getattr(self.preset, name)) for name in names}
+            update={name: value_or_default(getattr(self, name), getattr(self.light_preset, name)) for name in names}
         )
 
 

@@ -22,6 +22,8 @@ class Purpose(IntEnum):
     SENSOR = 6
     INTERREFLECTION = 7
     POINTS = 8
+    WALL_MOTION = 9
+    PROPS = 10
 
 
 def stream(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:

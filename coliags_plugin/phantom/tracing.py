@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.phantom.colon import ColonSurface
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,11 @@ class Hits:
 
     def kept(self) -> Hits:
         """Those of the rays that hit the wall."""
-        keep = self.found
-        return Hits(keep[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
+        return self.only(self.found)
+
+    def only(self, keep: Bool[np.ndarray, "N"]) -> Hits:
+        """Those of some of the rays."""
+        return Hits(self.found[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
 
 
 def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
@@ -33,10 +36,22 @@ def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 
-class Tracer:
-    """Ray-casting scene of the mesh."""
+class Triangles(Protocol):
+    """A triangle mesh."""
 
-    def __init__(self, surface: ColonSurface) -> None:
+    @property
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Positions, mm."""
+
+    @property
+    def triangles(self) -> Int[np.ndarray, "F 3"]:
+        """Vertex indices."""
+
+
+class Tracer:
+    """Ray-casting scene of a mesh."""
+
+    def __init__(self, surface: Triangles) -> None:
         self._open3d = import_open3d("traces a phantom's rays")
         self._surface = surface
         self._scene = self._open3d.t.geometry.RaycastingScene()

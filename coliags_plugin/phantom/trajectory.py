@@ -10,8 +10,10 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.phantom.colon import CentreLine
+from coliags_plugin.phantom.examination import examining_path
 from coliags_plugin.phantom.inspection import inspecting_path
-from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, rotation, rotation_about, times
+from coliags_plugin.phantom.living import WallMotion
+from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, looking, rotation, rotation_about, times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer
@@ -36,8 +38,20 @@ class RotationView:
     camera_to_world: Float[np.ndarray, "4 4"]  # OpenCV axes, mm
 
 
-def camera_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
-    """Camera-to-world pose of every frame, OpenCV axes, mm, at least 6 mm from the wall."""
+def camera_path(
+    centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer, motion: WallMotion | None = None
+) -> Float[np.ndarray, "T 4 4"]:
+    """Camera-to-world pose of every frame, OpenCV axes, mm.
+
+    It is at least 6 mm from the wall at rest, except in an examination.
+    """
+    if settings.trajectory == "examination":
+        return examining_path(
+            centre_line,
+            settings,
+            tracer.clearance,
+            lambda frame: (tracer if motion is None else Tracer(motion.at(frame))).clearance,
+        )
     if settings.trajectory == "inspection":
         poses = inspecting_path(centre_line, settings, tracer)
     else:
@@ -88,7 +102,7 @@ def turn_away(
 def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
     """Poses of the trajectories ``pullback`` and ``rotation``: along the centre line, and almost in place."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
-    preset = settings.preset
+    preset = settings.light_preset
     time = times(settings)
     if settings.trajectory == "pullback":
         arc = SHALLOW_END + settings.path_length * (1.0 - time)
@@ -116,7 +130,7 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
     for approach in range(0 if on_the_spot else preset.approaches):
         sideways = _with_approach(sideways, distances, preset.closest, approach, time, generator)
     ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
-    poses = _looking(centers(sideways), ahead, frames)
+    poses = looking(centers(sideways), ahead, frames)
     if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
     else:
@@ -127,20 +141,6 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
         roll = np.radians(preset.turn[2]) * waver[:, 4]
     for pose, turn in zip(poses, np.stack([yaw, pitch, roll], axis=1), strict=True):
         pose[:3, :3] = pose[:3, :3] @ rotation(*turn)
-    return poses
-
-
-def _looking(
-    centers: Float[np.ndarray, "T 3"], targets: Float[np.ndarray, "T 3"], frames: Float[np.ndarray, "T 3 3"]
-) -> Float[np.ndarray, "T 4 4"]:
-    """Poses that look at targets, x along the centre line's first across direction."""
-    forward = targets - centers
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = frames[:, :, 0] - (frames[:, :, 0] * forward).sum(axis=1, keepdims=True) * forward
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (len(centers), 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
-    poses[:, :3, 3] = centers
     return poses
 
 
