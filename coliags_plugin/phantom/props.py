@@ -30,7 +30,7 @@ _BUBBLES_AT = (30.0, 120.0)
 _TOOL_RADIUS, _CHANNEL = 1.2, np.array([3.0, 3.6, 0.0])
 #: Distance from the channel to the tool's tip, smallest and largest, mm, and period of its motion, s.
 _TOOL_REACH, _TOOL_PERIOD = (4.0, 22.0), 5.0
-_TOOL_ALBEDO = np.array([0.16, 0.17, 0.18])
+_TOOL_ALBEDO = np.array([0.07, 0.075, 0.08])
 #: Time that water stays on the lens, s, and how many drops there are.
 _WASH_TIME, _DROPS = 1.2, 9
 
@@ -127,7 +127,8 @@ def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh
     grid = surface.vertices.reshape(surface.rows, surface.columns, 3).astype(np.float64)
     rows = np.flatnonzero((surface.arc > _POOL[0]) & (surface.arc < _POOL[1]))[::2]
     arc = surface.arc[rows]
-    centres = grid[rows].mean(axis=1)
+    # A straight axis, so that the surface is level.
+    centres = np.polynomial.polynomial.polyval(arc, np.polynomial.polynomial.polyfit(arc, grid[rows].mean(axis=1), 1)).T
     down = grid[rows, clock % surface.columns] - grid[rows, (clock + surface.columns // 2) % surface.columns]
     down = _unit(down.mean(axis=0))
     side = _unit(np.cross(down, centres[-1] - centres[0]))
