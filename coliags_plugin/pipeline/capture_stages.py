@@ -31,13 +31,14 @@ def make_frames(context: StageContext) -> StageOutcome:
 
 def make_poses(context: StageContext) -> StageOutcome:
     """Estimate poses and points by structure from motion, and write them as a scene."""
-    from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
+    from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
-    from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
+    from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
     from coliags_plugin.reconstruction.structure.sfm import reconstruct
 
     mask = read_lens_mask(context.frames)
-    model = reconstruct(list_images(context.frames / IMAGES), context.settings.sfm, mask, context.progress)
+    atlas = reconstruct(list_images(context.frames / IMAGES), context.settings.sfm, mask, context.progress)
+    model = atlas.largest
     posed, count = len(model.registered), len(model.images)
     if posed < FEWEST:
         raise InputError(
@@ -47,16 +48,18 @@ def make_poses(context: StageContext) -> StageOutcome:
             "(--every), or give the camera (--camera)",
         )
     if posed < _MOST * count:
-        log.warning("only %d of %d frames have poses: the rest of the video is not reconstructed", posed, count)
+        log.warning("the surface is of the largest model, %d of %d frames: see poses/%s", posed, count, RIBBON_FILE)
     factor = millimetres(model, context.settings.diameter)
-    scene = scaled(model, UNKNOWN_MEDIAN_DEPTH / model.median_depth if factor is None else factor)
-    write_sfm_scene(context.posed, scene, mask, overwrite=True, unit="unknown" if factor is None else "mm")
+    atlas = atlas_scaled(atlas, UNKNOWN_MEDIAN_DEPTH / model.median_depth if factor is None else factor)
+    write_sfm_scene(context.posed, atlas, mask, overwrite=True, unit="unknown" if factor is None else "mm")
+    depth = atlas.largest.median_depth
     unit = (
         f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
         if factor is None
-        else f"unit mm, by a diameter of {context.settings.diameter:g} mm; median depth {scene.median_depth:.3g} mm"
+        else f"unit mm, by a diameter of {context.settings.diameter:g} mm; median depth {depth:.3g} mm"
     )
-    return StageOutcome(f"{model.summary()}; {unit}", {"poses": "scene in COLMAP's layout: images, poses, points"})
+    made = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
+    return StageOutcome(f"{atlas.summary()}; {unit}", made)
 
 
 def check_data(context: StageContext) -> StageOutcome:

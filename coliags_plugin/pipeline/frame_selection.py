@@ -13,8 +13,6 @@ from coliags_plugin.pipeline.settings import FrameSettings
 
 #: Larger side of the images that are measured, pixels.
 _SIDE = 480
-#: Brightness (of 255) of highlights, whose edges are sharp in any frame, and pixels about them that do not count.
-_HIGHLIGHT, _HIGHLIGHT_MARGIN = 240, 5
 #: Corners that are followed, at most, and fewest for a motion.
 _CORNERS, _FEWEST = 200, 12
 #: Largest distance between a corner and where following it there and back ends, pixels.
@@ -78,23 +76,6 @@ def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
         return gray
     size = (max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor)))
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
-
-
-def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
-    """Root mean square of the Laplacian of the smoothed image, relative to its mean brightness; 0 for a black image.
-
-    Highlights do not count: they are sharp in a blurred frame too. Comparable between frames of one video only.
-    """
-    import cv2
-
-    size = 2 * _HIGHLIGHT_MARGIN + 1
-    highlight = cv2.dilate((gray >= _HIGHLIGHT).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-    counted = ~highlight
-    brightness = float(gray[counted].mean()) if counted.any() else 0.0
-    if brightness == 0.0:
-        return 0.0
-    edges = cv2.Laplacian(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0), cv2.CV_32F)
-    return float(np.sqrt(np.mean(np.square(edges[counted])))) / brightness
 
 
 def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -13,6 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.progress import Progress
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES, file_names, list_images, read_image
 
 if TYPE_CHECKING:
@@ -142,3 +146,24 @@ def _opened(path: Path) -> cv2.VideoCapture:
             f"Fetch it again if it is incomplete. {_AS_IMAGES}",
         )
     return video
+
+
+@contextmanager
+def image_files(source: Path, progress: Progress | None = None) -> Iterator[list[Path]]:
+    """Image files of a folder, or of a video's frames, which are written to a temporary folder without loss.
+
+    Raises:
+        InputError: As :func:`frame_source`, or a frame cannot be read.
+    """
+    frames = frame_source(source)
+    if isinstance(frames, ImageFolder):
+        yield list_images(source)
+        return
+    with tempfile.TemporaryDirectory(prefix="coliags-frames-") as scratch:
+        files = []
+        for done, (name, image) in enumerate(frames, start=1):
+            files.append(Path(scratch) / f"{name}.png")
+            write_image(files[-1], image)
+            if progress is not None:
+                progress("read frames", done, max(done, frames.expected))
+        yield files

@@ -21,11 +21,11 @@ from coliags_plugin.pipeline.frame_selection import (
     motion,
     reduced,
     sharp_frames,
-    sharpness,
 )
 from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
+from coliags_plugin.reconstruction.structure.texture import sharpness
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"

@@ -24,7 +24,7 @@ class FrameSettings(Settings):
         description="Use the sharpest of every n frames. None: such that at most 'at_most' are left.",
     )
     at_most: int = Field(
-        default=200,
+        default=300,
         ge=2,
         description="Largest number of frames where 'every' is not given, spread over the whole video.",
     )

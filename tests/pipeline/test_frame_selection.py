@@ -16,9 +16,9 @@ from coliags_plugin.pipeline.frame_selection import (
     motion,
     reduced,
     sharp_frames,
-    sharpness,
 )
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.reconstruction.structure.texture import sharpness
 from tests.pipeline.films import WIDTH, blurred, film
 
 SHARPNESS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60)

@@ -38,8 +38,13 @@ def tube(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(tube):
+def atlas(tube):
     return reconstruct(list_images(tube), KNOWN)
+
+
+@pytest.fixture(scope="module")
+def found(atlas):
+    return atlas.largest
 
 
 def share_of_path(trajectory, poses):
@@ -50,9 +55,9 @@ def share_of_path(trajectory, poses):
     return result.ate.rmse / path, result.rotation_deg.rmse
 
 
-def test_a_known_camera_finds_its_path(found):
+def test_a_known_camera_finds_its_path(atlas, found):
     assert found.registered == tuple(range(COUNT))
-    assert found.left_out == ()
+    assert (atlas.lost, len(atlas.models)) == ({}, 1)
     error, degrees = share_of_path(found.trajectory, TRUTH)
     assert error < 0.005
     assert degrees < 2.0  # the direction of so short a path
@@ -72,14 +77,14 @@ def test_median_depth_is_that_of_the_points(found):
 
 
 def test_the_same_images_give_the_same_poses(found, tube):
-    again = reconstruct(list_images(tube), KNOWN)
+    again = reconstruct(list_images(tube), KNOWN).largest
     np.testing.assert_array_equal(again.camera_to_world, found.camera_to_world)
 
 
-def test_the_written_scene_is_read_as_it_is(found, tmp_path):
+def test_the_written_scene_is_read_as_it_is(atlas, found, tmp_path):
     mask = np.ones((128, 160), bool)
     mask[:20] = False
-    write_sfm_scene(tmp_path / "scene", found, mask)
+    write_sfm_scene(tmp_path / "scene", atlas, mask)
     for path in found.images:
         assert (tmp_path / "scene" / "images" / path.name).read_bytes() == path.read_bytes()
     np.testing.assert_allclose(colmap.read(tmp_path / "scene" / "sparse" / "0").camera_to_world, found.camera_to_world)
@@ -93,7 +98,7 @@ def test_the_written_scene_is_read_as_it_is(found, tmp_path):
 def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     images = list_images(phantom / "images")
     with caplog.at_level(logging.INFO):
-        found = reconstruct(images)
+        found = reconstruct(images).largest
     assert len(found.registered) == len(images)
     assert "SIMPLE_RADIAL is taken; SIMPLE_RADIAL_FISHEYE at best has +" in caplog.text
     assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
@@ -107,7 +112,9 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
 
 
 def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
-    found = reconstruct(list_images(phantom / "images"), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
+    found = reconstruct(
+        list_images(phantom / "images"), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE"))
+    ).largest
     (camera,) = found.model.cameras.values()
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
 
@@ -117,17 +124,17 @@ def test_an_implausible_focal_length_is_refused(tube):
     told = r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees"
     refusal(told, tube, SfmSettings(camera=camera))
     wide = camera.model_copy(update={"field_of_view": (20.0, 150.0)})
-    assert reconstruct(list_images(tube), SfmSettings(camera=wide)).registered
+    assert reconstruct(list_images(tube), SfmSettings(camera=wide)).largest.registered
 
 
 def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
     for path in list_images(tube):
         write_png(tmp_path / path.name, read_rgb(path))
     write_png(tmp_path / "9_other.png", np.random.default_rng(0).integers(0, 255, (128, 160, 3)).astype(np.uint8))
-    found = reconstruct(list_images(tmp_path), KNOWN)
-    assert [path.name for path in found.left_out] == ["9_other.png"]
+    atlas = reconstruct(list_images(tmp_path), KNOWN)
+    assert [atlas.images[index].name for index in atlas.lost] == ["9_other.png"]
     assert f"1 of {COUNT + 1} images have no pose: 9_other.png" in caplog.text
-    write_sfm_scene(tmp_path / "scene", found)
+    write_sfm_scene(tmp_path / "scene", atlas)
     assert not (tmp_path / "scene" / "images" / "9_other.png").exists()
     assert len(open_scene(tmp_path / "scene", options=["split=all-train"]).train) == COUNT
 
@@ -135,7 +142,7 @@ def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog)
 def test_masked_parts_have_no_features(tube):
     mask = np.ones((128, 160), bool)
     mask[64:] = False
-    half = reconstruct(list_images(tube), KNOWN, mask)
+    half = reconstruct(list_images(tube), KNOWN, mask).largest
     seen = [point.y() for image in half.model.images.values() for point in image.get_observation_points2D()]
     assert max(seen) < 62
 
@@ -170,7 +177,7 @@ def refusal(match, tube, settings=KNOWN, masks=None):
 def test_images_without_motion_are_refused(tube, tmp_path):
     for index in range(4):
         write_png(tmp_path / f"{index}.png", read_rgb(list_images(tube)[0]))
-    refusal(r"no model from 4 images with \d+ features.*the camera has to move", tmp_path)
+    refusal(r"no model from 4 images with \d+ points.*the camera has to move", tmp_path)
 
 
 def test_cameras_that_are_none_are_refused(tube, tmp_path):

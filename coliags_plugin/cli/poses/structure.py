@@ -106,7 +106,7 @@ class PosesSfmCommand:
     """Estimate poses, intrinsics and surface points from a video's images alone; write them as a scene."""
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
-    """Folder of images, ordered by the numbers in their names."""
+    """Video, or folder of images ordered by the numbers in their names."""
     output: arguments.Output
     """Folder to create, in COLMAP's layout."""
     camera: arguments.OptionalText = None
@@ -133,9 +133,10 @@ class PosesSfmCommand:
         """Reconstruct, write the scene and print a summary."""
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.pipeline.frame_sources import image_files
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-        from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for
-        from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
+        from coliags_plugin.reconstruction.structure.image_files import masks_for
+        from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
         from coliags_plugin.reconstruction.structure.sfm import reconstruct
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
@@ -146,15 +147,15 @@ class PosesSfmCommand:
         given = [] if self.camera is None else [f"camera.model={self.camera}"]
         given += [] if self.params is None else [f"camera.params=[{self.params}]"]
         settings = settings_of(SfmSettings, [*given, *self.set])
-        images = list_images(self.frames)[:: self.every][: self.max_frames]
-        masks = None if self.mask is None else masks_for(self.mask, images)
-        with progress_callback() as progress:
-            model = reconstruct(images, settings, masks, progress)
-        factor = millimetres(model, self.diameter, known_distance)
-        if factor is not None:
-            model = scaled(model, factor)
-        write_sfm_scene(self.output, model, masks, self.overwrite, "unknown" if factor is None else "mm")
-        text = f"{model.summary()}\n{_unit(model, factor)}"
+        with progress_callback() as progress, image_files(self.frames, progress) as files:
+            images = files[:: self.every][: self.max_frames]
+            masks = None if self.mask is None else masks_for(self.mask, images)
+            atlas = reconstruct(images, settings, masks, progress)
+            factor = millimetres(atlas.largest, self.diameter, known_distance)
+            if factor is not None:
+                atlas = atlas_scaled(atlas, factor)
+            write_sfm_scene(self.output, atlas, masks, self.overwrite, "unknown" if factor is None else "mm")
+        text = f"{atlas.summary()}\n{_unit(atlas.largest, factor)}"
         print_summary(text, written=[self.output], then=depth_commands(self.output), as_json=self.json)
 
     def _known_distance(self) -> tuple[str, str, float] | None:

@@ -62,6 +62,6 @@ def add_points(
         model.points3D[number].error = float(error)
 
 
-def write_model(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Write a binary model into ``sparse/0`` of a scene's folder."""
-    write_reconstruction(folder / "sparse" / "0", model)
+def write_model(folder: Path, model: pycolmap.Reconstruction, number: int = 0) -> None:
+    """Write a binary model into ``sparse/NUMBER`` of a scene's folder."""
+    write_reconstruction(folder / "sparse" / str(number), model)

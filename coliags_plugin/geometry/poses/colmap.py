@@ -139,7 +139,7 @@ def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: boo
 
 
 def _counts(model: pycolmap.Reconstruction) -> tuple[int, ...]:
-    return model.num_cameras(), model.num_images(), model.num_points3D(), model.compute_num_observations()
+    return model.num_cameras(), model.num_reg_images(), model.num_points3D(), model.compute_num_observations()
 
 
 def read_pinholes(path: Path) -> dict[int, Intrinsics | str]:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float32
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.poses.colmap import posed_model
 from coliags_plugin.geometry.poses.rigid import inverse
-from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.matching import Matches
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def write_database(
     path: Path,
     cameras: Sequence[pycolmap.Camera],
     images: Sequence[tuple[str, int]],
-    features: Sequence[Features],
+    keypoints: Sequence[Float32[np.ndarray, "K D"]],
     matches: Matches,
     verified: bool,
 ) -> None:
@@ -41,13 +41,13 @@ def write_database(
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
-        for number, ((name, camera_index), image_features) in enumerate(zip(images, features, strict=True), start=1):
+        for number, ((name, camera_index), image_keypoints) in enumerate(zip(images, keypoints, strict=True), start=1):
             image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, image_features.keypoints)
+            database.write_keypoints(number, np.ascontiguousarray(image_keypoints))
         for (first, second), pairs in matches.items():
             if not len(pairs):
                 continue

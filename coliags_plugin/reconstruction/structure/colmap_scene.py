@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from coliags_plugin.reconstruction.structure.features import image_and_mask
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of
-from coliags_plugin.reconstruction.structure.sfm import Reconstruction
+from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
+from coliags_plugin.reconstruction.structure.sfm import Atlas
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
 
 
@@ -54,16 +57,63 @@ def write_colmap_scene(
         write_unit(scratch, unit)
 
 
+#: Names of the record of the sub-maps and of their picture.
+ATLAS_FILE, RIBBON_FILE = "atlas.json", "atlas.png"
+
+
 def write_sfm_scene(
-    folder: Path, reconstruction: Reconstruction, masks: Masks = None, overwrite: bool = False, unit: Unit = "unknown"
+    folder: Path, atlas: Atlas, masks: Masks = None, overwrite: bool = False, unit: Unit = "unknown"
 ) -> None:
-    """Write a scene in COLMAP's layout: copies of the registered images, masks, the model and its unit."""
+    """Write a scene in COLMAP's layout: copies of the posed images, masks, the unit, and the models, largest first.
+
+    ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose;
+    ``atlas.png`` shows it. ``unit`` is that of the largest model; further models are in units of their own.
+    """
     with atomic_folder(folder, overwrite) as scratch:
         (scratch / "images").mkdir()
-        for index in reconstruction.registered:
-            shutil.copyfile(reconstruction.images[index], scratch / "images" / reconstruction.names[index])
-            mask = mask_of(reconstruction.images[index], masks)
-            if mask is not None:
-                write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
-        write_model(scratch, reconstruction.model)
+        for number, reconstruction in enumerate(atlas.models):
+            for index in reconstruction.registered:
+                shutil.copyfile(reconstruction.images[index], scratch / "images" / reconstruction.names[index])
+                mask = mask_of(reconstruction.images[index], masks)
+                if mask is not None:
+                    write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
+            write_model(scratch, reconstruction.model, number)
         write_unit(scratch, unit)
+        write_json(scratch / ATLAS_FILE, _record(atlas, unit))
+        write_png(scratch / RIBBON_FILE, draw_ribbon(atlas))
+
+
+def _record(atlas: Atlas, unit: Unit) -> dict[str, object]:
+    """What ``atlas.json`` holds. Frames are numbered from 0 in the order of the images."""
+    submaps = []
+    for number, span in atlas.submaps():
+        model = atlas.models[number]
+        camera = next(iter(model.model.cameras.values()))
+        submaps.append(
+            {
+                "model": f"sparse/{number}",
+                "unit": unit if number == 0 else "unknown",
+                "frames": [index for index in model.registered if index in span],
+                "camera": {
+                    "model": camera.model_name,
+                    "size": [camera.width, camera.height],
+                    "params": [float(value) for value in camera.params],
+                },
+                "points": int(model.model.num_points3D()),
+                "reprojection_error_px": round(float(model.model.compute_mean_reprojection_error()), 3),
+                "held_out_error_px": None if model.test_error is None else round(model.test_error, 3),
+                "brightness_depth_correlation": None if model.correlation is None else round(model.correlation, 3),
+            }
+        )
+    links = [(link, True) for model in atlas.models for link in model.links]
+    links += [(link, False) for link in atlas.refused]
+    return {
+        "format": 1,
+        "frames": [path.name for path in atlas.images],
+        "submaps": submaps,
+        "joins": [
+            {**asdict(link), "joined": joined, "reason": link.reason}
+            for link, joined in sorted(links, key=lambda pair: pair[0].after)
+        ],
+        "lost": [{"frame": index, "reason": reason} for index, reason in atlas.lost.items()],
+    }

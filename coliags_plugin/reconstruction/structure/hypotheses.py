@@ -198,7 +198,7 @@ def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | 
     tried = starts(settings.camera)
     if len(tried) == 1:
         return tried[0]
-    part, refined = video.middle(settings.search_images), is_refined(settings.camera)
+    part, refined = video.search_part(settings.search_images), is_refined(settings.camera)
     hypotheses = []
     for start in with_progress(tried, "try cameras", progress):
         for model in part.mapped(settings, start, None)[:1]:

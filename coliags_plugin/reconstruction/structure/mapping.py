@@ -1,4 +1,4 @@
-"""COLMAP's incremental mapping and bundle adjustment, on one thread for determinism; observations of its models."""
+"""COLMAP's mapping and bundle adjustment, on one thread for determinism; observations of its models."""
 
 from __future__ import annotations
 
@@ -16,6 +16,44 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+def _verify_pairs(database: Path, max_error: float, seed: int) -> None:
+    """Verify the matches of all pairs by their two-view geometry."""
+    import pycolmap
+
+    views = pycolmap.TwoViewGeometryOptions()
+    views.ransac.max_error = max_error
+    views.ransac.random_seed = seed
+    # The endoscope's dark border is masked instead of being detected as a watermark of static matches.
+    views.detect_watermark = False
+    pycolmap.geometric_verification(
+        str(database), pycolmap.GeometricVerifierOptions(num_threads=1), two_view_geometry_options=views
+    )
+
+
+def map_tracks(database: Path, scratch: Path, settings: SfmSettings) -> list[pycolmap.Reconstruction]:
+    """Models of verified matches by global mapping with fixed intrinsics, the largest first.
+
+    All rotations are averaged, then all positions found at once: small motion between frames does not add up.
+    """
+    import pycolmap
+
+    _verify_pairs(database, settings.tracks.max_pair_error, settings.seed)
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_model_size = settings.min_model_size
+    mapper = options.mapper
+    options.num_threads = mapper.num_threads = 1
+    for seeded in (
+        *(options, mapper, mapper.retriangulation),
+        *(mapper.global_positioning, mapper.rotation_averaging),
+    ):
+        seeded.random_seed = settings.seed
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
+    scratch.mkdir()
+    models = pycolmap.global_mapping(str(database), str(scratch), str(scratch), options)
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
 def map_images(
     database: Path, scratch: Path, settings: SfmSettings, count: int, progress: Progress | None
 ) -> list[pycolmap.Reconstruction]:
@@ -26,14 +64,7 @@ def map_images(
     """
     import pycolmap
 
-    views = pycolmap.TwoViewGeometryOptions()
-    views.ransac.max_error = settings.max_error
-    views.ransac.random_seed = settings.seed
-    # The endoscope's dark border is masked instead of being detected as a watermark of static matches.
-    views.detect_watermark = False
-    pycolmap.geometric_verification(
-        str(database), pycolmap.GeometricVerifierOptions(num_threads=1), two_view_geometry_options=views
-    )
+    _verify_pairs(database, settings.max_error, settings.seed)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = settings.seed

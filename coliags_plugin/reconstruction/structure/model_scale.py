@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reconstruction.structure.sfm import Reconstruction
+from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 
 log = logging.getLogger(__name__)
 
@@ -86,3 +86,8 @@ def scaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
     camera_to_world = reconstruction.camera_to_world.copy()
     camera_to_world[:, :3, 3] *= factor
     return replace(reconstruction, model=model, camera_to_world=camera_to_world)
+
+
+def atlas_scaled(atlas: Atlas, factor: float) -> Atlas:
+    """The atlas with its largest model in units of ``factor``."""
+    return replace(atlas, models=(scaled(atlas.largest, factor), *atlas.models[1:]))

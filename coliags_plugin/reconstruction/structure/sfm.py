@@ -1,4 +1,4 @@
-"""Incremental structure from motion by COLMAP: camera poses, intrinsics and points from images."""
+"""Structure from motion by COLMAP: camera poses, intrinsics and points from images or the frames of a video."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.libraries import quiet_colmap
-from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, both_signs, choose, find_start
+from coliags_plugin.reconstruction.structure.atlas import Link, held_out_error, part_of, weak_links
+from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, best, both_signs, choose, find_start
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
-from coliags_plugin.reconstruction.structure.mapping import depths_of
+from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_cameras import field_of_view, has_known_camera, is_refined
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, read_video
@@ -38,14 +39,9 @@ class Reconstruction:
     camera_to_world: Float[np.ndarray, "M 4 4"]  # their poses, OpenCV axes
     names: tuple[str, ...]  # of all images in the model
     model: pycolmap.Reconstruction
-    models: tuple[int, ...]  # number of registered images of every model found, the largest first
     correlation: float | None = None  # of log brightness with log depth; None: unknown
-
-    @property
-    def left_out(self) -> tuple[Path, ...]:
-        """Images that were not registered."""
-        known = set(self.registered)
-        return tuple(path for index, path in enumerate(self.images) if index not in known)
+    links: tuple[Link, ...] = ()  # weak places that hold
+    test_error: float | None = None  # median error of tracks that mapping has not used, pixels; None: unknown
 
     @property
     def trajectory(self) -> Trajectory:
@@ -69,12 +65,50 @@ class Reconstruction:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Models of a video, each in a frame and scale of its own, and the images that none has.
+
+    ``refused`` are the places at which a model was split, because the scales of its sides differ or cannot be compared.
+    """
+
+    images: tuple[Path, ...]  # all input images, in order
+    models: tuple[Reconstruction, ...]  # the largest first
+    lost: dict[int, str]  # why an image has no pose, by its index
+    refused: tuple[Link, ...] = ()
+
+    @property
+    def largest(self) -> Reconstruction:
+        """The model of the most images."""
+        return self.models[0]
+
+    def submaps(self) -> list[tuple[int, range]]:
+        """Stretches of images between weak places: number of the model, and span; in video order."""
+        stretches = []
+        for number, model in enumerate(self.models):
+            cuts = sorted(link.after for link in model.links)
+            for part in np.split(model.registered, np.searchsorted(model.registered, cuts, side="right")):
+                if len(part):
+                    stretches.append((number, range(int(part[0]), int(part[-1]) + 1)))
+        return sorted(stretches, key=lambda stretch: stretch[1].start)
+
+    def summary(self) -> str:
+        """One line, or two where there are several models."""
+        text = self.largest.summary()
+        if len(self.models) == 1:
+            return text
+        posed = len(self.images) - len(self.lost)
+        sizes = ", ".join(str(len(model.registered)) for model in self.models)
+        return f"{posed} of {len(self.images)} images posed, in models of {sizes}\nlargest model: {text}"
+
+
 def reconstruct(
     images: Sequence[Path], settings: SfmSettings | None = None, masks: Masks = None, progress: Progress | None = None
-) -> Reconstruction:
-    """Estimate poses and points by incremental structure from motion, and return the largest model.
+) -> Atlas:
+    """Estimate poses and points by structure from motion.
 
-    An unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`).
+    An unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`), and refined on
+    the largest model; the others are adjusted with its camera.
 
     Args:
         images: Files in video order. Images of the same size share a camera.
@@ -94,39 +128,92 @@ def reconstruct(
         video = read_video(images, settings, masks, progress)
         models = video.mapped(settings, find_start(video, settings, progress), progress)
         if not models:
-            counts = [len(features) for features in video.features]
+            counts = [len(keypoints) for keypoints in video.keypoints]
+            matches = [len(pairs) for pairs in video.matches.values()] or [0]
             raise InputError(
-                f"no model from {len(images)} images with {np.mean(counts):.0f} features and "
-                f"{np.mean([len(pairs) for pairs in video.matches.values()]):.0f} matches a pair",
+                f"no model from {len(images)} images with {np.mean(counts):.0f} points and {np.mean(matches):.0f} "
+                "matches a pair",
                 "overlapping images from different camera positions",
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
             )
         refined = is_refined(settings.camera)
         known = has_known_camera(settings.camera) and not refined
-        chosen = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
-        return _result(video, chosen, models)
+        first = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
+        cameras = first.model.cameras
+        chosen = [first]
+        for model in models[1:]:
+            for number, camera in model.cameras.items():
+                camera.params = cameras[number].params
+            bundle_adjust(model, refine_camera=False)
+            chosen.append(best(both_signs(model, video, refined=False)))
+        return _atlas(video, chosen, settings)
 
 
-def _result(video: MatchedVideo, chosen: Hypothesis, models: Sequence[pycolmap.Reconstruction]) -> Reconstruction:
+def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSettings) -> Atlas:
+    """The models, those of tracks split where their sides do not hold together."""
+    found: list[Reconstruction] = []
+    refused: list[Link] = []
+    for hypothesis in chosen:
+        links = weak_links(hypothesis.model) if video.tracks else []
+        broken = [link for link in links if not link.holds]
+        refused += broken
+        frames = np.array(sorted(hypothesis.model.reg_image_ids())) - 1
+        for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
+            if len(part) < settings.min_model_size:
+                continue
+            held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
+            model = part_of(hypothesis.model, part.tolist()) if broken else hypothesis.model
+            found.append(_result(video, Hypothesis.of(model, video.brightness), held))
+    found.sort(key=lambda one: -len(one.registered))
+    posed = {index for one in found for index in one.registered}
+    lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
+    if lost:
+        names = [video.images[index].name for index in lost]
+        shown = ", ".join([*names[:10], *(["..."] if len(names) > 10 else [])])
+        log.warning("%d of %d images have no pose: %s", len(lost), len(video.images), shown)
+    if len(found) > 1:
+        sizes = ", ".join(str(len(one.registered)) for one in found)
+        log.warning("%d models have %s images: what lies between them is not known", len(found), sizes)
+    return Atlas(video.images, tuple(found), lost, tuple(sorted(refused, key=lambda link: link.after)))
+
+
+#: Points that come from the image before, below which nothing is said to be in common; and the share of the median
+#: sharpness of its neighbours below which an image is blurred.
+_NOTHING, _BLURRED = 15, 0.5
+
+
+def _reason(video: MatchedVideo, index: int) -> str:
+    """Why an image has no pose."""
+    if not video.tracks:
+        return "too few matches with images that have a pose"
+    around = [frame.sharpness for frame in video.tracks[max(0, index - 10) : index + 11]]
+    frame = video.tracks[index]
+    if frame.sharpness < _BLURRED * np.median(around):
+        return "blurred, or the wall is too near to be in focus"
+    if index and frame.followed < _NOTHING:
+        return "moved too far, or shows nothing of the frame before"
+    return "too few points are seen in three frames or more"
+
+
+def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) -> Reconstruction:
     images, model = video.images, chosen.model
     registered = sorted(number - 1 for number in model.reg_image_ids())
     _color(model, images)
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
-    counts, poses = tuple(other.num_reg_images() for other in models), inverse(world_to_camera)
-    reconstruction = Reconstruction(images, tuple(registered), poses, video.names, model, counts, chosen.correlation)
-    if reconstruction.left_out:
-        left_out = [path.name for path in reconstruction.left_out]
-        shown = ", ".join([*left_out[:10], *(["..."] if len(left_out) > 10 else [])])
-        log.warning("%d of %d images have no pose: %s", len(left_out), len(images), shown)
-        if len(models) > 1:
-            log.warning("the models have %s images; the largest is used", ", ".join(map(str, reconstruction.models)))
+    error = held_out_error(model, video.tracks) if video.tracks else None
+    poses = inverse(world_to_camera)
+    reconstruction = Reconstruction(
+        images, tuple(registered), poses, video.names, model, chosen.correlation, links, error
+    )
     if not chosen.is_lit_from_the_camera:
         log.warning(
-            "nearer points are not brighter (correlation of brightness with depth %s): the model may be reversed in "
-            "depth, or the lamp is not at the lens. Give the camera's calibration, or other frames",
+            "images %s to %s: nearer points are not brighter (correlation of brightness with depth %s): the model may "
+            "be reversed in depth, or the lamp is not at the lens. Give the camera's calibration, or other frames",
+            images[registered[0]].name,
+            images[registered[-1]].name,
             "unknown" if chosen.correlation is None else f"{chosen.correlation:.2f}",
         )
     return reconstruction

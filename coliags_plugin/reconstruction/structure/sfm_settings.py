@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
@@ -48,6 +50,37 @@ class CameraSettings(Settings):
         return self
 
 
+class TrackSettings(Settings):
+    """Options of point tracks."""
+
+    side: int = Field(
+        default=384, ge=64, description="Larger side of the images that are tracked, pixels; larger ones are reduced."
+    )
+    corners: int = Field(default=1400, ge=100, description="Number of points followed, topped up in every frame.")
+    spacing: int = Field(default=6, ge=2, description="Least distance of a new corner from other points, pixels.")
+    quality: float = Field(
+        default=0.004, gt=0.0, lt=1.0, description="Least strength of a corner, relative to the strongest."
+    )
+    max_return: float = Field(
+        default=0.7, gt=0.0, description="Largest distance between a point and where following it back ends, pixels."
+    )
+    min_correlation: float = Field(
+        default=0.6, gt=-1.0, lt=1.0, description="Least normalised cross-correlation of 11 x 11 pixels around a point."
+    )
+    max_error: float = Field(
+        default=2.5, gt=0.0, description="RANSAC inlier threshold of the epipolar geometry of neighbours, pixels."
+    )
+    max_pair_error: float = Field(
+        default=2.0, gt=0.0, description="RANSAC inlier threshold of the two-view geometry of any two frames, pixels."
+    )
+    bridge_below: int = Field(
+        default=150,
+        ge=0,
+        description="Where fewer points survive, those lost are searched for again in the next frames; 0: never.",
+    )
+    longest_bridge: int = Field(default=4, ge=0, description="Number of frames in which lost points are searched for.")
+
+
 class SfmSettings(Settings):
     """Options of matching and incremental mapping."""
 
@@ -55,6 +88,13 @@ class SfmSettings(Settings):
     """Camera model and initial intrinsics, shared by all images."""
     features: FeatureSettings = FeatureSettings(max_features=6000, peak_threshold=0.002)
     """Feature extraction."""
+    matching: Literal["auto", "tracks", "features"] = Field(
+        default="auto",
+        description="What is matched: points tracked from frame to frame through a video, or SIFT features. auto: "
+        "features where neighbouring images have plenty of them in common, and where tracks do not hold either.",
+    )
+    tracks: TrackSettings = TrackSettings()
+    """Tracking of points."""
     exhaustive_up_to: int = Field(default=25, ge=0, description="Up to this many images are matched exhaustively.")
     min_alike: int = Field(
         default=12,

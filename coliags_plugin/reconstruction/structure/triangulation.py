@@ -201,7 +201,8 @@ def _triangulated(
     with tempfile.TemporaryDirectory() as scratch:
         database, output = Path(scratch) / "database.db", Path(scratch) / "model"
         output.mkdir()
-        write_database(database, cameras, images, features, matches, verified=True)
+        keypoints = [one.keypoints for one in features]
+        write_database(database, cameras, images, keypoints, matches, verified=True)
         return pycolmap.triangulate_points(model, str(database), scratch, str(output), True, options, False)
 
 

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
-from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
+from coliags_plugin.reconstruction.structure.features import feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
-from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images
+from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 if TYPE_CHECKING:
     import pycolmap
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +37,22 @@ class MatchedVideo:
     images: tuple[Path, ...]
     names: tuple[str, ...]  # in the model
     sizes: tuple[tuple[int, int], ...]  # width and height
-    features: tuple[Features, ...]
-    brightness: tuple[Float[np.ndarray, "K"], ...]  # at the features
+    keypoints: tuple[Float32[np.ndarray, "K D"], ...]
+    brightness: tuple[Float[np.ndarray, "K"], ...]  # at the keypoints
     matches: Matches
+    tracks: tuple[FramePoints, ...] = ()  # of each image, where matches are of tracks
+
+    def search_part(self, count: int) -> MatchedVideo:
+        """At most ``count`` images on which cameras are tried."""
+        return self._moving(count) if self.tracks else self.middle(count)
+
+    def _moving(self, count: int) -> MatchedVideo:
+        """Every second frame, or every one of a short video, of the stretch where points move and survive best."""
+        step = 2 if len(self.images) >= 2 * count else 1
+        good = [min(frame.followed / 300.0, 1.0) * min(frame.shift / 0.015, 1.0) for frame in self.tracks]
+        reach = min(step * count, len(good))
+        first = int(np.argmax(np.convolve(good, np.ones(reach), "valid")))
+        return self._part(list(range(first, first + reach, step))[:count])
 
     def middle(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle: every second or fourth, if there are enough.
@@ -43,7 +61,9 @@ class MatchedVideo:
         """
         step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
-        kept = list(range(first, len(self.images), step))[:count]
+        return self._part(list(range(first, len(self.images), step))[:count])
+
+    def _part(self, kept: list[int]) -> MatchedVideo:
         row_of = {index: row for row, index in enumerate(kept)}
         pick = itemgetter(*kept)  # of two or more, so that it gives tuples
         matches = {
@@ -52,7 +72,7 @@ class MatchedVideo:
             if one in row_of and other in row_of
         }
         return MatchedVideo(
-            pick(self.images), pick(self.names), pick(self.sizes), pick(self.features), pick(self.brightness), matches
+            pick(self.images), pick(self.names), pick(self.sizes), pick(self.keypoints), pick(self.brightness), matches
         )
 
     def mapped(self, settings: SfmSettings, start: Start, progress: Progress | None) -> list[pycolmap.Reconstruction]:
@@ -62,33 +82,106 @@ class MatchedVideo:
         named = [(name, kinds.index(size)) for name, size in zip(self.names, self.sizes, strict=True)]
         with tempfile.TemporaryDirectory() as scratch:
             database = Path(scratch) / "database.db"
-            write_database(database, cameras, named, self.features, self.matches, verified=False)
+            write_database(database, cameras, named, self.keypoints, self.matches, verified=False)
+            if self.tracks:
+                return map_tracks(database, Path(scratch) / "models", settings)
             return map_images(database, Path(scratch) / "models", settings, len(self.images), progress)
 
 
 def read_video(
     images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
 ) -> MatchedVideo:
-    """Find and match the features of a video's images."""
-    extract = feature_extractor(settings.features)
-    features, sizes, brightness = [], [], []
-    for path in with_progress(images, "find features", progress):
-        image, mask = read_image(path), mask_of(path, masks)
-        height, width = image.shape[:2]
-        if mask is not None and mask.shape != (height, width):
-            raise InputError(
-                f"the mask of {path} is {mask.shape[1]} x {mask.shape[0]}, the image {width} x {height}",
-                "a mask of the image's size",
-            )
-        features.append(extract(image, mask))
-        brightness.append(brightness_at(image, features[-1].pixels))
-        sizes.append((width, height))
+    """Match the images of a video, by tracks or by features; masks are False where a pixel is ignored."""
+    sizes = tuple(_size(path, mask_of(path, masks)) for path in images)
     starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
+    if _needs_tracks(images, sizes, settings, masks):
+        points = track_points(images, settings.tracks, masks, progress)
+        if settings.matching == "tracks" or np.median([frame.followed for frame in points]) >= _FOLLOWED:
+            return _tracked(images, sizes, points)
+        log.info("points cannot be followed from image to image: features are matched instead")
+    return _with_features(images, sizes, settings, masks, progress)
+
+
+#: Neighbouring images compared at most; matches of plenty of features; and the share of the pairs that must have them.
+_COMPARED, _PLENTY, _MOST = 24, 150, 0.9
+#: Fewest images of a video; and of points that are followed from frame to frame, in the median.
+_FEWEST_FRAMES, _FOLLOWED = 8, 60
+
+
+def _needs_tracks(
+    images: tuple[Path, ...], sizes: Sequence[tuple[int, int]], settings: SfmSettings, masks: Masks
+) -> bool:
+    """Whether points are to be tracked: as the settings say, or where neighbours have few features in common."""
+    if settings.matching != "auto" or len(images) < _FEWEST_FRAMES or len(set(sizes)) > 1:
+        return settings.matching == "tracks"
+    extract, strong = feature_extractor(settings.features), []
+    for first in np.unique(np.linspace(0, len(images) - 2, _COMPARED).round().astype(int)).tolist():
+        pair = [extract(read_image(path), mask_of(path, masks)) for path in images[first : first + 2]]
+        matches = mutual_matches(pair[0], pair[1], settings.max_ratio, settings.max_distance)
+        one, other = (features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True))
+        inliers = epipolar_inliers(one, other, sizes[first][::-1], settings.max_error)
+        strong.append(int(inliers.sum()) >= _PLENTY)
+    log.info("%d of %d pairs of neighbouring images have plenty of features in common", sum(strong), len(strong))
+    return float(np.mean(strong)) < _MOST
+
+
+def _size(path: Path, mask: Bool[np.ndarray, "H W"] | None) -> tuple[int, int]:
+    """Width and height of an image, the same as its mask's."""
+    height, width = read_image(path).shape[:2]
+    if mask is not None and mask.shape != (height, width):
+        raise InputError(
+            f"the mask of {path} is {mask.shape[1]} x {mask.shape[0]}, the image {width} x {height}",
+            "a mask of the image's size",
+        )
+    return width, height
+
+
+def _named(images: Sequence[Path]) -> tuple[str, ...]:
+    """Names in the model, which sort in the order of the images."""
+    names = file_names([path.stem for path in images], "")
+    return tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
+
+
+def _with_features(
+    images: tuple[Path, ...],
+    sizes: tuple[tuple[int, int], ...],
+    settings: SfmSettings,
+    masks: Masks,
+    progress: Progress | None,
+) -> MatchedVideo:
+    extract = feature_extractor(settings.features)
+    features, brightness = [], []
+    for path in with_progress(images, "find features", progress):
+        image = read_image(path)
+        features.append(extract(image, mask_of(path, masks)))
+        brightness.append(brightness_at(image, features[-1].pixels))
     pairs = alike_pairs(features, settings, progress)
     matches = {
         (first, second): mutual_matches(features[first], features[second], settings.max_ratio, settings.max_distance)
         for first, second in with_progress(pairs, "match features", progress)
     }
-    names = file_names([path.stem for path in images], "")
-    named = tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
-    return MatchedVideo(images, named, tuple(sizes), tuple(features), tuple(brightness), matches)
+    keypoints = tuple(one.keypoints for one in features)
+    return MatchedVideo(images, _named(images), sizes, keypoints, tuple(brightness), matches)
+
+
+#: Frames apart whose common tracks are matches, and fewest of them.
+_APART, _FEWEST_COMMON = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64), 15
+#: Fewest frames of a track that is used; of so many tracks one is kept for the test of the poses.
+_LEAST_LENGTH, TEST_EVERY = 3, 5
+
+
+def _tracked(
+    images: tuple[Path, ...], sizes: tuple[tuple[int, int], ...], points: Sequence[FramePoints]
+) -> MatchedVideo:
+    lengths = np.bincount(np.concatenate([frame.ids for frame in points]))
+    used = [(lengths[frame.ids] >= _LEAST_LENGTH) & (frame.ids % TEST_EVERY > 0) for frame in points]
+    ids = [frame.ids[rows] for frame, rows in zip(points, used, strict=True)]
+    matches = {}
+    for first in range(len(ids)):
+        for second in (first + apart for apart in _APART if first + apart < len(ids)):
+            _, one, other = np.intersect1d(ids[first], ids[second], assume_unique=True, return_indices=True)
+            if len(one) >= _FEWEST_COMMON:
+                matches[first, second] = np.stack([one, other], axis=1).astype(np.uint32)
+    keypoints = tuple(frame.pixels[rows] for frame, rows in zip(points, used, strict=True))
+    brightness = tuple(frame.brightness[rows].astype(np.float64) for frame, rows in zip(points, used, strict=True))
+    return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points))

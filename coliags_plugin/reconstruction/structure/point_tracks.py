@@ -1,0 +1,313 @@
+"""Point tracks through a video: corners of the wall's texture, followed from each frame to the next.
+
+Each corner is moved by two candidates, dense DIS flow refined by Lucas-Kanade and pyramidal Lucas-Kanade alone. Of
+those that come back when followed backwards, the one whose surroundings correlate better is kept, and both frames have
+to satisfy an epipolar geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
+
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
+from coliags_plugin.reconstruction.structure.mapping import brightness_at
+from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
+from coliags_plugin.reconstruction.structure.texture import correlation_at, sharpness, wall_textures
+
+
+@dataclass(frozen=True, eq=False)
+class FramePoints:
+    """Points that are followed, in one frame.
+
+    Attributes:
+        ids: Numbers of the tracks, ascending. [K]
+        pixels: Column and row in the frame, pixel centres at integers + 0.5. [K, 2]
+        brightness: Mean of red, green and blue around them, 0 to 255. [K]
+        followed: Number of points that came from the frame before.
+        shift: Their median displacement, as a share of the larger side.
+        sharpness: Of the frame (:func:`sharpness`).
+    """
+
+    ids: Int64[np.ndarray, "K"]
+    pixels: Float32[np.ndarray, "K 2"]
+    brightness: Float32[np.ndarray, "K"]
+    followed: int
+    shift: float
+    sharpness: float
+
+    def with_points(self, other: FramePoints) -> FramePoints:
+        """These points and others of the same frame, whose track numbers are larger."""
+        return replace(
+            self,
+            ids=np.concatenate([self.ids, other.ids]),
+            pixels=np.concatenate([self.pixels, other.pixels]),
+            brightness=np.concatenate([self.brightness, other.brightness]),
+        )
+
+
+def track_points(
+    images: Sequence[Path], settings: TrackSettings, masks: Masks = None, progress: Progress | None = None
+) -> list[FramePoints]:
+    """Follow points through the frames of a video, of one size and in order; a few frames are held at a time.
+
+    Around frames in which most points are lost, corners are also followed backwards: what is seen well after a fast
+    turn is often found in the blurred frames before it.
+
+    Args:
+        images: Files of the frames.
+        settings: Of tracking.
+        masks: False where a pixel is ignored; one for all frames, or one per frame.
+        progress: Progress callback.
+
+    Raises:
+        InputError: A frame cannot be read.
+    """
+    forward = _Tracker(settings)
+    points = []
+    for done, path in enumerate(images, start=1):
+        points.append(forward.advance(read_image(path), mask_of(path, masks)))
+        if progress is not None:
+            progress("track points", done, len(images))
+    stretches = _around([frame.followed for frame in points], settings)
+    next_id = forward.next_id
+    for done, stretch in enumerate(stretches, start=1):
+        backward = _Tracker(settings, next_id)
+        for index in reversed(stretch):
+            found = backward.advance(read_image(images[index]), mask_of(images[index], masks))
+            points[index] = points[index].with_points(found)
+        next_id = backward.next_id
+        if progress is not None:
+            progress("track backwards", done, len(stretches))
+    return points
+
+
+def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
+    """Stretches of frames around those in which few points survive."""
+    near = np.zeros(len(followed), bool)
+    for index, count in enumerate(followed):
+        if index and count < settings.bridge_below:
+            near[max(0, index - 2 * settings.longest_bridge) : index + 2 * settings.longest_bridge] = True
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]])))
+    return [range(first, end) for first, end in edges.reshape(-1, 2).tolist()]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Textures of one reduced image, the points in it (pixel centres at integers), and frames since it was seen."""
+
+    detail: UInt8[np.ndarray, "h w"]
+    folds: UInt8[np.ndarray, "h w"]
+    usable: Bool[np.ndarray, "h w"]
+    ids: Int64[np.ndarray, "K"]
+    pixels: Float32[np.ndarray, "K 2"]
+    age: int = 0
+
+    def only(self, kept: Int64[np.ndarray, "N"] | Bool[np.ndarray, "K"]) -> _View:
+        """The view with some of its points, in the order given."""
+        return replace(self, ids=self.ids[kept], pixels=self.pixels[kept])
+
+    def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Float32[np.ndarray, "N 2"]) -> _View:
+        """The view with further points."""
+        return replace(self, ids=np.concatenate([self.ids, ids]), pixels=np.concatenate([self.pixels, pixels]))
+
+
+class _Tracker:
+    """State between frames: the last view, and views before frames in which most points were lost."""
+
+    def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
+        import cv2
+
+        self.settings = settings
+        self.flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self.flow.setFinestScale(1)
+        self.last: _View | None = None
+        self.bridges: list[_View] = []
+        self.next_id = first_id
+
+    def advance(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> FramePoints:
+        """Follow the points into the next image, and add corners."""
+        import cv2
+
+        scale = min(1.0, self.settings.side / max(image.shape[:2]))
+        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+        small = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        if mask is not None and scale < 1.0:
+            mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        view = _View(*wall_textures(small, mask), np.empty(0, np.int64), np.empty((0, 2), np.float32))
+        shift = 0.0
+        if self.last is not None:
+            kept, moved = self._followed(self.last, view, 0.0)
+            shift = _median_length(moved - self.last.pixels[kept]) / max(size)
+            view = view.with_points(self.last.ids[kept], moved)
+            self._bridge_later(self.last, len(kept))
+            view = self._bridged(view)
+        view = _without_collisions(view)
+        followed = len(view.ids)
+        view = self._with_corners(view)
+        self.last = view
+        stretch = np.array([image.shape[1] / size[0], image.shape[0] / size[1]], np.float32)
+        order = np.argsort(view.ids)
+        pixels = (view.pixels[order] + 0.5) * stretch
+        brightness = brightness_at(image, pixels.astype(np.float64)).astype(np.float32)
+        sharp = sharpness(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY))
+        return FramePoints(view.ids[order], pixels, brightness, followed, shift, sharp)
+
+    def _followed(
+        self, before: _View, after: _View, least_share: float
+    ) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+        """Indices of the points of one view that are found in another one, and where.
+
+        All or none: of those that come back, the share that satisfies an epipolar geometry is at least ``least_share``.
+        """
+        none = np.empty(0, np.int64), np.empty((0, 2), np.float32)
+        if not len(before.ids):
+            return none
+        flows = self.flow.calc(before.folds, after.folds, None), self.flow.calc(after.folds, before.folds, None)
+        moved, scores = before.pixels.copy(), np.full(len(before.ids), -1.0, np.float32)
+        for guess in (flows, None):
+            # The second candidate is for points that the first has not clearly found.
+            rows = np.flatnonzero(scores < _CLEAR)
+            start = before.pixels[rows]
+            if not len(rows):
+                break
+            candidate, returned = _there_and_back(before.detail, after.detail, start, guess)
+            column, row = np.clip(np.rint(candidate), 0, np.array(after.detail.shape[::-1]) - 1).astype(np.int64).T
+            found = np.linalg.norm(returned - start, axis=1) < self.settings.max_return
+            correlation = correlation_at(before.detail, after.detail, start, candidate)
+            score = np.where(found & after.usable[row, column], correlation, -1.0)
+            better = score > scores[rows]
+            moved[rows[better]], scores[rows[better]] = candidate[better], score[better]
+        alike = np.flatnonzero(scores > self.settings.min_correlation)
+        consistent = epipolar_inliers(before.pixels[alike], moved[alike], after.detail.shape, self.settings.max_error)
+        kept = alike[consistent]
+        return none if len(kept) < least_share * len(alike) else (kept, moved[kept].astype(np.float32))
+
+    def _bridge_later(self, before: _View, followed: int) -> None:
+        """Keep the view before a frame in which most points were lost, for the frames after it."""
+        aged = [replace(bridge, age=bridge.age + 1) for bridge in self.bridges]
+        self.bridges = [bridge for bridge in aged if bridge.age <= self.settings.longest_bridge]
+        if followed < self.settings.bridge_below:
+            self.bridges.append(before)
+
+    def _bridged(self, view: _View) -> _View:
+        """The view with points that were lost in one of the frames before and are found again."""
+        for bridge in self.bridges:
+            if bridge.age == 0:
+                continue
+            lost = ~np.isin(bridge.ids, view.ids)
+            before = bridge.only(lost)
+            kept, moved = self._followed(before, view, _BRIDGE_SHARE)
+            view = view.with_points(before.ids[kept], moved)
+        return view
+
+    def _with_corners(self, view: _View) -> _View:
+        """The view with new points where there are few."""
+        import cv2
+
+        missing = self.settings.corners - len(view.ids)
+        if missing <= 0:
+            return view
+        free = view.usable.astype(np.uint8)
+        for column, row in np.rint(view.pixels).astype(int).tolist():
+            cv2.circle(free, (column, row), self.settings.spacing, 0, -1)
+        corners = cv2.goodFeaturesToTrack(
+            view.detail, missing, self.settings.quality, self.settings.spacing, mask=free, blockSize=7
+        )
+        if corners is None:
+            return view
+        ids = np.arange(self.next_id, self.next_id + len(corners))
+        self.next_id += len(corners)
+        return view.with_points(ids, corners.reshape(-1, 2))
+
+
+def _without_collisions(view: _View) -> _View:
+    """The view without points that have met an older one."""
+    order = np.argsort(view.ids)
+    cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)
+    _, first = np.unique(cells[:, 1] * 100_000 + cells[:, 0], return_index=True)
+    return view.only(order[np.sort(first)])
+
+
+def _median_length(vectors: Float32[np.ndarray, "K 2"]) -> float:
+    return float(np.median(np.linalg.norm(vectors, axis=1))) if len(vectors) else 0.0
+
+
+def _there_and_back(
+    before: UInt8[np.ndarray, "h w"],
+    after: UInt8[np.ndarray, "h w"],
+    pixels: Float32[np.ndarray, "K 2"],
+    flows: tuple[Float32[np.ndarray, "h w 2"], Float32[np.ndarray, "h w 2"]] | None,
+) -> tuple[Float32[np.ndarray, "K 2"], Float32[np.ndarray, "K 2"]]:
+    """Points followed by Lucas-Kanade, from dense flow or from coarse to fine; and followed back, infinity if lost."""
+    import cv2
+
+    options: dict[str, Any] = {"winSize": (21, 21), "criteria": (3, 20, 0.02), "maxLevel": 3 if flows is None else 1}
+    ends = []
+    status = np.ones(len(pixels), bool)
+    start = pixels
+    for index, (one, other) in enumerate(((before, after), (after, before))):
+        guess = None
+        if flows is not None:
+            guess = start + _sampled(flows[index], start)
+            options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+        end, known, _ = cv2.calcOpticalFlowPyrLK(one, other, start, guess, **options)
+        status &= known.ravel() > 0
+        ends.append(end)
+        start = end
+    limit = np.array(after.shape[::-1], np.float32) - 6.0
+    status &= ((ends[0] > 5.0) & (ends[0] < limit)).all(axis=1)
+    return ends[0], np.where(status[:, None], ends[1], np.float32(np.inf))
+
+
+def _sampled(flow: Float32[np.ndarray, "h w 2"], pixels: Float32[np.ndarray, "K 2"]) -> Float32[np.ndarray, "K 2"]:
+    import cv2
+
+    channels = [cv2.remap(flow[..., k], pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR).ravel() for k in (0, 1)]
+    return np.stack(channels, axis=1)
+
+
+#: Correlation from which a point is clearly found.
+_CLEAR = 0.8
+#: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring
+#: frames its error hardly matters.
+_TYPICAL_FOCAL_FACTOR = 0.6
+#: Least share of the points found again over a gap that satisfy one epipolar geometry.
+_BRIDGE_SHARE = 0.4
+#: Fewest matches for an epipolar geometry.
+_FEWEST = 15
+
+
+def epipolar_inliers(
+    first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"], shape: tuple[int, ...], max_error: float
+) -> Bool[np.ndarray, "K"]:
+    """Matches that satisfy one essential matrix of a typical endoscope; none where there are fewer than 15. [K]
+
+    Args:
+        first: Column and row, pixel centres at integers.
+        second: The same points in the other image.
+        shape: Height and width of both images.
+        max_error: RANSAC inlier threshold, pixels.
+    """
+    import pycolmap
+
+    inliers = np.zeros(len(first), bool)
+    if len(first) < _FEWEST:
+        return inliers
+    height, width = shape[:2]
+    camera = pycolmap.Camera.create_from_model_name(
+        0, "SIMPLE_RADIAL_FISHEYE", _TYPICAL_FOCAL_FACTOR * max(width, height), width, height
+    )
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = max_error, 0
+    matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
+    one, other = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(camera, one, camera, other, matches, options)
+    inliers[np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
+    return inliers

@@ -1,0 +1,142 @@
+"""Sub-maps of a video: weak places, parts of models, tests by held-out tracks, and what is written."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
+from coliags_plugin.reconstruction.structure.atlas import Link, held_out_error, part_of, weak_links
+from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
+from coliags_plugin.reconstruction.structure.image_files import list_images
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
+from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
+from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
+from coliags_plugin.reconstruction.structure.video import TEST_EVERY
+from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+
+#: Frames, the one after which most points change, and points seen from both sides of it.
+COUNT, GAP, COMMON = 8, 3, 9
+TRACKED = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS), matching="tracks")
+
+
+def seen_points(shift=0.0):
+    """A posed model: 40 points on either side of a gap, and a few seen from both, ``shift`` mm farther after it."""
+    frames = tube_frames(COUNT, 3.0, (16, 12))
+    frames = [replace(frame, camera=frame.camera.resized(160, 128)) for frame in frames]
+    rng = np.random.default_rng(0)
+    positions = np.stack([*rng.uniform(-8, 8, (2, 80 + COMMON)), rng.uniform(45, 58, 80 + COMMON)], axis=1)
+    sides = np.repeat([0, 1, 2], [40, 40, COMMON])
+    observed = []
+    for index, frame in enumerate(frames):
+        after = index > GAP
+        numbers = np.flatnonzero((sides == 2) | (sides == after))
+        pose = frame.camera.camera_to_world.double().numpy()
+        moved = positions[numbers] + np.where(((sides[numbers] == 2) & after)[:, None], [0.0, 0.0, shift], 0.0)
+        local = (moved - pose[:3, 3]) @ pose[:3, :3]
+        fx, fy, cx, cy = INTRINSICS
+        observed.append(SeenPoints(local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy), numbers))
+    model = frame_model(frames)
+    add_points(model, observed, positions, np.zeros((len(positions), 3), np.uint8), np.ones(len(positions)))
+    return model, observed
+
+
+def test_a_model_is_weak_where_few_points_are_common():
+    (link,) = weak_links(seen_points()[0])
+    assert (link.after, link.points) == (GAP, COMMON)
+    assert link.log_scale == pytest.approx(0.0, abs=1e-6)
+    assert link.holds
+    assert f"{COMMON} points seen from both sides" in link.reason
+
+
+def test_sides_of_another_scale_do_not_hold_together():
+    (link,) = weak_links(seen_points(shift=25.0)[0])
+    assert link.log_scale > 0.3
+    assert not link.holds
+
+
+def test_too_few_common_points_tell_no_scale():
+    assert [Link(0, points, None, None).holds for points in (7, 8)] == [False, True]
+    assert "too few to compare" in Link(0, 3, None, None).reason
+    assert not Link(0, 9, 0.0, 0.2).holds
+
+
+def test_a_part_has_its_frames_and_the_points_they_see():
+    model, _ = seen_points()
+    part = part_of(model, range(GAP + 1))
+    assert sorted(part.reg_image_ids()) == list(range(1, GAP + 2))
+    assert part.num_points3D() == 40 + COMMON
+    assert model.num_reg_images() == COUNT
+    for number in part.reg_image_ids():
+        np.testing.assert_array_equal(
+            part.images[number].cam_from_world().matrix(), model.images[number].cam_from_world().matrix()
+        )
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_held_out_tracks_measure_the_poses(noise):
+    model, observed = seen_points()
+    rng = np.random.default_rng(0)
+    tracks = [
+        FramePoints(
+            TEST_EVERY * points.points,
+            (points.pixels + rng.normal(0.0, noise, points.pixels.shape)).astype(np.float32),
+            np.zeros(len(points.points), np.float32),
+            followed=9,
+            shift=0.0,
+            sharpness=1.0,
+        )
+        for points in observed
+    ]
+    error = held_out_error(model, tracks)
+    # The median length of a normal vector in the plane is 1.18; part of the noise is fitted by the point.
+    assert error == pytest.approx(1.0 * noise, abs=0.25 if noise else 1e-3)
+    assert held_out_error(model, [replace(frame, ids=frame.ids + 1) for frame in tracks]) is None
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    return reconstruct(list_images(write_tube(tmp_path_factory.mktemp("tube") / "scene", 8, 2.0) / "images"), TRACKED)
+
+
+def test_tracks_give_every_frame_a_pose(tracked):
+    assert tracked.lost == {}
+    assert tracked.largest.registered == tuple(range(8))
+    assert tracked.largest.test_error < 0.6
+    assert tracked.submaps() == [(0, range(8))]
+
+
+def test_the_atlas_is_written(tracked, tmp_path):
+    half = replace(
+        tracked.largest, registered=(4, 5, 6), camera_to_world=tracked.largest.camera_to_world[4:7], links=()
+    )
+    first = replace(tracked.largest, registered=(0, 1, 2, 3), links=(Link(1, 9, 0.0, 0.01),))
+    atlas = Atlas(tracked.images, (first, half), {7: "blurred"}, (Link(3, 2, None, None),))
+    write_sfm_scene(tmp_path / "scene", atlas)
+    record = json.loads((tmp_path / "scene" / "atlas.json").read_text())
+    assert [(submap["model"], submap["frames"]) for submap in record["submaps"]] == [
+        ("sparse/0", [0, 1]),
+        ("sparse/0", [2, 3]),
+        ("sparse/1", [4, 5, 6]),
+    ]
+    assert [(join["after"], join["joined"]) for join in record["joins"]] == [(1, True), (3, False)]
+    assert record["lost"] == [{"frame": 7, "reason": "blurred"}]
+    assert record["frames"] == [path.name for path in tracked.images]
+    assert pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "1")).num_reg_images() == 8
+    np.testing.assert_array_equal(read_rgb(tmp_path / "scene" / "atlas.png"), draw_ribbon(atlas))
+
+
+def test_the_ribbon_has_a_colour_for_every_model(tracked):
+    halves = (replace(tracked.largest, registered=(0, 1, 2, 3)), replace(tracked.largest, registered=(4, 5, 6)))
+    ribbon = draw_ribbon(Atlas(tracked.images, halves, {7: "blurred"}))
+    row = ribbon[75, 20:1180]
+    colors = [tuple(int(value) for value in row[int((frame + 0.2) * 1160 / 8)]) for frame in range(8)]
+    assert len(set(colors[:4])) == len(set(colors[4:7])) == 1
+    assert len({colors[0], colors[4], colors[7]}) == 3

@@ -1,0 +1,111 @@
+"""Points followed through a video."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reconstruction.structure.point_tracks import epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
+from coliags_plugin.reconstruction.structure.texture import wall_textures
+from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
+
+#: Displacement of every pixel per frame, column and row.
+SHIFT = np.array([1.4, -0.7])
+COUNT = 7
+FEW = TrackSettings(corners=150)
+
+
+def wall(offset=(0.0, 0.0), size=(120, 160)):
+    """A textured wall, moved by an offset."""
+    noise = np.random.default_rng(0).normal(size=(60, 70)).cumsum(axis=0).cumsum(axis=1)
+    noise = (noise - noise.mean()) / noise.std()
+    grain = np.random.default_rng(1).normal(size=(60, 70))
+    row, column = np.mgrid[: size[0], : size[1]].astype(float)
+    at = np.stack([(row - offset[1]) / 3.0 + 8.0, (column - offset[0]) / 3.0 + 8.0])
+    value = 120.0 + 20.0 * map_coordinates(noise, at, order=3) + 15.0 * map_coordinates(grain, at, order=3)
+    return np.repeat(np.clip(value, 10, 230).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def write_video(folder, images):
+    folder.mkdir()
+    for index, image in enumerate(images):
+        write_png(folder / f"{index}.png", image)
+    return sorted(folder.iterdir())
+
+
+def moved(frames, first, second):
+    """Displacements of the points that two frames have in common."""
+    one, other = frames[first], frames[second]
+    _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
+    return other.pixels[b] - one.pixels[a]
+
+
+def test_points_move_as_the_image_does(tmp_path):
+    frames = track_points(write_video(tmp_path / "video", [wall(k * SHIFT) for k in range(COUNT)]), FEW)
+    assert [frame.followed > 80 for frame in frames] == [False] + [True] * (COUNT - 1)
+    shifts = moved(frames, 0, COUNT - 1)
+    assert len(shifts) > 60
+    np.testing.assert_allclose(np.median(shifts, axis=0), (COUNT - 1) * SHIFT, atol=0.1)
+    assert np.percentile(np.linalg.norm(shifts - (COUNT - 1) * SHIFT, axis=1), 90) < 0.5
+    assert frames[3].shift == pytest.approx(np.linalg.norm(SHIFT) / 160, rel=0.05)
+
+
+def test_larger_images_are_reduced_and_pixels_are_theirs(tmp_path):
+    images = [np.repeat(np.repeat(wall(k * SHIFT), 2, axis=0), 2, axis=1) for k in range(2)]
+    frames = track_points(write_video(tmp_path / "video", images), FEW.model_copy(update={"side": 160}))
+    np.testing.assert_allclose(np.median(moved(frames, 0, 1), axis=0), 2 * SHIFT, atol=0.15)
+
+
+def test_points_are_found_again_behind_a_covered_frame(tmp_path):
+    images = [wall(k * SHIFT) for k in range(COUNT)]
+    images[3] = np.full_like(images[3], 90)
+    frames = track_points(write_video(tmp_path / "video", images), FEW)
+    assert frames[3].followed == 0
+    assert frames[3].sharpness == 0.0
+    shifts = moved(frames, 2, 4)
+    assert len(shifts) > 50
+    np.testing.assert_allclose(np.median(shifts, axis=0), 2 * SHIFT, atol=0.1)
+
+
+def test_masked_pixels_have_no_points(tmp_path):
+    mask = np.ones((120, 160), bool)
+    mask[:, 80:] = False
+    frames = track_points(write_video(tmp_path / "video", [wall(), wall(SHIFT)]), FEW, mask)
+    assert all(frame.pixels[:, 0].max() < 80 for frame in frames)
+
+
+def test_the_same_frames_give_the_same_tracks(tmp_path):
+    paths = write_video(tmp_path / "video", [wall(k * SHIFT) for k in range(3)])
+    one, other = (track_points(paths, FEW)[-1] for _ in range(2))
+    np.testing.assert_array_equal(one.ids, other.ids)
+    np.testing.assert_array_equal(one.pixels, other.pixels)
+
+
+def test_the_lamp_drops_out_of_the_texture():
+    row = np.linspace(0.4, 1.0, 120)[:, None, None]
+    bright, dim = wall(), np.clip(wall() * row, 0, 255).astype(np.uint8)
+    inner = slice(20, -20)
+    for one, other in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
+        assert np.corrcoef(one[inner, inner].ravel(), other[inner, inner].ravel())[0, 1] > 0.95
+
+
+def test_points_that_fit_no_motion_are_outliers():
+    """Points of a tube, seen from two poses; a fifth of them moved elsewhere."""
+    first, second = tube_frames(2, 4.0)
+    rng = np.random.default_rng(0)
+    pixels = np.stack([rng.uniform(8, WIDTH - 8, 200), rng.uniform(8, HEIGHT - 8, 200)], axis=1)
+    fx, fy, cx, cy = INTRINSICS
+    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(200)], axis=1)
+    depth = first.depth.numpy()[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    one, other = (frame.camera.camera_to_world.double().numpy() for frame in (first, second))
+    local = ((rays * depth[:, None]) @ one[:3, :3].T + one[:3, 3] - other[:3, 3]) @ other[:3, :3]
+    moved_to = local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy)
+    wrong = np.arange(200) % 5 == 0
+    moved_to[wrong] += rng.choice([-25.0, 25.0], (wrong.sum(), 2))
+    inliers = epipolar_inliers(pixels - 0.5, moved_to - 0.5, (HEIGHT, WIDTH), 2.5)
+    assert inliers[~wrong].mean() > 0.95
+    assert inliers[wrong].mean() < 0.3
+    assert not epipolar_inliers(pixels[:14], moved_to[:14], (HEIGHT, WIDTH), 2.5).any()
