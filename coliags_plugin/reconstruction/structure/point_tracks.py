@@ -69,7 +69,7 @@ def track_points(
     Raises:
         InputError: A frame cannot be read.
     """
-    forward = _Tracker(settings)
+    forward = _PointTracker(settings)
     points = []
     for done, path in enumerate(images, start=1):
         points.append(forward.advance(read_image(path), mask_of(path, masks)))
@@ -78,7 +78,7 @@ def track_points(
     stretches = _around([frame.followed for frame in points], settings)
     next_id = forward.next_id
     for done, stretch in enumerate(stretches, start=1):
-        backward = _Tracker(settings, next_id)
+        backward = _PointTracker(settings, next_id)
         for index in reversed(stretch):
             found = backward.advance(read_image(images[index]), mask_of(images[index], masks))
             points[index] = points[index].with_points(found)
@@ -118,7 +118,7 @@ class _View:
         return replace(self, ids=np.concatenate([self.ids, ids]), pixels=np.concatenate([self.pixels, pixels]))
 
 
-class _Tracker:
+class _PointTracker:
     """State between frames: the last view, and views before frames in which most points were lost."""
 
     def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
