@@ -80,8 +80,8 @@ def file_server():
 
         def send(self, data):
             try:
+                state.sent += len(data)  # before the client can have it all and look
                 self.wfile.write(data)
-                state.sent += len(data)
             except OSError:  # the client is gone
                 pass
 
