@@ -194,11 +194,10 @@ def test_the_middle_of_a_video_is_matched_too(count):
     pairs = alike_pairs(features, SfmSettings())
     names = tuple(map(str, range(count)))
     matches = {pair: np.zeros((0, 2), np.uint32) for pair in pairs}
-    whole = MatchedVideo(
-        tuple(map(Path, names)), names, ((8, 8),) * count, tuple(features), (np.zeros(0),) * count, matches
-    )
-    part = whole.middle(24)
-    assert len(part.images) == len(part.features) == 24
+    keypoints = tuple(one.keypoints for one in features)
+    whole = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * count, keypoints, (np.zeros(0),) * count, matches)
+    part = whole.search_part(24)
+    assert len(part.images) == len(part.keypoints) == 24
     steps = {second - first for first, second in part.matches}
     assert {1, 2, 4} <= steps
     indices = [int(name) for name in part.names]
