@@ -133,7 +133,7 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, 
 
 
 def _json_value(value: Any) -> Any:
-    """Dataclasses as mappings, and what is not finite as None."""
+    """The value as JSON takes it: dataclasses become mappings, numbers that are not finite None."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, dict):

@@ -22,7 +22,7 @@ _BINS = 10
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors over the pixels that have both an estimate and a truth; None where there are none."""
+    """Relative depth errors of an estimate over the pixels that have a truth; None without such pixels."""
 
     pixels: int  # their number
     coverage: float  # share of the truth's pixels that have an estimate
@@ -36,7 +36,7 @@ class DepthErrors:
 
 @dataclass(frozen=True)
 class Band:
-    """Errors over the pixels whose true depth is in [low, high), units of the truth."""
+    """Depth errors of the pixels with a true depth in [low, high), units of the truth."""
 
     low: float
     high: float
@@ -45,7 +45,7 @@ class Band:
 
 @dataclass(frozen=True)
 class ConfidenceBin:
-    """Pixels whose confidence is in [low, high), the last bin with its upper end; [0, 0] where it is 0."""
+    """Stated confidence of one bin of pixels and the accuracy observed there; bins are [low, high), the last closed."""
 
     low: float  # ends of the bin
     high: float
@@ -89,7 +89,7 @@ def median_scale(samples: Samples) -> float:
 
 
 def pooled(parts: Sequence[Samples | None]) -> Samples | None:
-    """Samples of several frames as one, None without any; where only some have confidence, that of the others is 0."""
+    """Samples of several frames concatenated, None without any; where only some have confidence, others count as 0."""
     there = [part for part in parts if part is not None and len(part.true)]
     if not there:
         return None

@@ -79,7 +79,7 @@ def sparse_samples(estimate: FrameDepth, truth: FrameDepth) -> Samples | None:
 
 
 def check_same_view(name: str, estimate: FrameDepth, truth: FrameDepth) -> None:
-    """Refuse two maps of one frame whose aspect ratios or cameras differ, if at different sizes."""
+    """Raise InputError if an estimate and its truth differ in aspect ratio or, apart from their sizes, in camera."""
     (width, height), (true_width, true_height) = estimate.size, truth.size
     if abs(width * true_height / (height * true_width) - 1.0) > _SAME_ASPECT:
         raise InputError(

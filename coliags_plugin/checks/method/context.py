@@ -26,7 +26,7 @@ SEED = 0
 
 @dataclass
 class CheckContext:
-    """What the checks of one method share. A check may use what the checks that it needs have filled in."""
+    """Inputs of the checks of a method, and intermediate results that one check leaves for those that need it."""
 
     method: str  # name or path of the method config
     overrides: tuple[str, ...]  # the user's ``key.path=value`` assignments

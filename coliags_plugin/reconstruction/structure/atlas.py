@@ -58,26 +58,28 @@ class Link:
 def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
     """Places of a model, image i having ID i + 1, at which few points are seen from both sides."""
     frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
-    first, last = _spans(model)
+    points, first, last = _spans(model)
     links = []
     for after, before in zip(frames[:-1].tolist(), frames[1:].tolist(), strict=True):
         common = np.flatnonzero((first <= after) & (last >= before))
         if len(common) < _STRONG_LINK:
-            links.append(_measured(model, after, common))
+            links.append(_measured(model, after, points[common].tolist()))
     return links
 
 
-def _spans(model: pycolmap.Reconstruction) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
-    """First and last frame of each point, by ascending point ID."""
-    seen = [[element.image_id for element in model.points3D[point].track.elements] for point in sorted(model.points3D)]
-    return np.array([min(ids) for ids in seen]) - 1, np.array([max(ids) for ids in seen]) - 1
+def _spans(
+    model: pycolmap.Reconstruction,
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+    """IDs of the points, ascending, and the first and last frame of each."""
+    points = sorted(model.points3D)
+    seen = [[element.image_id for element in model.points3D[point].track.elements] for point in points]
+    return np.array(points), np.array([min(ids) for ids in seen]) - 1, np.array([max(ids) for ids in seen]) - 1
 
 
-def _measured(model: pycolmap.Reconstruction, after: int, common: Int[np.ndarray, "C"]) -> Link:
-    """The link, with the ratio of the depths of points triangulated from either side alone."""
-    numbers = np.array(sorted(model.points3D))[common]
+def _measured(model: pycolmap.Reconstruction, after: int, common: Sequence[int]) -> Link:
+    """The link by points seen from both sides, with the ratio of their depths triangulated from either side alone."""
     ratios = []
-    for point in numbers.tolist():
+    for point in common:
         sides: tuple[list[Any], list[Any]] = ([], [])
         for element in model.points3D[point].track.elements:
             sides[element.image_id - 1 > after].append(_ray(model, element.image_id, element.point2D_idx))

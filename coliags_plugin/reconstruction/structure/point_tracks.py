@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
@@ -71,20 +71,16 @@ def track_points(
     """
     forward = _PointTracker(settings)
     points = []
-    for done, path in enumerate(images, start=1):
+    for path in with_progress(images, "track points", progress):
         points.append(forward.advance(read_image(path), mask_of(path, masks)))
-        if progress is not None:
-            progress("track points", done, len(images))
     stretches = _around([frame.followed for frame in points], settings)
     next_id = forward.next_id
-    for done, stretch in enumerate(stretches, start=1):
+    for stretch in with_progress(stretches, "track backwards", progress):
         backward = _PointTracker(settings, next_id)
         for index in reversed(stretch):
             found = backward.advance(read_image(images[index]), mask_of(images[index], masks))
             points[index] = points[index].with_points(found)
         next_id = backward.next_id
-        if progress is not None:
-            progress("track backwards", done, len(stretches))
     return points
 
 

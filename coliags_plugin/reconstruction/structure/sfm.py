@@ -69,7 +69,7 @@ class Reconstruction:
 class Atlas:
     """Models of a video, each in a frame and scale of its own, and the images that none has.
 
-    ``refused`` are the places at which a model was split, because the scales of its sides differ or cannot be compared.
+    ``refused`` are the places at which a model was split: too few points link its sides, or their scales differ.
     """
 
     images: tuple[Path, ...]  # all input images, in order
@@ -163,8 +163,11 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
             if len(part) < settings.min_model_size:
                 continue
             held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
-            model = part_of(hypothesis.model, part.tolist()) if broken else hypothesis.model
-            found.append(_result(video, Hypothesis.of(model, video.brightness), held))
+            if broken:
+                one = Hypothesis.of(part_of(hypothesis.model, part.tolist()), video.brightness)
+            else:
+                one = hypothesis
+            found.append(_result(video, one, held))
     found.sort(key=lambda one: -len(one.registered))
     posed = {index for one in found for index in one.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}

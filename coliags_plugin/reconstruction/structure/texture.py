@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from coliags_plugin.core.morphology import dilated
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights
 
 #: Brightness, of 255, that is added before the logarithm, so that noise in the dark is not amplified without bound.
@@ -36,7 +37,7 @@ def wall_textures(
     """
     import cv2
 
-    glints = _grown(highlights(image, FeatureSettings()), _MARGIN)
+    glints = dilated(highlights(image, FeatureSettings()), _MARGIN)
     excluded = glints if mask is None else glints | ~mask
     log = np.log(0.7 * image[..., 1].astype(np.float32) + 0.3 * image[..., 0] + _DARK_OFFSET)
     weight = (~excluded).astype(np.float32)
@@ -44,7 +45,7 @@ def wall_textures(
     log = cv2.GaussianBlur(np.where(excluded, around, log), (0, 0), _DENOISING)
     detail, deviation = _normalised(log, _DETAIL)
     flat = (deviation < _NOISE) | (image[..., 1] > _OVEREXPOSED) | (image.max(axis=2) < _BLACK)
-    usable = ~(excluded | _grown(flat, _MARGIN))
+    usable = ~(excluded | dilated(flat, _MARGIN))
     usable[:_EDGE] = usable[-_EDGE:] = usable[:, :_EDGE] = usable[:, -_EDGE:] = False
     return detail, _normalised(log, _FOLDS)[0], usable
 
@@ -90,9 +91,7 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     """
     import cv2
 
-    size = 2 * _HIGHLIGHT_MARGIN + 1
-    highlight = cv2.dilate((gray >= _HIGHLIGHT).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-    counted = ~highlight
+    counted = ~dilated(gray >= _HIGHLIGHT, _HIGHLIGHT_MARGIN)
     brightness = float(gray[counted].mean()) if counted.any() else 0.0
     if brightness == 0.0:
         return 0.0
@@ -111,9 +110,3 @@ def _patches(texture: np.ndarray, at: np.ndarray, reach: int) -> Float32[np.ndar
         for part in np.array_split(at.astype(np.float32), len(at) // 30_000 + 1)
     ]
     return np.concatenate(parts)
-
-
-def _grown(mask: Bool[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
-    import cv2
-
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0

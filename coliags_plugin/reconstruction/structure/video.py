@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Float32
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
-from coliags_plugin.reconstruction.structure.features import feature_extractor
+from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
@@ -44,7 +45,7 @@ class MatchedVideo:
 
     def search_part(self, count: int) -> MatchedVideo:
         """At most ``count`` images on which cameras are tried."""
-        return self._moving(count) if self.tracks else self.middle(count)
+        return self._moving(count) if self.tracks else self._middle(count)
 
     def _moving(self, count: int) -> MatchedVideo:
         """Every second frame, or every one of a short video, of the stretch where points move and survive best."""
@@ -54,7 +55,7 @@ class MatchedVideo:
         first = int(np.argmax(np.convolve(good, np.ones(reach), "valid")))
         return self._part(list(range(first, first + reach, step))[:count])
 
-    def middle(self, count: int) -> MatchedVideo:
+    def _middle(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle: every second or fourth, if there are enough.
 
         These are matched like all (:func:`alike_pairs`).
@@ -92,31 +93,41 @@ def read_video(
     images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
 ) -> MatchedVideo:
     """Match the images of a video, by tracks or by features; masks are False where a pixel is ignored."""
+    # Before the minutes of matching: what cannot be read, and a camera that does not fit.
     sizes = tuple(_size(path, mask_of(path, masks)) for path in images)
     starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
-    if _needs_tracks(images, sizes, settings, masks):
+    extract = feature_extractor(settings.features)
+
+    @cache
+    def features_of(index: int) -> tuple[Features, Float[np.ndarray, "K"]]:
+        image = read_image(images[index])
+        features = extract(image, mask_of(images[index], masks))
+        return features, brightness_at(image, features.pixels)
+
+    if _needs_tracks(sizes, settings, features_of):
+        features_of.cache_clear()
         points = track_points(images, settings.tracks, masks, progress)
         if settings.matching == "tracks" or np.median([frame.followed for frame in points]) >= _FOLLOWED:
             return _tracked(images, sizes, points)
         log.info("points cannot be followed from image to image: features are matched instead")
-    return _with_features(images, sizes, settings, masks, progress)
+    return _with_features(images, sizes, settings, features_of, progress)
 
 
+#: Features of an image by its index, and the brightness at them.
+_FeaturesOf = Callable[[int], tuple[Features, Float[np.ndarray, "K"]]]
 #: Neighbouring images compared at most; matches of plenty of features; and the share of the pairs that must have them.
 _COMPARED, _PLENTY, _MOST = 24, 150, 0.9
 #: Fewest images of a video; and of points that are followed from frame to frame, in the median.
 _FEWEST_FRAMES, _FOLLOWED = 8, 60
 
 
-def _needs_tracks(
-    images: tuple[Path, ...], sizes: Sequence[tuple[int, int]], settings: SfmSettings, masks: Masks
-) -> bool:
+def _needs_tracks(sizes: Sequence[tuple[int, int]], settings: SfmSettings, features_of: _FeaturesOf) -> bool:
     """Whether points are to be tracked: as the settings say, or where neighbours have few features in common."""
-    if settings.matching != "auto" or len(images) < _FEWEST_FRAMES or len(set(sizes)) > 1:
+    if settings.matching != "auto" or len(sizes) < _FEWEST_FRAMES or len(set(sizes)) > 1:
         return settings.matching == "tracks"
-    extract, strong = feature_extractor(settings.features), []
-    for first in np.unique(np.linspace(0, len(images) - 2, _COMPARED).round().astype(int)).tolist():
-        pair = [extract(read_image(path), mask_of(path, masks)) for path in images[first : first + 2]]
+    strong = []
+    for first in np.unique(np.linspace(0, len(sizes) - 2, _COMPARED).round().astype(int)).tolist():
+        pair = [features_of(index)[0] for index in (first, first + 1)]
         matches = mutual_matches(pair[0], pair[1], settings.max_ratio, settings.max_distance)
         one, other = (features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True))
         inliers = epipolar_inliers(one, other, sizes[first][::-1], settings.max_error)
@@ -146,22 +157,19 @@ def _with_features(
     images: tuple[Path, ...],
     sizes: tuple[tuple[int, int], ...],
     settings: SfmSettings,
-    masks: Masks,
+    features_of: _FeaturesOf,
     progress: Progress | None,
 ) -> MatchedVideo:
-    extract = feature_extractor(settings.features)
-    features, brightness = [], []
-    for path in with_progress(images, "find features", progress):
-        image = read_image(path)
-        features.append(extract(image, mask_of(path, masks)))
-        brightness.append(brightness_at(image, features[-1].pixels))
+    features, brightness = zip(
+        *(features_of(index) for index in with_progress(range(len(images)), "find features", progress)), strict=True
+    )
     pairs = alike_pairs(features, settings, progress)
     matches = {
         (first, second): mutual_matches(features[first], features[second], settings.max_ratio, settings.max_distance)
         for first, second in with_progress(pairs, "match features", progress)
     }
     keypoints = tuple(one.keypoints for one in features)
-    return MatchedVideo(images, _named(images), sizes, keypoints, tuple(brightness), matches)
+    return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches)
 
 
 #: Frames apart whose common tracks are matches, and fewest of them.
