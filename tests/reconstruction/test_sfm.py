@@ -139,6 +139,19 @@ def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog)
     assert len(open_scene(tmp_path / "scene", options=["split=all-train"]).train) == COUNT
 
 
+def test_models_of_other_cameras_keep_their_own(tube, tmp_path):
+    """Two tubes in images of two sizes have no camera in common."""
+    for index, frame in enumerate(tube_frames(COUNT, 3.0)):
+        write_png(tmp_path / f"0_{index}.png", frame.image.numpy())
+    for index, frame in enumerate(tube_frames(5, 3.0, (200, 160))):
+        write_png(tmp_path / f"1_{index}.png", np.ascontiguousarray(frame.image.numpy()[::-1, :, ::-1]))
+    camera = CameraSettings(model="SIMPLE_PINHOLE", focal_factors=(0.63,))
+    atlas = reconstruct(list_images(tmp_path), SfmSettings(camera=camera))
+    assert [model.registered for model in atlas.models] == [tuple(range(COUNT)), tuple(range(COUNT, COUNT + 5))]
+    sizes = [{(camera.width, camera.height) for camera in model.model.cameras.values()} for model in atlas.models]
+    assert sizes == [{(160, 128)}, {(200, 160)}]
+
+
 def test_masked_parts_have_no_features(tube):
     mask = np.ones((128, 160), bool)
     mask[64:] = False

@@ -108,7 +108,7 @@ def reconstruct(
     """Estimate poses and points by structure from motion.
 
     An unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`), and refined on
-    the largest model; the others are adjusted with its camera.
+    the largest model; the others are adjusted with its cameras, unless their images have other sizes.
 
     Args:
         images: Files in video order. Images of the same size share a camera.
@@ -140,13 +140,14 @@ def reconstruct(
         refined = is_refined(settings.camera)
         known = has_known_camera(settings.camera) and not refined
         first = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
-        cameras = first.model.cameras
         chosen = [first]
         for model in models[1:]:
-            for number, camera in model.cameras.items():
-                camera.params = cameras[number].params
-            bundle_adjust(model, refine_camera=False)
-            chosen.append(best(both_signs(model, video, refined=False)))
+            has_its_cameras = set(model.cameras) <= set(first.model.cameras)
+            if has_its_cameras:
+                for number, camera in model.cameras.items():
+                    camera.params = first.model.cameras[number].params
+                bundle_adjust(model, refine_camera=False)
+            chosen.append(best(both_signs(model, video, refined and not has_its_cameras)))
         return _atlas(video, chosen, settings)
 
 
