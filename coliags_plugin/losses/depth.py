@@ -204,6 +204,12 @@ class SparseDepthSettings(LossSettings):
         default=False,
         description="Whether differences are divided by the known depth, so that the weight needs no unit of length.",
     )
+    bound: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="What a point adds at most, of the differences' unit: x becomes bound (1 - exp(-x / bound)), whose "
+        "slope falls from 1 to 0, so that outliers hardly pull; null: x itself.",
+    )
 
 
 class SparseDepthLoss(Loss[SparseDepthSettings]):
@@ -239,6 +245,8 @@ class SparseDepthLoss(Loss[SparseDepthSettings]):
             difference = difference / torch.where(counts, truth, 1.0)
         if self.settings.huber is not None:
             difference = _smooth_l1(difference, self.settings.huber)
+        if self.settings.bound is not None:
+            difference = -self.settings.bound * torch.expm1(-difference / self.settings.bound)
         return difference.sum() / counts.sum().clamp_min(1)
 
 

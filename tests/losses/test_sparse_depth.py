@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -137,6 +138,17 @@ def test_huber_is_torchs_scaled_to_a_slope_of_one(case, rendered, generator):
     depth = 20 + 10 * torch.rand(len(pixels), generator=generator, dtype=torch.float64)
     expected = huber_loss(rendered.reshape(-1), depth, delta=2.5) / 2.5
     assert case(rendered, pixels + 0.5, depth, huber=2.5).item() == pytest.approx(expected.item())
+
+
+def test_a_bounded_point_pulls_less_the_farther_it_is(case, rendered):
+    """x becomes b (1 - exp(-x / b)): its slope is exp(-x / b), whatever its value."""
+    value = rendered[2, 3].item()
+    for share in (0.01, 0.5, 3.0, 1e4):
+        depth = value / (1.0 + share)
+        term = case(rendered, [[3.5, 2.5]], [depth], relative=True, bound=0.1)
+        assert term.item() == pytest.approx(0.1 * (1 - math.exp(-share / 0.1)), rel=1e-5)
+        (gradient,) = torch.autograd.grad(term, rendered)
+        assert gradient[2, 3].item() == pytest.approx(math.exp(-share / 0.1) / depth, rel=1e-5, abs=1e-12)
 
 
 def test_inverse_depth_is_inverted_and_emptiness_left_out(case):

@@ -16,8 +16,18 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
 from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
-from coliags_plugin.reconstruction.structure.tracks import LEAST_NOISE, Tracks, uncertainty, widest_angles
-from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, in_pixels_of, triangulate
+from coliags_plugin.reconstruction.structure.outliers import (
+    difference_from_lamp,
+    difference_from_neighbours,
+    median_of_points,
+)
+from coliags_plugin.reconstruction.structure.tracks import LEAST_NOISE, NOISE_WEIGHT, Tracks, uncertainty, widest_angles
+from coliags_plugin.reconstruction.structure.triangulation import (
+    TriangulationSettings,
+    fitting,
+    in_pixels_of,
+    triangulate,
+)
 from tests.textured_tube import texture, tube_frames
 
 FRAMES = tube_frames()
@@ -273,10 +283,11 @@ def test_the_angle_between_two_rays():
 
 
 def test_depth_is_as_uncertain_as_the_parallax_is_small():
-    """Between two cameras: sigma_z / z = sqrt(2) sigma z / (f b)."""
+    """Between two cameras: sigma_z / z = sqrt(2) sigma z / (f b), and residuals of 0 lower sigma."""
     noise, shares = uncertainty(tracks([[0.0, 0, DEPTH], [0, 0, 2 * DEPTH]]), CAMERAS)
     assert noise == LEAST_NOISE
-    np.testing.assert_allclose(shares, np.sqrt(2) * noise * DEPTH / (F * BASELINE) * np.array([1, 2]), rtol=1e-6)
+    own = noise * np.sqrt(NOISE_WEIGHT / (NOISE_WEIGHT + 1))
+    np.testing.assert_allclose(shares, np.sqrt(2) * own * DEPTH / (F * BASELINE) * np.array([1, 2]), rtol=1e-6)
 
 
 def test_residuals_tell_the_noise():
@@ -300,3 +311,75 @@ def test_some_of_the_points():
     np.testing.assert_allclose(some.residuals(CAMERAS)[1], [10, 30, 10, 30])
     assert len(some.only(np.array([False, False]))) == 0
     assert uncertainty(some.only(np.array([False, False])), CAMERAS)[1].shape == (0,)
+
+
+# Outliers
+
+
+def grid(size=12):
+    return np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2) * 5.0
+
+
+def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
+    pixels = grid()
+    log_depth = np.where(pixels[:, 0] < 30.0, 3.0, 4.0)
+    clean = difference_from_neighbours(pixels, log_depth)
+    np.testing.assert_array_equal(clean, 0.0)
+    log_depth[40] += 0.7
+    found = difference_from_neighbours(pixels, log_depth)
+    assert found[40] == pytest.approx(0.7)
+    np.testing.assert_array_equal(np.delete(found, 40), 0.0)
+    assert np.isnan(difference_from_neighbours(pixels[:8], log_depth[:8])).all()
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.3])
+def test_a_near_point_that_is_dark_contradicts_the_lamp(gain):
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(20.0, 80.0, 200)
+    albedo = rng.uniform(0.7, 1.0, 200)
+    brightness = 250.0 * gain * (albedo * (20.0 / depth) ** 2) ** (1 / 2.2)
+    frames = np.repeat([0, 3], 100)
+    depth[[7, 150]] = 0.5, 2000.0
+    found = difference_from_lamp(brightness, np.log(depth), frames)
+    assert (np.flatnonzero(found > 4.0) == [7, 150]).all()
+
+
+def test_brightness_without_a_lamp_tells_nothing():
+    rng = np.random.default_rng(0)
+    found = difference_from_lamp(rng.uniform(20.0, 200.0, 500), rng.uniform(3.0, 4.0, 500), np.zeros(500, int))
+    assert np.isnan(found).all()
+    assert difference_from_lamp(np.empty(0), np.empty(0), np.empty(0, int)).shape == (0,)
+
+
+def test_medians_of_points():
+    values = np.array([3.0, np.nan, 1.0, 2.0, np.nan, 5.0, 4.0])
+    points = np.array([0, 0, 0, 0, 2, 3, 3])
+    np.testing.assert_array_equal(median_of_points(values, points, 4), [2.0, 0.0, 0.0, 4.0])
+
+
+def test_points_at_wrong_depths_are_left_out():
+    """Consistent in every view, as matches of a repeated texture are: only their neighbours and the lamp tell."""
+    depth = [frame.depth.numpy() for frame in FRAMES]
+    rng = np.random.default_rng(1)
+    cameras = [frame.camera for frame in FRAMES]
+    positions, points, frames, pixels = [], [], [], []
+    for number in range(400):
+        pixel = rng.uniform(10.0, [150.0, 118.0])
+        z = depth[4][int(pixel[1]), int(pixel[0])] * (0.5 if number % 10 == 0 else 1.0)
+        if not np.isfinite(z):
+            continue
+        camera = cameras[4]
+        ray = np.array([(pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy, 1.0])
+        c2w = camera.camera_to_world.numpy()
+        positions.append((c2w[:3, :3] @ (z * ray) + c2w[:3, 3], number % 10 == 0))
+        for index in (3, 4, 5):
+            seen, front = cameras[index].project(torch.from_numpy(positions[-1][0][None]))
+            if front[0] > 0.0:
+                points.append(len(positions) - 1)
+                frames.append(index)
+                pixels.append(seen[0].numpy())
+    wrong = np.array([is_wrong for _, is_wrong in positions])
+    observed = Tracks(np.stack([p for p, _ in positions]), np.array(points), np.array(frames), np.array(pixels))
+    kept = fitting(FRAMES, observed, SETTINGS)
+    assert not kept[wrong].any()
+    assert kept[~wrong].mean() > 0.8

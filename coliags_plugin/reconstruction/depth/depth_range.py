@@ -20,6 +20,7 @@ from coliags_plugin.reconstruction.structure.features import (
     image_and_mask,
 )
 from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
+from coliags_plugin.reconstruction.structure.outliers import difference_from_neighbours
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +32,8 @@ _LEAST_ANGLE, _ERROR = 1.0, 1.0
 _FEWEST, _FEWEST_OF_FRAME = 30, 10
 #: Relative difference within which two partners must agree about a point.
 _AGREEMENT = 0.15
+#: Difference of log depth from the neighbours' above which a point does not count.
+_UNLIKE = 0.3
 #: Percentiles of the points' depth, and the factors on them: features are rare where the lumen is dark.
 _NEAREST, _FARTHEST = (1.0, 0.6), (99.0, 2.0)
 
@@ -60,7 +63,10 @@ def find_range(
     """
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
         depths_by_frame = [
-            np.zeros(0) if f.sparse_depth is None else f.sparse_depth.depth.cpu().double().numpy() for f in frames
+            np.zeros(0)
+            if known is None
+            else _neighbourly(known.pixels.cpu().numpy(), known.depth.cpu().double().numpy())
+            for known in (frame.sparse_depth for frame in frames)
         ]
         return _range_of(depths_by_frame, "points of the scene")
     depths_by_frame = [np.zeros(0)] * len(frames)
@@ -81,7 +87,8 @@ def find_range(
                 triangulated_depths(features_of(index), features_of(other), frames[index], frames[other], max_turn)
                 for other in partners
             ]
-            depths_by_frame[index] = _agreed(np.stack(depths)) if depths else np.zeros(0)
+            if depths:
+                depths_by_frame[index] = _neighbourly(features_of(index).pixels, _agreed(np.stack(depths)))
             for old in [key for key in features if key < index]:
                 del features[old]
     return _range_of(depths_by_frame, "points triangulated between frames")
@@ -113,15 +120,21 @@ def triangulated_depths(
     return depths
 
 
-def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "A"]:
-    """Median depths of the features about which two partners agree, and most do."""
-    depths = depths[:, (~np.isnan(depths)).sum(axis=0) >= min(2, len(depths))]
-    if not depths.size:
-        return np.zeros(0)
-    middle = np.nanmedian(depths, axis=0)
-    near = (np.abs(depths / middle - 1.0) <= _AGREEMENT).sum(axis=0)
+def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "K"]:
+    """Median depths of the features about which two partners agree, and most do; NaN for all others."""
     there = (~np.isnan(depths)).sum(axis=0)
-    return np.asarray(middle[(near >= np.minimum(2, there)) & (2 * near > there)])
+    agreed = np.full(depths.shape[1], np.nan)
+    enough = there >= min(2, len(depths))
+    agreed[enough] = np.nanmedian(depths[:, enough], axis=0)
+    near = (np.abs(depths / agreed - 1.0) <= _AGREEMENT).sum(axis=0)
+    return np.where((near >= np.minimum(2, there)) & (2 * near > there), agreed, np.nan)
+
+
+def _neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"]) -> Float[np.ndarray, "A"]:
+    """Depths of one frame that are known, above 0, and not unlike their neighbours'."""
+    known = depths > 0.0
+    depths = depths[known]
+    return np.asarray(depths[~(difference_from_neighbours(pixels[known], np.log(depths)) > _UNLIKE)])
 
 
 def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:
@@ -140,5 +153,5 @@ def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> D
         )
     else:
         medians = np.full(len(depths_by_frame), np.log(np.median(every)))
-    log.info("depth range %.4g to %.4g, from %d %s", near, far, len(every), what)
+    log.info("depths of %.4g to %.4g are tried, by %d %s", near, far, len(every), what)
     return DepthRange(near, far, tuple(float(value) for value in np.exp(medians)))

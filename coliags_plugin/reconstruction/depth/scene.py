@@ -30,8 +30,10 @@ log = logging.getLogger(__name__)
 
 #: Confidence from which a pixel counts as known in the summary.
 _KNOWN = 0.5
+#: Shares of the known pixels between whose depths the summary's range is, and the number of logarithmic bins of depth.
+_SHARES, _BINS = (0.01, 0.99), 2000
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 2
+_VERSION = 3
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 
@@ -107,7 +109,9 @@ def _write(
     k = frames[0].camera
     footprint = float(np.median(estimation.medians)) / float(np.sqrt(k.fx * k.fy))
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
-    pixels, known = 0, 0
+    pixels = 0
+    log_range = np.log([estimation.range.near, estimation.range.far])
+    counts = np.zeros(_BINS, np.int64)
     for index, stored in enumerate(with_progress(frames, "write", progress)):
         frame, (depth, confidence) = stored.to("cpu"), estimation.result(index)
         image, mask = image_and_mask(frame)
@@ -117,8 +121,10 @@ def _write(
         if frame.name in trained:
             voxels.add(Pose.of(frame.camera), depth, confidence, image)
         pixels += int(frame.valid.sum())
-        known += int((confidence >= _KNOWN).sum())
+        logs = np.clip(np.log(depth[confidence >= _KNOWN]), *log_range)
+        counts += np.histogram(logs, _BINS, (log_range[0], log_range[1]))[0]
     positions, colors = voxels.points()
+    known = int(counts.sum())
     if not len(positions):
         raise InputError(
             f"no surface that {len(frames)} frames agree on: {100.0 * known / max(pixels, 1):.1f} % of the pixels have "
@@ -130,11 +136,10 @@ def _write(
     test = [frame.name for frame in scene.test_sets.get("test", ())]
     writer.finish(positions, colors, ([frame.name for frame in scene.train], test) if own else None)
     write_unit(folder, scene.provenance["unit"])
-    return (
-        f"{len(frames)} frames, depth {estimation.range.near:.4g} to {estimation.range.far:.4g}, "
-        f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more; "
-        f"{len(positions)} points"
-    )
+    bins = np.searchsorted(np.cumsum(counts), np.multiply(known, _SHARES))
+    near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)
+    share = f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
+    return f"{len(frames)} frames, {share}, 98 % of these at depths of {near:.4g} to {far:.4g}; {len(positions)} points"
 
 
 #: Least confidence of a pixel, and least number of frames that see a point's voxel.

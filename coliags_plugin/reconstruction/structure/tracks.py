@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Lower bound of the estimated noise of an observation, pixels.
 LEAST_NOISE = 0.1
+#: Weight of the common noise in that of a point, in residuals: a short track tells little about its own.
+NOISE_WEIGHT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +92,16 @@ def uncertainty(tracks: Tracks, cameras: Sequence[Camera]) -> tuple[float, Float
     """Observation noise, and the depth uncertainty it propagates to for exact poses.
 
     The noise is the standard deviation of an observation along each axis, estimated from the residuals, pixels, at
-    least ``LEAST_NOISE``; the uncertainty each point's standard deviation of z-depth relative to it, mean over cameras.
+    least ``LEAST_NOISE``; the uncertainty each point's standard deviation of z-depth relative to it, mean over cameras,
+    by its own residuals together with ``NOISE_WEIGHT`` residuals of that noise.
     """
     if not len(tracks):
         return LEAST_NOISE, np.empty(0)
     residuals, _ = tracks.residuals(cameras)
     freedom = 2 * len(residuals) - 3 * len(tracks)
-    noise = max(LEAST_NOISE, float(np.sqrt((residuals**2).sum() / max(freedom, 1))))
+    squared = np.bincount(tracks.points, (residuals**2).sum(axis=1), len(tracks))
+    noise = max(LEAST_NOISE, float(np.sqrt(squared.sum() / max(freedom, 1))))
+    own = (NOISE_WEIGHT * noise**2 + squared) / (NOISE_WEIGHT + 2 * tracks.lengths - 3)
     local, k = tracks.local(cameras), _intrinsics(cameras)[tracks.frames]
     z = local[:, 2]
     jacobians = np.zeros((len(z), 2, 3))
@@ -111,7 +116,7 @@ def uncertainty(tracks: Tracks, cameras: Sequence[Camera]) -> tuple[float, Float
     covariances = np.linalg.inv(information + 1e-12 * scale * np.eye(3))
     axes = rotations[:, :, 2]
     deviations = np.sqrt(np.einsum("ki,kij,kj->k", axes, covariances[tracks.points], axes)) / np.abs(z)
-    return noise, noise * np.bincount(tracks.points, deviations, len(tracks)) / tracks.lengths
+    return noise, np.sqrt(own) * np.bincount(tracks.points, deviations, len(tracks)) / tracks.lengths
 
 
 def _poses(cameras: Sequence[Camera]) -> Float[np.ndarray, "F 4 4"]:

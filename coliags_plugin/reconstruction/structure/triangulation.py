@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
@@ -26,12 +26,18 @@ from coliags_plugin.reconstruction.structure.features import (
     feature_extractor,
     image_and_mask,
 )
+from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.matching import (
     Matches,
     all_pairs,
     check_motion,
     epipolar_matches,
     video_pairs,
+)
+from coliags_plugin.reconstruction.structure.outliers import (
+    difference_from_lamp,
+    difference_from_neighbours,
+    median_of_points,
 )
 from coliags_plugin.reconstruction.structure.tracks import Tracks, uncertainty, widest_angles
 
@@ -85,7 +91,18 @@ class TriangulationSettings(Settings):
         default=0.03,
         gt=0.0,
         description="Largest standard deviation of a point's z-depth, relative to it, propagated from the noise of the "
-        "observations.",
+        "observations and the point's own residuals.",
+    )
+    max_lamp_difference: float = Field(
+        default=4.0,
+        gt=0.0,
+        description="Largest difference of a point's log depth from that of points as bright, robust standard "
+        "deviations: near a lamp at the lens, the wall is brighter.",
+    )
+    max_neighbour_difference: float = Field(
+        default=0.1,
+        gt=0.0,
+        description="Largest difference of a point's log depth from four of its eight nearest neighbours in the image.",
     )
     min_share: float = Field(
         default=0.01,
@@ -139,7 +156,8 @@ def triangulate(
     """Triangulate surface points by COLMAP with fixed poses and intrinsics; deterministic.
 
     SIFT features are matched along the epipolar lines of the given poses, joined into tracks and triangulated; points
-    are filtered by track length, triangulation angle, reprojection error and depth uncertainty.
+    are filtered by track length, triangulation angle, reprojection error and depth uncertainty, and by their depth
+    against the brightness (nearer is brighter under a lamp at the lens) and against neighbouring points.
 
     Args:
         frames: In video order; pinhole cameras, images of any size.
@@ -211,25 +229,46 @@ def _result(frames: Sequence[Frame], tracks: Tracks, settings: TriangulationSett
     cameras = [frame.camera.to("cpu") for frame in frames]
     tracks = tracks.only(tracks.lengths >= settings.min_track_length)
     tracks = tracks.only(widest_angles(tracks, cameras) >= settings.min_angle)
+    seen = len(tracks)
     noise, shares = uncertainty(tracks, cameras)
     certain = shares <= settings.max_depth_uncertainty
-    if certain.sum() < max(FEWEST_POINTS, settings.min_share * found):
+    tracks, shares = tracks.only(certain), shares[certain]
+    kept = fitting(frames, tracks, settings)
+    if kept.sum() < max(FEWEST_POINTS, settings.min_share * found):
         raise InputError(
-            f"of {found} points from {matches} matches, {len(tracks)} are seen in {settings.min_track_length} "
-            f"frames or more at an angle of {settings.min_angle:g} degrees or more, and {certain.sum()} of these have "
-            f"a depth uncertainty of {100.0 * settings.max_depth_uncertainty:g} % or less",
+            f"of {found} points from {matches} matches, {seen} are seen in {settings.min_track_length} "
+            f"frames or more at an angle of {settings.min_angle:g} degrees or more, {len(tracks)} of these have "
+            f"a depth uncertainty of {100.0 * settings.max_depth_uncertainty:g} % or less, and {kept.sum()} of "
+            "these are as deep as their neighbours",
             f"at least {FEWEST_POINTS}, and {100.0 * settings.min_share:g} % of the points found",
             "Check the poses first (coliags data check); else take frames farther apart, lower min_track_length, or "
-            "raise max_depth_uncertainty or max_reprojection_error",
+            "raise max_depth_uncertainty, max_reprojection_error or max_neighbour_difference",
         )
-    tracks, shares = tracks.only(certain), shares[certain]
+    tracks, shares = tracks.only(kept), shares[kept]
     residuals, depth = tracks.residuals(cameras)
     lengths = tracks.lengths
-    seen = [tracks.frames == index for index in range(len(frames))]
-    observations = tuple(Observations(tracks.pixels[here], depth[here], tracks.points[here]) for here in seen)
+    by_frame = [tracks.frames == index for index in range(len(frames))]
+    observations = tuple(Observations(tracks.pixels[here], depth[here], tracks.points[here]) for here in by_frame)
     errors = np.bincount(tracks.points, np.linalg.norm(residuals, axis=1), len(tracks)) / lengths
     colors = _colors(frames, tracks)
     return Triangulation(tracks.positions, colors, errors, shares, lengths, observations, noise, matches, found)
+
+
+def fitting(frames: Sequence[Frame], tracks: Tracks, settings: TriangulationSettings) -> Bool[np.ndarray, "N"]:
+    """Points whose depth agrees with the lamp and, in most frames, with their neighbours that do."""
+    _, depth = tracks.residuals([frame.camera.to("cpu") for frame in frames])
+    log_depth = np.log(np.maximum(depth, np.finfo(float).tiny))
+    brightness, differences = np.empty(len(depth)), np.empty(len(depth))
+    by_frame = [tracks.frames == index for index in range(len(frames))]
+    for frame, here in zip(frames, by_frame, strict=True):
+        brightness[here] = brightness_at(frame.image.cpu().numpy(), tracks.pixels[here])
+    from_lamp = difference_from_lamp(brightness, log_depth, tracks.frames)
+    lit = median_of_points(from_lamp, tracks.points, len(tracks)) <= settings.max_lamp_difference
+    for here in by_frame:
+        left = here & lit[tracks.points]
+        differences[left] = difference_from_neighbours(tracks.pixels[left], log_depth[left])
+    differences[~lit[tracks.points]] = np.inf
+    return median_of_points(differences, tracks.points, len(tracks)) <= settings.max_neighbour_difference
 
 
 def _colors(frames: Sequence[Frame], tracks: Tracks) -> UInt8[np.ndarray, "N 3"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -114,8 +115,10 @@ def test_what_is_printed(wall, tmp_path, capsys):
     options = (*OPTIONS, "--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
     assert run("depth", "estimate", wall, "--output", out, *options) == 0
     summary, written, command = capsys.readouterr().out.splitlines()
-    assert summary.startswith("6 frames, depth 20 to 80, ")
-    assert summary.endswith(" points")
+    told = re.fullmatch(r"6 frames, .+, 98 % of these at depths of (.+) to (.+); \d+ points", summary)
+    near, far = map(float, told.groups())
+    depths = np.concatenate([frame.depth[frame.depth_confidence >= 0.5] for frame in open_scene(out).video])
+    assert [near, far] == pytest.approx(np.percentile(depths, [1.0, 99.0]), rel=2e-3)
     assert written == f"written: {out}"
     assert command == f"next:    coliags train coliags-estimated-depth --data {out} --set datamanager.split=endogslam"
 

@@ -16,10 +16,11 @@ from coliags_plugin.reconstruction.depth.completion import complete, near_rim, s
 from coliags_plugin.reconstruction.depth.depth_range import find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
 from coliags_plugin.reconstruction.depth.fusion import depth_confidence
-from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
+from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.robust_fit import robust_fit
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 
@@ -44,7 +45,7 @@ def test_features_give_the_range_in_any_unit():
 
 
 def test_sparse_depth_of_the_scene_counts():
-    pixels = torch.full((50, 2), 20.5)
+    pixels = torch.stack([torch.arange(50) + 0.5, torch.full((50,), 20.5)], dim=1)
     depths = torch.linspace(30.0, 50.0, 50)
     frames = [
         dataclasses.replace(frame, sparse_depth=SparseDepth(pixels, depths)) for frame in wall_frames(sideways(4, 0.0))
