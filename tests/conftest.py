@@ -15,9 +15,10 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(autouse=True)
-def two_threads():
-    """The same number of torch threads everywhere, so that sums are taken in the same order."""
+def repeatable_torch():
+    """The same numbers in whatever order tests run: two torch threads (the order of sums), and a seed."""
     torch.set_num_threads(2)
+    torch.manual_seed(0)
 
 
 @pytest.fixture

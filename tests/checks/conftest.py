@@ -7,6 +7,6 @@ import torch
 
 
 @pytest.fixture(autouse=True)
-def one_thread(two_threads):
+def one_thread(repeatable_torch):
     """On so few pixels a second thread costs more than it gains."""
     torch.set_num_threads(1)

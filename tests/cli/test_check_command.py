@@ -34,7 +34,7 @@ SMALL = ("--steps", 10, "--set", "datamanager.points_count=500")
 
 
 @pytest.fixture(autouse=True)
-def one_thread(two_threads):
+def one_thread(repeatable_torch):
     torch.set_num_threads(1)
 
 
