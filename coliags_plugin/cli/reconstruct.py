@@ -31,7 +31,7 @@ class ReconstructCommand:
     diameter: arguments.OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
     every: arguments.OptionalInt = None
-    """Use the sharpest of every n frames; default: such that at most 200 are left."""
+    """Use the sharpest of every n frames; default: such that at most 300 are left."""
     mask: arguments.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
     size: arguments.OptionalText = None
@@ -39,7 +39,7 @@ class ReconstructCommand:
     method: arguments.OptionalText = None
     """Method to train; default: coliags-estimated-depth, or coliags for a scene with depth."""
     steps: arguments.OptionalInt = None
-    """Training steps; default 2000."""
+    """Training steps of the largest sub-map; default 2000. Smaller ones get fewer (docs/reconstruct.md 1)."""
     set: arguments.Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""

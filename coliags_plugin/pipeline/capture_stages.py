@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import logging
+from dataclasses import replace
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.datamanagers.units import Unit
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.frames import FEWEST, IMAGES, read_lens_mask, write_frames
+from coliags_plugin.pipeline.frames import IMAGES, read_lens_mask, write_frames
+from coliags_plugin.pipeline.settings import FEWEST
 from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH
 
-log = logging.getLogger(__name__)
-
-#: Median depth of a model whose scale is unknown, units: with about the depth that colons have in mm, constants in mm
-#: (docs/methods.md 4.4) have about the effect that they have on a colon.
-UNKNOWN_MEDIAN_DEPTH = 30.0
 #: Share of the frames below which it is said that the poses are of a part of the video only.
 _MOST = 0.7
 
@@ -33,33 +31,40 @@ def make_poses(context: StageContext) -> StageOutcome:
     """Estimate poses and points by structure from motion, and write them as a scene."""
     from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
-    from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
+    from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
     from coliags_plugin.reconstruction.structure.sfm import reconstruct
 
+    settings = context.settings
     mask = read_lens_mask(context.frames)
-    atlas = reconstruct(list_images(context.frames / IMAGES), context.settings.sfm, mask, context.progress)
-    model = atlas.largest
-    posed, count = len(model.registered), len(model.images)
-    if posed < FEWEST:
+    atlas = reconstruct(list_images(context.frames / IMAGES), settings.sfm, mask, context.progress)
+    largest, count = atlas.largest, len(atlas.images)
+    if len(largest.registered) < FEWEST:
         raise InputError(
-            f"{posed} of {count} frames have poses",
+            f"{len(largest.registered)} of {count} frames have poses",
             f"at least {FEWEST}",
             "Choose a part of the video in which the camera moves along tissue that it sees well, keep more frames "
             "(--every), or give the camera (--camera)",
         )
-    if posed < _MOST * count:
-        log.warning("the surface is of the largest model, %d of %d frames: see poses/%s", posed, count, RIBBON_FILE)
-    factor = millimetres(model, context.settings.diameter)
-    atlas = atlas_scaled(atlas, UNKNOWN_MEDIAN_DEPTH / model.median_depth if factor is None else factor)
-    write_sfm_scene(context.posed, atlas, mask, overwrite=True, unit="unknown" if factor is None else "mm")
+    warnings = []
+    if (posed := count - len(atlas.lost)) < _MOST * count:
+        warnings.append(f"{posed} of {count} frames have a pose: poses/{RIBBON_FILE} shows why the others have none")
+    used = [model for model in atlas.models if model is largest or len(model.registered) >= settings.least_submap]
+    factors = [millimetres(model, settings.diameter) for model in used]
+    models = [
+        scaled(model, factor or UNKNOWN_MEDIAN_DEPTH / model.median_depth)
+        for model, factor in zip(used, factors, strict=True)
+    ]
+    atlas = replace(atlas, models=(*models, *atlas.models[len(used) :]))
+    units: list[Unit] = ["unknown" if factor is None else "mm" for factor in factors]
+    write_sfm_scene(context.posed, atlas, mask, overwrite=True, units=units)
     depth = atlas.largest.median_depth
     unit = (
         f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
-        if factor is None
-        else f"unit mm, by a diameter of {context.settings.diameter:g} mm; median depth {depth:.3g} mm"
+        if units[0] == "unknown"
+        else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
     )
     made = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
-    return StageOutcome(f"{atlas.summary()}; {unit}", made)
+    return StageOutcome(f"{atlas.summary()}; {unit}", made, warnings)
 
 
 def check_data(context: StageContext) -> StageOutcome:
@@ -74,13 +79,11 @@ def check_data(context: StageContext) -> StageOutcome:
     )
     if context.anonymous:
         check = check.anonymous()
-    write_html(check_page(check), context.out / "check.html")
-    write_json(context.out / "check.json", check.as_json())
-    for finding in check.findings:
-        log.warning("suspect: %s (%s). %s", finding.what, finding.evidence, finding.do)
-    return StageOutcome(
-        verdict(check), {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
-    )
+    write_html(check_page(check), context.folder / "check.html")
+    write_json(context.folder / "check.json", check.as_json())
+    made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
+    warnings = [f"suspect: {finding.what} ({finding.evidence}). {finding.do}" for finding in check.findings]
+    return StageOutcome(verdict(check), made, warnings, {"frames": len(scene.video)})
 
 
 def estimate_depth(context: StageContext) -> StageOutcome:

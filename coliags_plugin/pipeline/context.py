@@ -1,14 +1,15 @@
-"""Folder of a reconstruction, with what its stages share."""
+"""Folders of a reconstruction and of its sub-maps, with what their stages share."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.settings import ReconstructionSettings
+from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps, scale_of
 
 if TYPE_CHECKING:
     import torch
@@ -28,6 +29,22 @@ class StageContext:
     device: torch.device
     progress: Progress | None = None
     anonymous: bool = False  # keep absolute paths out of what is written
+    submap: Submap = LARGEST  # which model of the posed scene is reconstructed
+
+    def of(self, submap: Submap) -> StageContext:
+        """The same for another model of the posed scene."""
+        return replace(self, submap=submap)
+
+    def submaps(self) -> list[StageContext]:
+        """One for every model that is reconstructed, the largest first, as far as poses are there."""
+        if self.data_format not in (None, "colmap") or not self.posed.is_dir():
+            return [self]
+        return [self.of(submap) for submap in find_submaps(self.posed, self.settings.least_submap)]
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the sub-map's results."""
+        return self.out / self.submap.folder
 
     @property
     def frames(self) -> Path:
@@ -42,21 +59,29 @@ class StageContext:
     @property
     def estimated(self) -> Path:
         """Scene with estimated depth."""
-        return self.out / "depth"
+        return self.folder / "depth"
 
     @property
     def run(self) -> Path:
         """The trained run."""
-        return self.out / "run"
+        return self.folder / "run"
 
     def open_posed(self, stored_size: bool = False) -> Scene:
         """The posed scene at the working size, its images read when they are needed."""
         from coliags_plugin.engine.data_formats import open_scene
 
         size = self.settings.size
-        options = ["initial_points=none", "keep_pixels=false"]
+        options = ["initial_points=none", "keep_pixels=false", *self.model_options]
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]
         return open_scene(self.posed, self.data_format, options, self.progress, stored_size)
+
+    @cached_property
+    def model_options(self) -> list[str]:
+        """Options of the posed scene's data manager: which model is read, and its scale."""
+        options = [] if self.submap.model is None else [f"model={self.submap.model}"]
+        # Poses that were estimated here have their scale.
+        scale = scale_of(self.posed, self.submap) if self.data_format == "colmap" else 1.0
+        return options if scale == 1.0 else [*options, f"scale={scale:.6g}"]
 
     @property
     def scene(self) -> Path:

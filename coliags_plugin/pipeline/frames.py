@@ -23,14 +23,12 @@ from coliags_plugin.pipeline.frame_selection import (
     sharp_frames,
 )
 from coliags_plugin.pipeline.frame_sources import FrameSource
-from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
-#: Fewest frames that can give depth (docs/depth.md 6).
-FEWEST = 4
 
 
 def write_frames(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,37 +55,54 @@ def reconstruct(
         _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written
     context = StageContext(out, source, settings, mask, data_format, device, progress, anonymous)
-    stages = stages_of(context)
+    stages_of(context)  # what cannot be planned is found out before anything is written
     with locked(out / LOCK_FILE, out):
         record = Record.of(out)
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
-        run_stages(stages, record, overwrite)
+        failure = run_stages(lambda: stages_of(context), record, overwrite)
         write_index(record, f"Reconstruction of {source.resolve().name}")
+    if failure is not None:
+        raise failure
     return record
 
 
 def stages_of(context: StageContext) -> list[Stage]:
-    """The stages for a source, in order."""
-    settings = context.settings
-    size = {"size": settings.size}
-    stages: list[Stage] = []
-
-    def add(work: Callable[[StageContext], StageOutcome], name: str, options: Mapping[str, Any], *outputs: str) -> None:
-        source = {} if stages else {"source": _identity(context.source)}
-        stages.append(Stage(name, {**options, **source}, partial(work, context), outputs))
-
+    """The stages for a source, in order: of the sub-maps as far as they are known."""
+    settings, stages = context.settings, list[Stage]()
+    source: dict[str, Any] = {"source": _identity(context.source)}
     if context.data_format is None:
         mask = None if context.mask is None else _identity(context.mask)
-        add(capture_stages.make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}, "frames")
-        posing = {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
-        add(capture_stages.make_poses, "poses", posing, "poses")
-    add(capture_stages.check_data, "check", size, "check.html", "check.json")
+        options = {"frames": settings.frames.model_dump(), "mask": mask, **source}
+        stages.append(Stage("frames", options, partial(capture_stages.make_frames, context), ["frames"]))
+        options = {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
+        stages.append(Stage("poses", options, partial(capture_stages.make_poses, context), ["poses"], is_plan=True))
+        source = {}
+    for submap in context.submaps():
+        own = {"model": _identity(context.posed / str(submap.submap.model))} if submap.submap.number else source
+        stages += _submap_stages(submap, own)
+    return stages
+
+
+def _submap_stages(context: StageContext, source: Mapping[str, Any]) -> list[Stage]:
+    """The stages of one sub-map; the first depends on ``source``, as no stage before it does."""
+    settings, stages = context.settings, list[Stage]()
+    prefix = f"{context.submap.folder}/" if context.submap.folder else ""
+
+    def add(work: Callable[[StageContext], StageOutcome], name: str, options: Mapping[str, Any], *outputs: str) -> None:
+        def run() -> StageOutcome:
+            made = work(context)
+            return replace(made, files={prefix + path: what for path, what in made.files.items()})
+
+        stages.append(Stage(prefix + name, options, run, [prefix + path for path in outputs], context.submap.number))
+
+    size = {"size": settings.size}
+    add(capture_stages.check_data, "check", {**size, **source}, "check.html", "check.json")
     if context.estimates_depth:
         depth = {**size, "depth": settings.depth.model_dump()}
         add(capture_stages.estimate_depth, "depth", depth, "depth", ".depth.work")
     method = training_stages.method_for(context)
     load_method(method)  # an unknown method is found out before the work starts
-    training = {"method": method, "steps": settings.steps, "seed": settings.seed}
+    training = {"method": method, "steps": training_stages.steps_for(context), "seed": settings.seed}
     add(training_stages.train, "train", training, "run")
     add(training_stages.evaluate, "evaluate", {}, "run/eval")
     add(training_stages.mesh, "mesh", {"mesh": settings.mesh.model_dump()}, "run/mesh")

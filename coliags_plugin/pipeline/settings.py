@@ -12,6 +12,8 @@ from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.meshing.settings import MeshSettings
 
+#: Fewest frames that can give depth (docs/depth.md 6).
+FEWEST = 4
 Pixels = Annotated[int, Field(gt=0)]
 
 
@@ -54,6 +56,11 @@ class ReconstructionSettings(Settings):
         gt=0.0,
         description="The colon's typical inner diameter, mm. None: the unit of length stays unknown.",
     )
+    least_submap: int = Field(
+        default=12,
+        ge=FEWEST,
+        description="Fewest frames of a further model that is reconstructed beside the largest.",
+    )
     depth: DepthEstimationSettings = DepthEstimationSettings()
     """Estimation of dense depth."""
     size: tuple[Pixels, Pixels] | None = Field(
@@ -65,7 +72,12 @@ class ReconstructionSettings(Settings):
         default=None,
         description="Method to train. None: coliags-estimated-depth, or coliags where the scene has depth.",
     )
-    steps: int = Field(default=2000, ge=1, description="Training steps.")
+    steps: int = Field(
+        default=2000,
+        ge=1,
+        description="Training steps of the largest model; a further model of fewer than 100 frames gets less in "
+        "proportion, but at least a quarter.",
+    )
     mesh: MeshSettings = MeshSettings()
     """Fusion of the rendered depth into a mesh."""
     coverage: CoverageSettings = CoverageSettings()

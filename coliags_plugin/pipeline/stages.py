@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from coliags_plugin._version import __version__
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import (
+    InputError,
+    NotFiniteError,
+    NothingDrawnError,
+    NotWritableError,
+    ReportedError,
+)
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.reporting.numbers import duration
@@ -33,9 +39,11 @@ class StageRecord:
 
     options: Mapping[str, Any]  # what it depends on, as JSON
     state: Literal["begun", "failed", "done"] = "begun"  # failed: for its input
-    summary: str = ""  # what came out, in one line
+    summary: str = ""  # what came out, or why it failed, in one line
     seconds: float = 0.0  # of the attempt that ended, wall-clock
     files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to the folder, and what each is
+    warnings: Sequence[str] = ()  # what limits the result, and what to do
+    figures: Mapping[str, Any] = field(default_factory=dict)  # numbers of the summary, by name
 
 
 class Record:
@@ -79,6 +87,8 @@ class Record:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+            if path.parent != self.folder and path.parent.is_dir() and not any(path.parent.iterdir()):
+                path.parent.rmdir()
 
     def write(self) -> None:
         """Write the file atomically."""
@@ -97,6 +107,8 @@ class StageOutcome:
 
     summary: str
     files: Mapping[str, str] = field(default_factory=dict)  # paths relative to the folder, and what each is
+    warnings: Sequence[str] = ()  # logged, and kept
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -110,42 +122,65 @@ class Stage:
     options: Mapping[str, Any]  # all that it depends on apart from the stages before it, as JSON
     run: Callable[[], StageOutcome]
     outputs: Sequence[str] = ()  # files and folders that it writes, relative to the reconstruction's folder
+    part: int | None = None  # which of several parts, independent of each other, it is of; None: all need it
+    is_plan: bool = False  # whether the stages after it are known only once it is done
 
 
-def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False) -> None:
-    """Run the stages that are not done.
+def run_stages(plan: Callable[[], Sequence[Stage]], record: Record, overwrite: bool = False) -> ReportedError | None:
+    """Run the stages that are not done, as they are planned now and after each stage that decides on others.
 
     A stage that was begun with other options is an error, or with ``overwrite`` removed and repeated, along with those
-    after it. The options of one that failed may change.
+    that need it. The options of one that failed may change. A stage of a part that fails ends that part alone: the
+    error of part 0 is returned, those of others are in the record.
     """
+    stages, number, failed = plan(), 0, dict[int, ReportedError]()
     _check_options(stages, record, overwrite)
-    for number, stage in enumerate(stages, start=1):
-        title = f"[{number}/{len(stages)}] {stage.name}"
-        known = record.stages.get(stage.name)
-        if known is not None and known.state == "done":
-            log.info("%s: done before: %s", title, known.summary)
+    while number < len(stages):
+        stage = stages[number]
+        number += 1
+        if stage.part in failed:
             continue
-        log.info("%s%s", title, "" if known is None else ": begun before")
-        record.put(stage.name, StageRecord(_plain(stage.options)))
-        began = time.monotonic()
+        before = [other.name for other in stages[: number - 1] if other.part in (None, stage.part)]
         try:
-            made = stage.run()
-        except InputError as error:
-            record.put(stage.name, replace(record.stages[stage.name], state="failed"))
-            raise _failed(error, stage, stages[: number - 1]) from error
-        except KeyboardInterrupt:
-            log.info("%s: interrupted; the same command goes on from here", title)
-            raise
-        seconds = time.monotonic() - began
-        ended = replace(
-            record.stages[stage.name],
-            state="done",
-            summary=made.summary,
-            seconds=round(seconds, 1),
-            files=dict(made.files),
-        )
-        record.put(stage.name, ended)
-        log.info("%s: %s; took %s", title, made.summary, duration(seconds))
+            _run_stage(stage, f"[{number}/{len(stages)}] {stage.name}", record)
+        except NotWritableError as error:
+            raise _failed(error, stage, before) from error
+        except (InputError, NotFiniteError, NothingDrawnError) as error:
+            told = _failed(error, stage, before) if isinstance(error, InputError) else error
+            if stage.part is None:
+                raise told from error
+            failed[stage.part] = told
+            if any(other.part not in (None, stage.part) for other in stages):
+                log.warning("%s; the others go on", str(told).rstrip("."))
+        if stage.is_plan:
+            stages = plan()
+            _check_options(stages, record, overwrite)
+    return failed.get(0)
+
+
+def _run_stage(stage: Stage, title: str, record: Record) -> None:
+    """Run a stage that is not done."""
+    known = record.stages.get(stage.name)
+    if known is not None and known.state == "done":
+        log.info("%s: done before: %s", title, known.summary)
+        return
+    log.info("%s%s", title, "" if known is None else ": begun before")
+    begun = StageRecord(_plain(stage.options))
+    record.put(stage.name, begun)
+    began = time.monotonic()
+    try:
+        made = stage.run()
+    except (InputError, NotFiniteError, NothingDrawnError) as error:
+        record.put(stage.name, replace(begun, state="failed", summary=str(error)))
+        raise
+    except KeyboardInterrupt:
+        log.info("%s: interrupted; the same command goes on from here", title)
+        raise
+    seconds = time.monotonic() - began
+    for warning in made.warnings:
+        log.warning("%s: %s", stage.name, warning)
+    record.put(stage.name, replace(begun, state="done", seconds=round(seconds, 1), **vars(made)))
+    log.info("%s: %s; took %s", title, made.summary, duration(seconds))
 
 
 def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
@@ -160,9 +195,8 @@ def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> 
                 "the options that it was begun with",
                 f"Choose another --output, or pass --overwrite to repeat {stage.name} and what follows it",
             )
-        later = stages[number:]
+        later = [other for other in stages[number:] if stage.part in (None, other.part)]
         record.forget([other.name for other in later], [output for other in later for output in other.outputs])
-        return
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -185,9 +219,8 @@ def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _failed(error: InputError, stage: Stage, before: Sequence[Stage]) -> InputError:
-    """The error of a stage, with what stands."""
-    done = ", ".join(other.name for other in before)
-    stands = f"{done} {'stand' if len(before) > 1 else 'stands'}: the same command goes on from there" if done else ""
-    advice = ". ".join(part.rstrip(".") for part in (error.do, stands) if part)
-    return InputError(f"stage {stage.name}: {error.seen}", error.expected, advice)
+def _failed(error: InputError, stage: Stage, before: Sequence[str]) -> InputError:
+    """The error of a stage, with those before it that stand."""
+    stands = f"{', '.join(before)} {'stand' if len(before) > 1 else 'stands'}: the same command goes on from there"
+    advice = ". ".join(part.rstrip(".") for part in (error.do, stands if before else "") if part)
+    return type(error)(f"stage {stage.name}: {error.seen}", error.expected, advice)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+from typing import TYPE_CHECKING
 
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
@@ -10,16 +10,29 @@ from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.stages import StageOutcome
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from coliags_plugin.engine.trained import TrainedRun
 
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
+#: Training views that are evaluated, for comparison with those held out.
+_TRAINING_VIEWS = 16
+#: Frames of a sub-map from which on it gets all steps, and the least share of them (docs/reconstruct.md 5).
+_ALL_STEPS, _LEAST_SHARE = 100, 0.25
 
 
 def method_for(context: StageContext) -> str:
     """Name of the method to train: the one given, or else by what is known of the depth."""
     given = context.settings.method
     return given or ("coliags-estimated-depth" if context.estimates_depth or context.has_estimates else "coliags")
+
+
+def steps_for(context: StageContext) -> int:
+    """Training steps: all for the largest sub-map, of a smaller one in proportion to its frames."""
+    steps, submap = context.settings.steps, context.submap
+    if submap.number == 0 or submap.frames is None:
+        return steps
+    return max(1, round(steps * min(1.0, max(_LEAST_SHARE, submap.frames / _ALL_STEPS))))
 
 
 def train(context: StageContext) -> StageOutcome:
@@ -29,9 +42,10 @@ def train(context: StageContext) -> StageOutcome:
     from coliags_plugin.reconstruction.depth.scene import training_options
 
     settings = context.settings
-    steps = f"schedule.steps={settings.steps}"
-    options = [*training_options(context.open_posed()), steps]
+    options = [*training_options(context.open_posed()), f"schedule.steps={steps_for(context)}"]
     data_format = None if context.estimates_depth else context.data_format
+    if not context.estimates_depth:
+        options += [f"datamanager.{option}" for option in context.model_options]
     request = TrainingRequest(
         method_for(context), context.scene, options, settings.seed, data_format, context.anonymous
     )
@@ -46,7 +60,8 @@ def train(context: StageContext) -> StageOutcome:
             ) from error
     rows = folder.log_rows()
     last = f", {rows[-1]['psnr']:.2f} dB in the last view" if rows else ""
-    return StageOutcome(f"{method_name(request.method)}, {trainer.steps} steps{last}", {"run": "the trained run"})
+    summary = f"{method_name(request.method)}, {trainer.steps} steps{last}"
+    return StageOutcome(summary, {"run": "the trained run"}, figures={"steps": trainer.steps})
 
 
 def evaluate(context: StageContext) -> StageOutcome:
@@ -58,11 +73,24 @@ def evaluate(context: StageContext) -> StageOutcome:
     trained = load_trained(context.run, context.device, context.scene)
     folder = evaluator.evaluate(trained, trained.config.protocol)
     result = read_result(folder / RESULT_FILE)
-    values = [(name, result.mean(name)) for name in ("psnr", "ssim")]
-    shown = ", ".join(f"{name.upper()} {value:.4g}" for name, value in values if value is not None)
-    return StageOutcome(
-        f"held-out frames: {shown}", {str(folder.relative_to(context.out)): "metrics and rendered frames"}
-    )
+    figures = {name: value for name in ("psnr", "ssim") if (value := result.mean(name)) is not None}
+    shown = ", ".join(f"{name.upper()} {value:.4g}" for name, value in figures.items())
+    made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
+    figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
+    return StageOutcome(f"held-out frames: {shown}", made, figures=figures | _training_psnr(trained))
+
+
+def _training_psnr(trained: TrainedRun) -> dict[str, float]:
+    """Mean PSNR of at most 16 training views, as the protocol has it; empty where it has none."""
+    from coliags_plugin.comparison.report.view_pixels import evenly
+    from coliags_plugin.engine.scoring import Scorer
+
+    scorer, frames, values = Scorer(trained.config.protocol, ["psnr"]), trained.scene.train, list[float]()
+    for index in evenly(len(frames), _TRAINING_VIEWS):
+        frame = frames[index].to(trained.device)
+        output = trained.model.render(frame.camera, scorer.wants, frame.view(trained=True))
+        values += scorer.score(scorer.protocol.compare(output, frame)).values.values()
+    return {"psnr_training": sum(values) / len(values)} if values else {}
 
 
 def mesh(context: StageContext) -> StageOutcome:
@@ -75,13 +103,15 @@ def mesh(context: StageContext) -> StageOutcome:
     area = made.mesh.areas.sum()
     shown = f"{area / 100.0:.1f} cm²" if trained.scene.is_metric else f"{area:,.0f} square units"
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
-    return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files)
+    figures = {"triangles": len(made.mesh), "area": float(area), "unit": trained.scene.length_unit}
+    return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
 
 
 def coverage(context: StageContext) -> StageOutcome:
     """Measure the share of the wall seen in the video; left out where it cannot be measured."""
     from coliags_plugin.geometry.meshes.files import read_mesh
     from coliags_plugin.surface.coverage.page import summary
+    from coliags_plugin.surface.coverage.visibility import Level
     from coliags_plugin.surface.coverage.writing import measure_scene
 
     scene = context.open_posed()
@@ -95,12 +125,14 @@ def coverage(context: StageContext) -> StageOutcome:
     except NotWritableError:
         raise
     except InputError as error:
-        log.warning("no coverage: %s", error)
-        return StageOutcome(f"left out: {error}")
+        return StageOutcome(f"left out: {error}", warnings=[f"no coverage: {error}"])
     what = "what was seen and missed, for research use only"
+    measured = made.coverage
+    unseen = measured.area(measured.level == Level.UNSEEN) / measured.area()
     return StageOutcome(
-        "; ".join(" ".join(line.split()).rstrip(";") for line in summary(made.coverage, made.evaluation)),
+        "; ".join(" ".join(line.split()).rstrip(";") for line in summary(measured, made.evaluation)),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
+        figures={"seen": 1.0 - unseen},
     )
 
 
@@ -112,5 +144,5 @@ def report(context: StageContext) -> StageOutcome:
 
     protocol = RunFolder(context.run).method().config.protocol
     title = f"Reconstruction of {context.source.name}"
-    write_report([context.run], context.out / "report.html", ("html",), Choices(title=title), protocol)
+    write_report([context.run], context.folder / "report.html", ("html",), Choices(title=title), protocol)
     return StageOutcome("report.html", {"report.html": "views, metrics, training, provenance"})

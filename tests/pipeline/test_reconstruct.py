@@ -20,44 +20,12 @@ from coliags_plugin.geometry.poses.association import associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages, training_stages
-from coliags_plugin.pipeline.stages import StageOutcome
 from tests import commands
+from tests.pipeline.conftest import CAPTURE, TRAINING, Killed
 from tests.pipeline.films import blurred, film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
-CAPTURE, TRAINING = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
-
 _COVERAGE = training_stages.coverage
-
-
-class Killed(BaseException):
-    """Ends a process wherever it is."""
-
-
-@pytest.fixture
-def done(monkeypatch):
-    """Names of the stages that were run; all but the first, which is quick, are faked."""
-    names: list[str] = []
-
-    def faked(name):
-        def work(context):
-            names.append(name)
-            return StageOutcome(f"{name} done", {name: "a file"})
-
-        return work
-
-    write = capture_stages.make_frames
-    monkeypatch.setattr(capture_stages, "make_frames", lambda context: (names.append("make_frames"), write(context))[1])
-    for module, functions in ((capture_stages, CAPTURE), (training_stages, TRAINING)):
-        for function in functions:
-            monkeypatch.setattr(module, function, faked(function))
-    return names
-
-
-@pytest.fixture
-def video(tmp_path):
-    write_video(film(range(0, 120, 8)), tmp_path / "film.mp4", 15.0)
-    return tmp_path / "film.mp4"
 
 
 def test_stages_of_a_video(done, video, tmp_path, capsys):

@@ -37,7 +37,9 @@ class Workshop:
 
     def run(self, overwrite=False, **options):
         self.done = []
-        run_stages(self.stages(**options), Record.of(self.folder), overwrite)
+        failure = run_stages(lambda: self.stages(**options), Record.of(self.folder), overwrite)
+        if failure is not None:
+            raise failure
         return self.done
 
 

@@ -154,7 +154,7 @@ class PosesSfmCommand:
             factor = millimetres(atlas.largest, self.diameter, known_distance)
             if factor is not None:
                 atlas = atlas_scaled(atlas, factor)
-            write_sfm_scene(self.output, atlas, masks, self.overwrite, "unknown" if factor is None else "mm")
+            write_sfm_scene(self.output, atlas, masks, self.overwrite, [] if factor is None else ["mm"])
         text = f"{atlas.summary()}\n{_unit(atlas.largest, factor)}"
         print_summary(text, written=[self.output], then=depth_commands(self.output), as_json=self.json)
 

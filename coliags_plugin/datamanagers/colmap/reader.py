@@ -13,6 +13,7 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.colmap import files
+from coliags_plugin.datamanagers.colmap.atlas import model_unit, read_atlas
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import (
     first_few,
@@ -97,7 +98,8 @@ class ColmapDataManager(RecordedDataManager):
         rectification_of = rectifications(lenses, model.cameras_file, self.working_size, settings.focal_scale)
         names = short_names([image.name for image in model.images])
         others = unposed_images(paths, (*masks, *depths))
-        warn_of_unposed(model.files[1], others)
+        if read_atlas(path) is None:  # else it says why images have no pose, or which other model has one
+            warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
         shots, used = [], 0
         for index, image in enumerate(model.images):
@@ -123,6 +125,7 @@ class ColmapDataManager(RecordedDataManager):
         facts: dict[str, Any] = {
             "layout": "colmap",
             "model": str(model.folder),
+            "unit": model_unit(path, model.folder),
             "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if set(kinds) - files.PINHOLES else None,
             "cameras": len(rectification_of),

@@ -13,6 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
 from coliags_plugin.outputs.image_files import write_png
@@ -57,18 +58,20 @@ def write_colmap_scene(
         write_unit(scratch, unit)
 
 
-#: Names of the record of the sub-maps and of their picture.
-ATLAS_FILE, RIBBON_FILE = "atlas.json", "atlas.png"
+#: Name of the picture of the sub-maps.
+RIBBON_FILE = "atlas.png"
 
 
 def write_sfm_scene(
-    folder: Path, atlas: Atlas, masks: Masks = None, overwrite: bool = False, unit: Unit = "unknown"
+    folder: Path, atlas: Atlas, masks: Masks = None, overwrite: bool = False, units: Sequence[Unit] = ()
 ) -> None:
     """Write a scene in COLMAP's layout: copies of the posed images, masks, the unit, and the models, largest first.
 
     ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose;
-    ``atlas.png`` shows it. ``unit`` is that of the largest model; further models are in units of their own.
+    ``atlas.png`` shows it. ``units`` are those of the models, unknown where not given: each has then one of its own.
     """
+    unknown: list[Unit] = ["unknown"] * (len(atlas.models) - len(units))
+    units = [*units, *unknown]
     with atomic_folder(folder, overwrite) as scratch:
         (scratch / "images").mkdir()
         for number, reconstruction in enumerate(atlas.models):
@@ -78,12 +81,12 @@ def write_sfm_scene(
                 if mask is not None:
                     write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
             write_model(scratch, reconstruction.model, number)
-        write_unit(scratch, unit)
-        write_json(scratch / ATLAS_FILE, _record(atlas, unit))
+        write_unit(scratch, units[0])
+        write_json(scratch / ATLAS_FILE, _record(atlas, units))
         write_png(scratch / RIBBON_FILE, draw_ribbon(atlas))
 
 
-def _record(atlas: Atlas, unit: Unit) -> dict[str, object]:
+def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:
     """What ``atlas.json`` holds. Frames are numbered from 0 in the order of the images."""
     submaps = []
     for number, span in atlas.submaps():
@@ -92,7 +95,7 @@ def _record(atlas: Atlas, unit: Unit) -> dict[str, object]:
         submaps.append(
             {
                 "model": f"sparse/{number}",
-                "unit": unit if number == 0 else "unknown",
+                "unit": units[number],
                 "frames": [index for index in model.registered if index in span],
                 "camera": {
                     "model": camera.model_name,

@@ -1,0 +1,189 @@
+"""Reconstructions of videos that are posed in several models."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+import coliags_plugin as cp
+from coliags_plugin.core.errors import InputError, NotFiniteError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.images import write_image
+from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
+from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.settings import ReconstructionSettings
+from coliags_plugin.pipeline.stages import Record, StageOutcome
+from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH, Submap, find_submaps
+from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from tests import commands
+from tests.pipeline.conftest import TRAINING, Killed
+from tests.textured_tube import tube_frames
+
+SUBMAP = ("check_data", "estimate_depth", *TRAINING)
+#: Frames of the models, along the video; the last is too small.
+COUNTS = (14, 12, 5)
+
+
+def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), depth=2.0):
+    """A scene of several models, each with a point before every camera, ``depth`` units away."""
+    (folder / "images").mkdir(parents=True)
+    start, submaps, names = 0, [], []
+    for number, count in enumerate(counts):
+        frames = tube_frames(count, 1.0, (40, 32))
+        own = [f"{start + index:03d}.png" for index in range(count)]
+        for frame, name in zip(frames, own, strict=True):
+            write_image(folder / "images" / name, frame.image.numpy())
+        model = frame_model(frames, own)
+        poses = np.stack([frame.camera.camera_to_world.numpy() for frame in frames])
+        points = poses[:, :3, 3] + depth * (number + 1) * poses[:, :3, 2]
+        seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
+        add_points(model, seen, points, np.zeros((count, 3), np.uint8))
+        write_model(folder, model, number)
+        stretch = {"model": f"sparse/{number}", "unit": units[number], "frames": [*range(start, start + count)]}
+        submaps.append(stretch)
+        names += own
+        start += count
+    write_unit(folder, units[0])
+    lost = [{"frame": start, "reason": "blurred"}]
+    write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
+    return folder
+
+
+@pytest.fixture
+def atlas(tmp_path):
+    return write_atlas(tmp_path / "atlas")
+
+
+def context_of(scene, out, **settings):
+    return StageContext(out, scene, ReconstructionSettings(**settings), None, "colmap", torch.device("cpu"))
+
+
+def positions(frames):
+    return np.stack([frame.camera.center.numpy() for frame in frames])
+
+
+def test_models_with_enough_frames_are_sub_maps_and_the_largest_always(atlas):
+    assert find_submaps(atlas, 12) == [Submap(0, "sparse/0", 14), Submap(1, "sparse/1", 12)]
+    assert [submap.number for submap in find_submaps(atlas, 4)] == [0, 1, 2]
+    assert [submap.number for submap in find_submaps(atlas, 100)] == [0]
+    for number in (1, 2):
+        shutil.rmtree(atlas / "sparse" / str(number))
+    assert find_submaps(atlas, 4) == [Submap()]  # nothing to choose from, and no option for it
+
+
+def test_each_sub_map_has_its_own_frames_and_median_depth(atlas, tmp_path, caplog):
+    for number, context in enumerate(context_of(atlas, tmp_path / "out", least_submap=5).submaps()):
+        scene = context.open_posed()
+        assert len(scene.video) == COUNTS[number]
+        assert not scene.is_metric
+        factor = UNKNOWN_MEDIAN_DEPTH / (2.0 * (number + 1))
+        np.testing.assert_allclose(positions(scene.video), factor * positions(tube_frames(COUNTS[number], 1.0)), 1e-4)
+        assert context.folder == tmp_path / "out" / ("" if number == 0 else f"submap-{number}")
+    assert "no pose" not in caplog.text  # the atlas says it
+
+
+def test_the_atlas_tells_the_unit_of_each_model(tmp_path):
+    scene = write_atlas(tmp_path / "scene", units=("mm", "unknown", "unknown"))
+    scenes = [context.open_posed() for context in context_of(scene, tmp_path / "out").submaps()]
+    assert [one.is_metric for one in scenes] == [True, False]
+    assert float(scenes[0].video[1].camera.camera_to_world[2, 3]) == pytest.approx(1.0, abs=1e-6)
+    write_json(scene / ATLAS_FILE, {"frames": 3})
+    with pytest.raises(InputError, match=r"atlas.json: frames: .*valid list"):
+        read_atlas(scene)
+
+
+def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        mesh = training_stages.mesh
+
+        def killed(context):
+            if context.submap.number == 1:
+                raise Killed
+            return mesh(context)
+
+        patched.setattr(training_stages, "mesh", killed)
+        cp.reconstruct(atlas, tmp_path / "out")
+    assert done == [*SUBMAP, "submap-1/check_data", "submap-1/estimate_depth", "submap-1/train", "submap-1/evaluate"]
+    done.clear()
+    record = cp.reconstruct(atlas, tmp_path / "out")
+    assert done == ["submap-1/mesh", "submap-1/coverage", "submap-1/report"]
+    assert record.stages["submap-1/mesh"].files == {"submap-1/mesh": "a file"}
+    assert record.stages["train"].options["steps"] == 2000
+    assert record.stages["submap-1/train"].options["steps"] == 500
+    done.clear()
+    cp.reconstruct(atlas, tmp_path / "out", settings={"least_submap": 5})
+    assert done == [f"submap-2/{name}" for name in SUBMAP]
+    with pytest.raises(InputError, match="stage train was made with steps 2000, not 4000"):
+        cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000})
+    done.clear()
+    cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, overwrite=True)  # depth stands
+    assert done == [*TRAINING, *(f"submap-1/{name}" for name in TRAINING)]
+
+
+def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatch):
+    make_poses = capture_stages.make_poses
+
+    def poses(context):
+        shutil.rmtree(context.posed, ignore_errors=True)
+        write_atlas(context.posed, COUNTS if context.settings.diameter is None else COUNTS[:1])
+        return make_poses(context)
+
+    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    cp.reconstruct(video, tmp_path / "out")
+    assert done == ["make_frames", "make_poses", *SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
+    (tmp_path / "out" / "submap-1").mkdir()
+    (tmp_path / "out" / "submap-1" / "run").mkdir()
+    done.clear()
+    with pytest.raises(InputError, match="stage poses was made with diameter None, not 40"):
+        cp.reconstruct(video, tmp_path / "out", settings={"diameter": 40.0})
+    record = cp.reconstruct(video, tmp_path / "out", settings={"diameter": 40.0}, overwrite=True)
+    assert done == ["make_poses", *SUBMAP]
+    assert not any(name.startswith("submap-1") for name in record.stages)
+    assert not (tmp_path / "out" / "submap-1").exists()
+
+
+@pytest.mark.parametrize("error", [InputError("no surface that frames agree on"), NotFiniteError("loss is nan")])
+def test_a_sub_map_that_fails_does_not_end_the_others(done, atlas, tmp_path, monkeypatch, caplog, error, capsys):
+    failing = [1]
+    estimate = capture_stages.estimate_depth
+
+    def fails(context):
+        if context.submap.number in failing:
+            raise error
+        return estimate(context)
+
+    monkeypatch.setattr(capture_stages, "estimate_depth", fails)
+    argv = ("reconstruct", atlas, "--output", tmp_path / "out", "--set", "least_submap=5")
+    assert commands.run(*argv) == 0
+    assert done == [*SUBMAP, "submap-1/check_data", *(f"submap-2/{name}" for name in SUBMAP)]
+    stages = Record.of(tmp_path / "out").stages
+    assert stages["submap-1/depth"].state == "failed"
+    assert stages["submap-1/depth"].summary.startswith(str(error).rstrip("."))
+    assert "the others go on" in caplog.text
+    shutil.rmtree(tmp_path / "out")
+    failing[:] = [0]
+    done.clear()
+    assert commands.run(*argv) == error.exit_status
+    assert str(error).rstrip(".") in capsys.readouterr().err
+    assert done == ["check_data", *(f"submap-{number}/{name}" for number in (1, 2) for name in SUBMAP)]
+    failing.clear()
+    done.clear()
+    assert commands.run(*argv) == 0
+    assert done == [name for name in SUBMAP if name != "check_data"]
+
+
+def test_warnings_and_figures_are_kept(done, atlas, tmp_path, monkeypatch, caplog):
+    outcome = StageOutcome("1 suspect finding", {}, ["suspect: the camera jumps. Check it"], {"frames": 14})
+    monkeypatch.setattr(capture_stages, "check_data", lambda context: outcome)
+    cp.reconstruct(atlas, tmp_path / "out")
+    assert "submap-1/check: suspect: the camera jumps. Check it" in caplog.text
+    content = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]
+    assert content["check"]["warnings"] == list(outcome.warnings)
+    assert content["check"]["figures"] == {"frames": 14}
