@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 import torch
 
+from coliags_plugin.checks.data.findings import points_findings
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
 from coliags_plugin.datamanagers.colmap.reader import ColmapDataManager, ColmapSettings
@@ -72,6 +73,19 @@ def test_images_of_every_camera_become_pinhole_images(model, tmp_path):
         assert frame.valid.float().mean() > 0.75
         assert len(frame.sparse_depth.depth) > 50
         assert off_wall(sparse_points(frame)).max() < 1e-4
+
+
+def test_observations_that_poses_do_not_explain_are_counted(folder):
+    assert load(folder).provenance["misplaced_observations"] == 0
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for image in model.images.values():
+        pose = image.cam_from_world()
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose.rotation, 3.0 * pose.translation))
+    model.write(folder / "sparse" / "0")
+    wrong = load(folder)
+    facts = wrong.provenance
+    assert facts["misplaced_observations"] > 0.7 * facts["observations"]
+    assert "poses and points of the model contradict each other" in [found.what for found in points_findings(facts)]
 
 
 def test_pinhole_images_are_left_alone(scene_folder):

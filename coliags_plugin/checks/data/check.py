@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from coliags_plugin.checks.data import facts
 from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import CHANGES
-from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, match
+from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, follow, match
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale, Pair, agreement, best_scale
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.progress import Progress, with_progress
@@ -21,6 +21,8 @@ from coliags_plugin.core.scenes import Frame, Scene
 
 #: Largest number of frame pairs.
 _PAIRS = 12
+#: Shares of the pairs that must have matches: of features, else points are followed; of either, else nothing is judged.
+_MATCHED, _JUDGED = 0.5, 0.25
 #: Steps count as at most this many typical ones, so that no jump takes all pairs.
 _LONGEST_STEP = 3.0
 
@@ -37,8 +39,9 @@ class SceneCheck:
     lamp: facts.LampFacts | None
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
-    #: epipolar errors of matched features, by pose hypothesis; empty where there is depth
+    #: epipolar errors of matched points, by pose hypothesis; empty where there is depth or too few are matched
     matches: dict[str, EpipolarAgreement]
+    matched_by: Literal["features", "tracks"] | None  # how they are matched; None where there is depth
     findings: list[Finding]  # suspected problems
     undecided: list[Finding]  # what the data are not enough to check
 
@@ -63,6 +66,7 @@ class SceneCheck:
             "agreement": self.agreement,
             "best_depth_scale": self.scale,
             "matches": self.matches,
+            "matched_by": self.matched_by,
         }
         return {key: _json_value(value) for key, value in values.items()}
 
@@ -72,8 +76,9 @@ def check_scene(
 ) -> SceneCheck:
     """Run all checks on a scene.
 
-    ``at_stored_size`` loads the same scene with images of the stored size, in which features are matched if there is no
-    depth; None: those of ``scene``.
+    ``at_stored_size`` loads the same scene with images of the stored size, in which points are matched if there is no
+    depth; None: those of ``scene``. They are matched by features, or where these fail, as in patients, followed from
+    frame to frame.
     """
     video = scene.video
     sample = facts.sampled_frames(video)
@@ -81,30 +86,45 @@ def check_scene(
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
     agreements: dict[str, Agreement] = {}
     matches: dict[str, EpipolarAgreement] = {}
+    matched_by: Literal["features", "tracks"] | None = None
+    undecided: list[Finding] = []
     if with_depth:
         for name in with_progress(list(CHANGES), "compare frames", progress):
             agreements[name] = agreement(with_depth, name)
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
         pairs = video_pairs(video, farther=3)
-        full = {frame.name: frame for frame in (video if at_stored_size is None else at_stored_size().video)}
-        matched = match([(full[source.name], full[target.name]) for source, target in pairs])
-        errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
-        matches = {name: error for name, error in errors.items() if error is not None}
+        full = video if at_stored_size is None else at_stored_size().video
+        place = {frame.name: number for number, frame in enumerate(full)}
+        matched_by = "features"
+        matched = match([(full[place[source.name]], full[place[target.name]]) for source, target in pairs])
+        if len(matched) < _MATCHED * len(pairs):
+            # Points are lost over long ways.
+            matched_by, pairs = "tracks", video_pairs(video)
+            stretches = [full[place[source.name] : place[target.name] + 1] for source, target in pairs]
+            matched = follow(stretches, progress)
+        if len(matched) < _JUDGED * len(pairs):
+            undecided = list(rules.unmatched(len(matched), len(pairs)))
+        else:
+            errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
+            matches = {name: error for name, error in errors.items() if error is not None}
+            undecided = list(rules.undecided(matches))
     scale = best_scale(with_depth) if with_depth else None
     depth, path = facts.depth_facts(sample), facts.path_facts(video)
     images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
     findings = [
         *rules.agreement_findings(agreements, scale, path, depth),
         *rules.match_findings(matches),
+        *rules.points_findings(scene.provenance),
         *rules.depth_findings(depth, scene.is_metric),
         *rules.lamp_findings(lamp),
         *rules.path_findings(path),
         *rules.calibration_findings(video),
         *rules.image_findings(images),
     ]
-    undecided = list(rules.undecided(matches))
-    return SceneCheck(scene, pairs, depth, path, images, lamp, agreements, scale, matches, findings, undecided)
+    return SceneCheck(
+        scene, pairs, depth, path, images, lamp, agreements, scale, matches, matched_by, findings, undecided
+    )
 
 
 def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, Frame]]:

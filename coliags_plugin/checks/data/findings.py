@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, LampFacts, PathFacts
 from coliags_plugin.checks.data.hypotheses import ADVICE, GIVEN, NO_MOTION
@@ -22,6 +23,8 @@ CLEARLY_BETTER = 2.0
 SCALE_TOLERANCE = 0.1
 #: Smallest share of pixels that must project into the other image, and of good matches in front of both cameras.
 MIN_SHARE, MIN_IN_FRONT = 0.3, 0.6
+#: Largest share of a model's observations that are not where its poses project its points.
+MAX_MISPLACED = 0.5
 #: Steps longer than this many typical steps of the moving camera are jumps.
 JUMP = 10.0
 #: Rank correlation of brightness and distance, and share of at least so many frames where it is positive, above which
@@ -135,7 +138,7 @@ def agreement_findings(
 
 
 def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Contradictions of poses and matched features."""
+    """Contradictions of poses and matched points."""
     given = readings.get(GIVEN)
     if given is None:
         return
@@ -152,7 +155,7 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
         and (reading.in_front or 0.0) >= MIN_IN_FRONT
         and (
             (given.error > EPIPOLAR_RESOLUTION and reading.error * CLEARLY_BETTER < given.error)
-            or (not in_front and reading.error <= max(EPIPOLAR_RESOLUTION, given.error))
+            or (not in_front and reading.agrees and reading.error <= max(EPIPOLAR_RESOLUTION, given.error))
         )
     ]
     best = min(right, key=lambda name: readings[name].error, default=None)
@@ -172,7 +175,7 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
 
 
 def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Poses that matched features can neither confirm nor refute, for lack of parallax."""
+    """Poses that matched points can neither confirm nor refute, for lack of parallax."""
     given = readings.get(GIVEN)
     if given is not None and given.in_front is None and given.agrees:
         yield Finding(
@@ -181,6 +184,28 @@ def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
             f"{given.parallax:.2g} px only (median), beside its rotation",
             "Look at frames further apart, --set frame_step=N, or at a part of the video with more motion",
         )
+
+
+def points_findings(facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """Points of a model that its poses do not project to where its images see them; ``facts`` are of the data."""
+    count, misplaced = facts.get("observations", 0), facts.get("misplaced_observations", 0)
+    if count and misplaced > MAX_MISPLACED * count:
+        yield Finding(
+            "poses and points of the model contradict each other",
+            f"{misplaced} of {count} observations of points are not where the poses project them",
+            "Take poses, points and intrinsics from one model: a factor on the poses alone, another camera or poses of "
+            "other images do this",
+        )
+
+
+def unmatched(matched: int, pairs: int) -> Iterator[Finding]:
+    """Poses that cannot be judged, as too few points are found again in other frames."""
+    yield Finding(
+        "the images cannot tell whether the poses are right",
+        f"points are found again in {matched} of {pairs} pairs of frames only",
+        "Judge the poses by what comes of them: held-out frames, and the depth and mesh by eye; or check a part of the "
+        "video that is sharper or has less motion between frames",
+    )
 
 
 def path_findings(path: PathFacts | None) -> Iterator[Finding]:

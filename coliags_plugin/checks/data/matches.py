@@ -1,19 +1,28 @@
-"""Epipolar check of poses without depth: matched features must lie on epipolar lines, in front of both cameras."""
+"""Epipolar check of poses without depth: matched points must lie on epipolar lines, in front of both cameras."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.checks.data.hypotheses import CHANGES, GIVEN
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.structure.point_tracks import track_points
+from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
 #: Smallest number of matches of a usable pair.
 _MIN_MATCHES = 8
+#: An epipolar geometry passes through seven matches whatever they are. Smallest share of the others that it explains if
+#: they are right: of random ones, it is up to 0.18 in images of patients.
+_FREE, _MIN_EXPLAINED = 7, 0.3
 #: Largest epipolar distance of a good match, px.
 _MAX_DISTANCE = 3.0
 #: Largest median epipolar distance of matches that agree with the poses, px, and as a share of the image's width: true
@@ -26,8 +35,8 @@ _MIN_PARALLAX = 2.0
 
 
 @dataclass(frozen=True)
-class FeatureMatches:
-    """Matched features of two frames: (column, row), pixel centres at integers + 0.5. [K, 2] each."""
+class FrameMatches:
+    """Matched points of two frames: (column, row), pixel centres at integers + 0.5. [K, 2] each."""
 
     source: Frame
     target: Frame
@@ -53,10 +62,10 @@ class EpipolarAgreement:
         return self.error <= max(_MAX_ERROR, _MAX_ERROR_SHARE * self.width)
 
 
-def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FeatureMatches]:
+def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FrameMatches]:
     """Mutual best matches of SIFT features on CLAHE images that some epipolar geometry explains, whatever the poses.
 
-    Pairs with few matches are left out.
+    Pairs with few matches, or with no more that agree on a geometry than random ones would, are left out.
     """
     import cv2
 
@@ -80,10 +89,48 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FeatureMatches]:
         # OpenCV has pixel centres at integers.
         here = np.array([points[m.queryIdx].pt for m in mutual]) + 0.5
         there = np.array([points_there[m.trainIdx].pt for m in mutual]) + 0.5
-        inlier = _epipolar_inliers(here, there)
-        if inlier.sum() >= _MIN_MATCHES:
-            matches.append(FeatureMatches(source, target, here[inlier], there[inlier]))
+        matches += _explained(source, target, here, there)
     return matches
+
+
+def follow(stretches: Sequence[Sequence[Frame]], progress: Progress | None = None) -> list[FrameMatches]:
+    """Points followed from the first to the last frame of each stretch, as those of structure from motion are.
+
+    For videos whose frames have few features in common. Stretches through which few points survive, or whose points no
+    epipolar geometry explains, are left out.
+    """
+    matches = []
+    # Bridges would find points again after a gap, of which most are not needed.
+    settings = TrackSettings(bridge_below=0)
+    for stretch in with_progress(stretches, "follow points", progress):
+        if len({frame.image.shape for frame in stretch}) > 1:
+            continue
+        with tempfile.TemporaryDirectory(prefix="coliags-check-") as scratch:
+            masks = {}
+            for number, frame in enumerate(stretch):
+                path = Path(scratch) / f"{number}.png"
+                write_image(path, frame.image.numpy())
+                masks[path] = frame.valid.numpy()
+            points = track_points(list(masks), settings, masks)
+        _, here, there = np.intersect1d(points[0].ids, points[-1].ids, assume_unique=True, return_indices=True)
+        pixels, pixels_there = points[0].pixels[here], points[-1].pixels[there]
+        matches += _explained(stretch[0], stretch[-1], pixels.astype(np.float64), pixels_there.astype(np.float64))
+    return matches
+
+
+def _explained(source: Frame, target: Frame, here: np.ndarray, there: np.ndarray) -> list[FrameMatches]:
+    """The matches that one epipolar geometry explains, or nothing."""
+    inlier = supported(here, there)
+    return [] if inlier is None else [FrameMatches(source, target, here[inlier], there[inlier])]
+
+
+def supported(here: Float[np.ndarray, "K 2"], there: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "K"] | None:
+    """Matches that one epipolar geometry explains; None if they are few, or no more than of random ones."""
+    if len(here) < _MIN_MATCHES:
+        return None
+    inlier = _epipolar_inliers(here, there)
+    needed = max(_MIN_MATCHES, _FREE + _MIN_EXPLAINED * (len(here) - _FREE))
+    return inlier if inlier.sum() >= needed else None
 
 
 def _epipolar_inliers(here: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, "K"]:
@@ -97,7 +144,7 @@ def _epipolar_inliers(here: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, "
     return np.zeros(len(here), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
 
 
-def epipolar_agreement(matches: Sequence[FeatureMatches], change: str = GIVEN) -> EpipolarAgreement | None:
+def epipolar_agreement(matches: Sequence[FrameMatches], change: str = GIVEN) -> EpipolarAgreement | None:
     """Epipolar errors under the hypothesis ``change``; None without matches or camera motion."""
     errors = [error for pair in matches if (error := _epipolar_errors(pair, change)) is not None]
     if not errors:
@@ -112,7 +159,7 @@ def epipolar_agreement(matches: Sequence[FeatureMatches], change: str = GIVEN) -
     return EpipolarAgreement(float(np.median(distance)), in_front, float(np.median(parallax)), len(distance), width)
 
 
-def _epipolar_errors(pair: FeatureMatches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _epipolar_errors(pair: FrameMatches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Distances from the epipolar lines, px; whether points are in front of both cameras; parallax, px. [K] each"""
     cameras = [
         replace(frame.camera, camera_to_world=CHANGES[change](frame.camera.camera_to_world.double()))

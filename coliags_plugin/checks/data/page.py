@@ -116,7 +116,8 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
         if scale := check.scale:
             rows.append([f"given, depth times {scale.factor:.3g}", _percent(scale.depth_error), None, None, None])
     else:
-        note = f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
+        points = "Points followed through" if check.matched_by == "tracks" else "Matched features of"
+        note = f"{points} {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
         head = ["distance from the epipolar line, px", "in front of both cameras, %", "parallax, px", "matches"]
         rows = [
             [name, short_number(e.error), _percent(e.in_front), short_number(e.parallax), str(e.count)]

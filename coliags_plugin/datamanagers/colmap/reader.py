@@ -101,12 +101,13 @@ class ColmapDataManager(RecordedDataManager):
         if read_atlas(path) is None:  # else it says why images have no pose, or which other model has one
             warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
-        shots, used = [], 0
+        shots, used, misplaced = [], 0, 0
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
             camera_to_world[:3, 3] *= settings.scale
             rectification, depth = rectification_of[image.camera], depths[index]
-            sparse = self._sparse_depth(model, image, camera_to_world, rectification)
+            sparse, off = self._sparse_depth(model, image, camera_to_world, rectification)
+            misplaced += off
             used += 0 if sparse is None else len(sparse.depth)
             shots.append(
                 Shot(
@@ -133,6 +134,7 @@ class ColmapDataManager(RecordedDataManager):
             "scale": settings.scale,
             "sparse_points": len(model.positions),
             "observations": sum(len(image.points) for image in model.images),
+            "misplaced_observations": misplaced,
             "sparse_depths": used,
             "masks": sum(mask is not None for mask in masks),
         }
@@ -167,8 +169,11 @@ class ColmapDataManager(RecordedDataManager):
         image: files.RegisteredImage,
         camera_to_world: np.ndarray,
         rectification: Rectification,
-    ) -> SparseDepth | None:
-        """z-depth of the image's points at their projections (not at the observed keypoints)."""
+    ) -> tuple[SparseDepth | None, int]:
+        """z-depth of the image's points at their projections (not at the observed keypoints).
+
+        Also the number of observations far from these, or of points behind the camera.
+        """
         settings, lens = self.settings, model.cameras[image.camera]
         points = model.positions[image.points] * settings.scale
         local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
@@ -177,16 +182,16 @@ class ColmapDataManager(RecordedDataManager):
             k = rectification.pinhole
             pixels = local[:, :2] / local[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
             kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
+            misplaced = int((~kept).sum())
             kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
         kept &= model.track_lengths[image.points] >= settings.min_track_length
         # One depth per point, even if the image observes it twice.
         _, first = np.unique(image.points[kept], return_index=True)
         rows = np.flatnonzero(kept)[np.sort(first)]
         if not len(rows):
-            return None
-        return SparseDepth(
-            torch.from_numpy(pixels[rows].astype(np.float32)), torch.from_numpy(local[rows, 2].astype(np.float32))
-        )
+            return None, misplaced
+        pixels, depth = (torch.from_numpy(values[rows].astype(np.float32)) for values in (pixels, local[:, 2]))
+        return SparseDepth(pixels, depth), misplaced
 
     def _points(self, model: files.SparseModel) -> PointCloud:
         positions = (model.positions * self.settings.scale).astype(np.float32)

@@ -15,7 +15,7 @@ from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.findings import image_findings, path_findings
 from coliags_plugin.checks.data.hypotheses import CHANGES
-from coliags_plugin.checks.data.matches import epipolar_agreement, match
+from coliags_plugin.checks.data.matches import epipolar_agreement, follow, match, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.checks.data.reprojection import Pair, agreement, best_scale
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -288,6 +288,57 @@ def test_matches_that_opencv_cannot_explain_are_none(scene, monkeypatch):
 
     monkeypatch.setattr(cv2, "findFundamentalMat", degenerate)
     assert match(video_pairs(scene.train)) == []
+
+
+def test_random_matches_are_not_taken_for_right_ones():
+    rng = np.random.default_rng(0)
+    for count in (10, 20, 40, 90):
+        here, there = rng.uniform(0, 384, (2, count, 2))
+        assert supported(here, there) is None
+    moved = here + [12.0, 0.0] + [0.0, 0.3] * rng.normal(size=(90, 2))
+    assert supported(here, np.where(np.arange(90)[:, None] < 60, moved, there)).sum() > 50
+
+
+@pytest.fixture
+def unmatched(scene, monkeypatch):
+    """The scene without depth, in which features are not found again."""
+    monkeypatch.setattr("coliags_plugin.checks.data.check.match", lambda pairs: [])
+    return changed(scene, depth=lambda depth: None)
+
+
+def test_where_features_fail_points_are_followed(unmatched):
+    check = check_scene(unmatched)
+    assert (check.findings, check.undecided, check.matched_by) == ([], [], "tracks")
+    assert check.matches["given"].error < 1.0
+    assert check.matches["given"].count > 500
+    assert "Points followed through" in page_text(check_page(check))
+
+
+def test_points_are_followed_through_frames(scene):
+    matches = follow([scene.video[:3], scene.video[4:6]])
+    assert [(pair.source.index, pair.target.index) for pair in matches] == [(0, 2), (4, 5)]
+    assert epipolar_agreement(matches).error < 0.5
+
+
+@pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
+def test_followed_points_tell_poses_in_another_convention(unmatched, reading):
+    assert "poses agree with the images when read as" in whats(changed(unmatched, pose=CHANGES[reading]))
+
+
+def test_followed_points_tell_poses_of_other_frames(unmatched):
+    poses = [frame.camera.camera_to_world for frame in unmatched.video]
+    order = iter(np.random.default_rng(0).permutation(len(poses)))
+    assert "images do not agree with the poses" in whats(changed(unmatched, pose=lambda _: poses[next(order)]))
+
+
+def test_images_that_show_nothing_again_leave_poses_undecided(unmatched):
+    rng = np.random.default_rng(0)
+    noise = changed(
+        unmatched, image=lambda image, _: torch.from_numpy(rng.integers(90, 130, image.shape, dtype=np.uint8))
+    )
+    check = check_scene(noise)
+    assert [doubt.what for doubt in check.undecided] == ["the images cannot tell whether the poses are right"]
+    assert check.findings == [] and check.matches == {}
 
 
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
