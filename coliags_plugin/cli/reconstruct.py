@@ -54,7 +54,9 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
         from coliags_plugin.pipeline.stages import PAGE_FILE
+        from coliags_plugin.reporting.terminal import terminal_text
 
         given: dict[str, Any] = {
             "sfm.camera.model": self.camera,
@@ -77,11 +79,16 @@ class ReconstructCommand:
             overwrite=self.overwrite,
             anonymous=self.anonymous,
         )
-        stages = record.stages
-        lines = [f"{name}: {stage.summary}" for name, stage in stages.items()]
+        stages, results = record.stages, results_of(record)
+        told = {name: stage for name, stage in stages.items() if "/" not in name}
+        lines = [f"{name}: {stage.summary}" for name, stage in told.items()]
         lines += [
-            f"{self.output / path}: {content}" for stage in stages.values() for path, content in stage.files.items()
+            f"{self.output / path}: {content}" for stage in told.values() for path, content in stage.files.items()
         ]
+        if len(results) > 1:
+            lines += [f"{self.output / one.submap.folder}: {one.submap.title}, likewise" for one in results[1:]]
+            lines += ["", terminal_text([submap_table(results)]), "", f"held-out PSNR: {held_out_text(results)}"]
+        lines += remarks(record)
         print_summary(
             "\n".join(lines),
             {"stages": {name: asdict(stage) for name, stage in stages.items()}},

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import torch
 
@@ -20,12 +19,10 @@ from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import frame_source
+from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
-from coliags_plugin.pipeline.stages import LOCK_FILE, PAGE_FILE, Record, Stage, StageOutcome, run_stages
+from coliags_plugin.pipeline.stages import LOCK_FILE, Record, Stage, StageOutcome, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
-from coliags_plugin.reporting.html_page import write_html
-from coliags_plugin.reporting.model import Bullet, Bullets, Column, Page, Section, Table
-from coliags_plugin.reporting.numbers import duration
 
 
 def reconstruct(
@@ -60,7 +57,7 @@ def reconstruct(
         record = Record.of(out)
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
         failure = run_stages(lambda: stages_of(context), record, overwrite)
-        write_index(record, f"Reconstruction of {source.resolve().name}")
+        write_index(record, context.posed, f"Reconstruction of {source.resolve().name}")
     if failure is not None:
         raise failure
     return record
@@ -131,13 +128,3 @@ def _identity(path: Path) -> Mapping[str, Any]:
     """Name and size of a file or folder: enough to notice that it is another one."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}
-
-
-def write_index(record: Record, title: str) -> None:
-    """Write ``index.html``: what each stage gave, and links to the files."""
-    stages = record.stages.items()
-    links = [Bullet(what, path, quote(path)) for _, stage in stages for path, what in stage.files.items()]
-    columns = [Column("stage"), Column("result", words=True), Column("time")]
-    rows = [{"stage": name, "result": stage.summary, "time": duration(stage.seconds)} for name, stage in stages]
-    sections = [Section("Files", [Bullets(links)]), Section("Stages", [Table("", columns, rows)])]
-    write_html(Page(title, sections, note="For research use only."), record.folder / PAGE_FILE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from coliags_plugin.config.method_config import method_name
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
+#: What a file is that shows the surface in a browser.
+SURFACE = "the surface to turn in a browser"
 #: Training views that are evaluated, for comparison with those held out.
 _TRAINING_VIEWS = 16
 #: Frames of a sub-map from which on it gets all steps, and the least share of them (docs/reconstruct.md 5).
@@ -103,6 +106,11 @@ def mesh(context: StageContext) -> StageOutcome:
     area = made.mesh.areas.sum()
     shown = f"{area / 100.0:.1f} cm²" if trained.scene.is_metric else f"{area:,.0f} square units"
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
+    if find_spec("viser") is not None:
+        from coliags_plugin.export.viewer.saving import save_surface
+
+        save_surface(trained, made.mesh, context.run / "mesh" / "surface.html")
+        files["run/mesh/surface.html"] = SURFACE
     figures = {"triangles": len(made.mesh), "area": float(area), "unit": trained.scene.length_unit}
     return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
 

@@ -12,53 +12,17 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
-from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH, Submap, find_submaps
-from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from tests import commands
-from tests.pipeline.conftest import TRAINING, Killed
+from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas
 from tests.textured_tube import tube_frames
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)
-#: Frames of the models, along the video; the last is too small.
-COUNTS = (14, 12, 5)
-
-
-def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), depth=2.0):
-    """A scene of several models, each with a point before every camera, ``depth`` units away."""
-    (folder / "images").mkdir(parents=True)
-    start, submaps, names = 0, [], []
-    for number, count in enumerate(counts):
-        frames = tube_frames(count, 1.0, (40, 32))
-        own = [f"{start + index:03d}.png" for index in range(count)]
-        for frame, name in zip(frames, own, strict=True):
-            write_image(folder / "images" / name, frame.image.numpy())
-        model = frame_model(frames, own)
-        poses = np.stack([frame.camera.camera_to_world.numpy() for frame in frames])
-        points = poses[:, :3, 3] + depth * (number + 1) * poses[:, :3, 2]
-        seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
-        add_points(model, seen, points, np.zeros((count, 3), np.uint8))
-        write_model(folder, model, number)
-        stretch = {"model": f"sparse/{number}", "unit": units[number], "frames": [*range(start, start + count)]}
-        submaps.append(stretch)
-        names += own
-        start += count
-    write_unit(folder, units[0])
-    lost = [{"frame": start, "reason": "blurred"}]
-    write_json(folder / ATLAS_FILE, {"frames": [*names, "lost.png"], "submaps": submaps, "joins": [], "lost": lost})
-    return folder
-
-
-@pytest.fixture
-def atlas(tmp_path):
-    return write_atlas(tmp_path / "atlas")
 
 
 def context_of(scene, out, **settings):

@@ -108,7 +108,8 @@ def _explanation(study: Study, views: Sequence[ViewPixels], scales: _Scales, ref
     if scales.rgb_error is not None:
         texts.append("Views without true depth show the absolute colour error, the mean of red, green and blue.")
     if any(depth is not None for view in views for depth in view.expected):
-        texts.append("Below it the expected depth, hatched where alpha is below 0.5.")
+        place = "Beside" if all(map(_in_row, views)) else "Below"
+        texts.append(f"{place} it the expected depth, hatched where alpha is below 0.5.")
     texts.append(
         "One scale serves every method, frame and scene of this page; it ends at the smallest 1, 2 or 5 times a power "
         f"of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. Errors beyond it, and missing depth "
@@ -119,6 +120,11 @@ def _explanation(study: Study, views: Sequence[ViewPixels], scales: _Scales, ref
     if len({run.result.seed for run in study.runs}) > 1:
         texts.append("Of several seeds, the first is shown.")
     return " ".join([*texts, "Photographs are JPEG here; the run folders keep them as PNG."])
+
+
+def _in_row(view: ViewPixels) -> bool:
+    """Whether the pictures of a view stand side by side: there is one method, and nothing true below it to compare."""
+    return len(view.runs) == 1 and view.true_depth is None
 
 
 def _view(view: ViewPixels, scales: _Scales, reference: str) -> dict[str, Any]:
@@ -138,8 +144,9 @@ def _view(view: ViewPixels, scales: _Scales, reference: str) -> dict[str, Any]:
         tiles.append((_webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
         caption = ["above: camera image", "below: true depth"]
     else:
-        tiles.append((None, "no true depth"))
         caption = []
+        if not _in_row(view):
+            tiles.append((None, "no true depth"))
     return {
         "title": f"{frame.scene} · {frame.part.set_name} · {frame.name}",
         "where": where,
@@ -150,6 +157,7 @@ def _view(view: ViewPixels, scales: _Scales, reference: str) -> dict[str, Any]:
             **{name.replace("_", "-"): signs[name] * values[name] for name in _SORTED_BY if name in values},
         },
         "size": truth,
+        "in_row": _in_row(view),
         "cells": [("truth", None, tiles, caption), *_method_cells(view, scales, where)],
     }
 

@@ -25,6 +25,7 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import mean_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.splats import ViewDecoder, merged_to, shown, wire_unit
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
@@ -124,6 +125,7 @@ class ViewerContent:
     decoder: ViewDecoder | None  # its Gaussians for a view; None for a method without Gaussians
     pictures: FramePictures  # of the frames
     unit: float  # see :func:`~coliags_plugin.export.viewer.splats.wire_unit`
+    first: int = 0  # training frame where a view starts
     # Held while something is computed: browsers take turns.
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -145,6 +147,14 @@ class ViewerContent:
             )
         return cls(trained, trained.scene.video, baked, decoder, FramePictures(trained), wire_unit(baked))
 
+    @classmethod
+    def of_mesh(cls, trained: TrainedRun, mesh: TriangleMesh) -> ViewerContent:
+        """A run of which frames and its mesh alone are to be shown, at first from where most of the mesh is in view."""
+        vertices = torch.as_tensor(mesh.vertices, dtype=torch.float64)
+        seen = [int(frame.camera.to("cpu", torch.float64).sees(vertices)[1].sum()) for frame in trained.scene.train]
+        best, video = int(np.argmax(seen)), trained.scene.video
+        return cls(trained, video, _NOTHING, None, FramePictures(trained), wire_unit(_NOTHING), best)
+
     def relit_evenly(self) -> ViewerContent:
         """The same, its Gaussians baked under the flattened light, where their colours know a lamp."""
         if not self.knows_lamp:
@@ -165,19 +175,22 @@ class ViewerContent:
 
     @property
     def first_camera(self) -> Camera:
-        """Of the first training frame: where a view starts."""
-        return self.trained.scene.train[0].camera
+        """Where a view starts."""
+        return self.trained.scene.train[self.first].camera
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
-        """Up in the image of the first training frame, world frame. [3]"""
+        """Up in the image where a view starts, world frame. [3]"""
         return -self.first_camera.camera_to_world[:3, 1].double().cpu().numpy()
 
     @cached_property
     def look_distance(self) -> float:
-        """Distance of the point that the browser's camera turns about: the median depth in the first view."""
+        """Distance of the point that the browser's camera turns about: the median depth in the first view.
+
+        Of Gaussians, or else of the scene's points.
+        """
         camera = self.first_camera
-        centers = torch.as_tensor(self.baked.means, dtype=torch.float64)
+        centers = torch.as_tensor(self.baked.means if len(self.baked) else self.trained.scene.points.positions).double()
         depth, seen = camera.to("cpu", torch.float64).sees(centers)
         if seen.any():
             return float(depth[seen].median())

@@ -1,10 +1,12 @@
-"""A scene as one HTML page that needs neither a server nor a network."""
+"""A scene or a surface as one HTML page that needs neither a server nor a network."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +16,10 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.content import ViewerContent
-from coliags_plugin.export.viewer.layers import add_cameras
+from coliags_plugin.export.viewer.layers import add_cameras, add_mesh, add_own_colours_light
 from coliags_plugin.export.viewer.serving import import_viser, set_start, start_server, stop_server
 from coliags_plugin.export.viewer.splats import merged_to, on_wire
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.html_page import refuse_folder
 
 logger = logging.getLogger(__name__)
@@ -73,27 +76,47 @@ def fitting_page(content: ViewerContent, largest: int) -> tuple[SplatCloud, str]
     raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
 
 
+def save_surface(trained: TrainedRun, mesh: TriangleMesh, output: Path) -> None:
+    """Write a run's mesh, in the colours of its vertices, as an HTML page; an existing one is replaced."""
+    content = ViewerContent.of_mesh(trained, mesh)
+
+    def fill(scene: Any) -> None:
+        add_mesh(scene, "surface", mesh)
+        add_own_colours_light(scene)
+
+    atomic_write(output, _filled_page(content, fill, f"{len(mesh):,} triangles"))
+
+
 def _page(content: ViewerContent, splats: SplatCloud) -> str:
+    def fill(scene: Any) -> None:
+        scene.add_gaussian_splats("/splats", **on_wire(splats, content.unit), scale=content.unit)
+
+    return _filled_page(content, fill, _caption(content, splats))
+
+
+def _filled_page(content: ViewerContent, fill: Callable[[Any], None], caption: str) -> str:
+    """A scene as a page, with the frames' cameras, which are shown when they are chosen, and a line at its bottom."""
     server = start_server("127.0.0.1", 0)
     try:
         set_start(server, content)
-        server.scene.add_gaussian_splats("/splats", **on_wire(splats, content.unit), scale=content.unit)
+        fill(server.scene)
         for handle in add_cameras(server.scene, content):
             handle.visible = False
         page: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)
+    style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"
+    line = f'<div style="{style}">{escape(caption)}</div>'
     return page.replace("<title>Viser</title>", f"<title>{escape(content.title)}</title>").replace(
-        "</body>", f"{_caption(content, splats)}</body>"
+        "</body>", f"{line}</body>"
     )
 
 
 def _caption(content: ViewerContent, splats: SplatCloud) -> str:
-    """What is seen, at the bottom of the page."""
+    """What is seen."""
     text = f"{content.title}, step {content.trained.step}"
     if content.knows_lamp:
         text += "; flattened light"
     if len(splats) < len(content.baked):
         text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
-    style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"
-    return f'<div style="{style}">{escape(text)}</div>'
+    return text

@@ -106,7 +106,7 @@ class Viewer:
 
 
 def set_start(server: Any, content: ViewerContent) -> None:
-    """Let browsers start at the first training frame, upright there, before black, with a plain panel and no lights."""
+    """Let browsers start at the content's first camera, upright, before black, with a plain panel and no lights."""
     camera = content.first_camera
     _, position = pose(camera)
     axis = camera.optical_axis.double().cpu().numpy()

@@ -197,6 +197,13 @@
     details.addEventListener("toggle", () => (frame.srcdoc ||= frame.dataset.page));
   }
 
+  // ---- One of several surfaces.
+
+  function surfaces(box) {
+    const select = box.querySelector("select");
+    if (select) select.addEventListener("change", () => (box.querySelector("iframe").src = select.value));
+  }
+
   const tables = all("table.results");
   tables.forEach(sortable);
   for (const family of new Set(tables.map(familyOf))) {
@@ -207,4 +214,5 @@
   all(".sorter").forEach(viewSorter);
   all(".compare").forEach(comparator);
   all("details.scene").forEach(scene);
+  all(".surfaces").forEach(surfaces);
 })();

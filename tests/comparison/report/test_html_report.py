@@ -201,7 +201,9 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
     color = color_table("depth")[round(0.5 * 255 if with_truth else 255)]
     assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
     assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
-    assert "Below it the expected depth, hatched where alpha is below 0.5." in page.words
+    place = "Below" if with_truth else "Beside"
+    assert f"{place} it the expected depth, hatched where alpha is below 0.5." in page.words
+    assert page.words.count("no true depth") == 1  # in the legend alone
     assert "depth [mm]" in page.words
 
 

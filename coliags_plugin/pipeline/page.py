@@ -1,0 +1,309 @@
+"""The page that ends a reconstruction: frames with a pose, figures, surfaces and held-out views of all sub-maps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
+from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
+from coliags_plugin.pipeline.submaps import Submap
+from coliags_plugin.pipeline.training_stages import SURFACE
+from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.model import (
+    Block,
+    Bullet,
+    Bullets,
+    Column,
+    EncodedImage,
+    Fact,
+    Figures,
+    Folded,
+    Image,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+    Template,
+    Value,
+    ranked_cells,
+    simple_table,
+)
+from coliags_plugin.reporting.numbers import duration
+
+#: Held-out views shown of each sub-map, beside the worst.
+_VIEWS = 6
+#: Rows of the table of stretches above which it is folded.
+_LONG = 12
+#: What to do where the poses of a sub-map are suspect.
+_SUSPECT = (
+    "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
+    "more frames (--every), a part of the video without cuts, a mask of what does not move with the wall (--mask), or "
+    "the calibration of the camera (--camera, --params)."
+)
+
+
+@dataclass(frozen=True)
+class SubmapResults:
+    """The stages of a sub-map, by their names without its folder."""
+
+    submap: Submap
+    stages: Mapping[str, StageRecord]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The numbers of all its stages."""
+        return {name: value for stage in self.stages.values() for name, value in stage.figures.items()}
+
+    @property
+    def failure(self) -> str:
+        """Which stage failed, and why; empty where none did."""
+        failed = (f"{name} failed: {stage.summary}" for name, stage in self.stages.items() if stage.state == "failed")
+        return next(failed, "")
+
+
+def results_of(record: Record) -> list[SubmapResults]:
+    """The sub-maps of a record, the largest first."""
+    stages: dict[int, dict[str, StageRecord]] = {0: {}}
+    for name, stage in record.stages.items():
+        folder, _, own = name.rpartition("/")
+        if own not in ("frames", "poses"):
+            stages.setdefault(int(folder.removeprefix("submap-") or 0), {})[own] = stage
+    return [SubmapResults(Submap(number), stages[number]) for number in sorted(stages)]
+
+
+def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | None = None) -> Table:
+    """Figures of the sub-maps and their means; ``spans`` tell where in the video each is."""
+    columns = [
+        Column("submap", "Sub-map", words=True),
+        Column("frames", "Frames"),
+        *([Column("span", "In the video", words=True)] if spans else []),
+        Column("held_out", "Held out"),
+        Column("psnr", "PSNR", "dB", "higher"),
+        Column("ssim", "SSIM", "1", "higher"),
+        Column("psnr_training", "PSNR of training views", "dB"),
+        Column("gap", "Gap", "dB", "lower"),
+        Column("area", "Area"),
+        *([Column("seen", "Seen", "%")] if any("seen" in one.figures for one in results) else []),
+        Column("steps", "Steps"),
+        Column("time", "Time"),
+    ]
+    rows: list[dict[str, Value | TableCell]] = []
+    measured: dict[str, list[float | None]] = {key: [] for key in ("psnr", "ssim", "psnr_training", "gap")}
+    for one in results:
+        figures = one.figures
+        if "psnr" in figures and "psnr_training" in figures:
+            figures["gap"] = figures["psnr_training"] - figures["psnr"]
+        for key, values in measured.items():
+            values.append(figures.get(key))
+        seen = figures.get("seen")
+        rows.append(
+            {
+                "submap": TableCell(
+                    f"{one.submap.number}{'' if one.submap.number else ', the largest'}", note=one.failure
+                ),
+                "frames": figures.get("frames"),
+                "span": (spans or {}).get(one.submap.number),
+                "held_out": figures.get("held_out"),
+                "area": _area(figures),
+                "seen": None if seen is None else f"{100.0 * seen:.0f}",
+                "steps": figures.get("steps"),
+                "time": duration(sum(stage.seconds for stage in one.stages.values())),
+            }
+        )
+    if len(results) > 1:
+        for values in measured.values():
+            known = [value for value in values if value is not None]
+            values.append(sum(known) / len(known) if known else None)
+        rows.append({"submap": "mean", "frames": None})
+    for key, unit in (("psnr", "dB"), ("ssim", "1"), ("psnr_training", "dB"), ("gap", "dB")):
+        for row, cell in zip(rows, ranked_cells(measured[key], unit, None), strict=True):
+            row[key] = cell
+    return Table("", columns, rows, notes=[one.failure for one in results if one.failure], name="submaps")
+
+
+def _area(figures: Mapping[str, Any]) -> str | None:
+    if "area" not in figures:
+        return None
+    metric = figures.get("unit") == "mm"
+    return f"{figures['area'] / 100.0:.1f} cm²" if metric else f"{figures['area']:,.0f} square units"
+
+
+def held_out_text(results: Sequence[SubmapResults]) -> str:
+    """Held-out PSNR of each sub-map, and the mean; empty where nothing was evaluated."""
+    values = [(one.submap.number, psnr) for one in results if (psnr := one.figures.get("psnr")) is not None]
+    if not values:
+        return ""
+    if len(values) == 1:
+        return f"{values[0][1]:.2f} dB"
+    each = ", ".join(f"{number}: {psnr:.2f}" for number, psnr in values)
+    mean = sum(psnr for _, psnr in values) / len(values)
+    return f"{mean:.2f} dB in the mean over {len(values)} sub-maps ({each})"
+
+
+def remarks(record: Record) -> list[str]:
+    """What limits the result, and what to do; findings of checks are only counted."""
+    told = [
+        f"{name} failed: {stage.summary}" if stage.state == "failed" else f"{name}: {warning}"
+        for name, stage in record.stages.items()
+        if name.rpartition("/")[2] != "check"
+        for warning in (stage.warnings or [""] * (stage.state == "failed"))
+    ]
+    checks = {one.submap.title: one.stages["check"] for one in results_of(record) if "check" in one.stages}
+    if suspect := [f"{title} ({check.summary})" for title, check in checks.items() if check.warnings]:
+        told.append(f"the poses of {', '.join(suspect)}: {_SUSPECT}")
+    return told
+
+
+def _remarks(record: Record) -> Iterator[Block]:
+    """The findings of checks in full."""
+    found = [
+        Bullet(warning, name, quote(next(iter(stage.files), "")))
+        for name, stage in record.stages.items()
+        if name.rpartition("/")[2] == "check"
+        for warning in stage.warnings
+    ]
+    if found:
+        yield Folded(f"Findings of the checks of images and poses ({len(found)})", [Bullets(found)])
+
+
+def write_index(record: Record, posed: Path, title: str) -> None:
+    """Write ``index.html`` for a reconstruction from the scene ``posed``; its pictures are beside it."""
+    results = results_of(record)
+    atlas = read_atlas(posed)
+    spans = {} if atlas is None else _spans(atlas)
+    sections = [
+        Section("Video", [] if atlas is None else list(_video(atlas, posed, results))),
+        Section("Sub-maps", [submap_table(results, spans), *_remarks(record)]),
+        Section("Surfaces", _surfaces(results)),
+        *_views(record.folder, results),
+        Section("Files", list(_files(record, results))),
+        Section("Stages", [_stage_table(record)]),
+    ]
+    page = Page(title, sections, list(_facts(record, results, atlas)), "For research use only.", remarks(record))
+    write_html(page, record.folder / PAGE_FILE, limit=0)
+
+
+def _facts(record: Record, results: Sequence[SubmapResults], atlas: AtlasRecord | None) -> Iterator[Fact]:
+    if atlas is not None:
+        count = len(atlas.frames)
+        posed = count - len(atlas.lost)
+        yield Fact("Frames with a pose", f"{posed} of {count} ({100.0 * posed / count:.0f} %)")
+        models = len({stretch.model for stretch in atlas.submaps})
+        yield Fact("Sub-maps", f"{len(results)} reconstructed of {models}")
+    yield Fact("Held-out PSNR", held_out_text(results))
+    units = {figures["unit"] for one in results if "unit" in (figures := one.figures)}
+    if units:
+        known = "mm, by the diameter given" if "poses" in record.stages else "mm"
+        yield Fact("Unit of length", known if units == {"mm"} else "unknown" if "mm" not in units else "mm of some")
+    yield Fact("Time", duration(sum(stage.seconds for stage in record.stages.values())))
+
+
+def _spans(atlas: AtlasRecord) -> dict[int, str]:
+    """First and last frame of each model, by its number."""
+    frames: dict[int, list[int]] = {}
+    for stretch in atlas.submaps:
+        frames.setdefault(int(Path(stretch.model).name), []).extend(stretch.frames)
+    return {number: f"{min(own)} to {max(own)}" for number, own in frames.items() if own}
+
+
+def _video(atlas: AtlasRecord, posed: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
+    from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE
+
+    if (posed / RIBBON_FILE).is_file():
+        yield Paragraph(
+            "From left to right, the frames: each colour is a model, with its number of frames, grey has no pose. A "
+            "notch marks a place where few points are seen from both sides."
+        )
+        yield Figures([Image(EncodedImage.png(read_rgb(posed / RIBBON_FILE)), "", wide=True)])
+    rows = list(_stretches(atlas, {one.submap.number for one in results}))
+    table = simple_table(["Frames", "Number", "What", "Why"], rows)
+    table = replace(table, columns=[replace(column, words=column.key != "Number") for column in table.columns])
+    yield Folded(f"{len(rows)} stretches of frames, and why they end", [table], is_open=len(rows) <= _LONG)
+
+
+def _stretches(atlas: AtlasRecord, reconstructed: set[int]) -> Iterator[Sequence[Value]]:
+    """Rows of frames in order: those of one model, or without a pose for one reason."""
+    what: dict[int, tuple[str, str]] = {lost.frame: ("no pose", lost.reason) for lost in atlas.lost}
+    apart = {join.after: join.reason for join in atlas.joins if not join.joined}
+    for stretch in atlas.submaps:
+        number = int(Path(stretch.model).name)
+        few = "" if number in reconstructed else "too few frames to be reconstructed"
+        what |= dict.fromkeys(stretch.frames, (f"sub-map {number}", few))
+    for key, group in groupby(range(len(atlas.frames)), lambda frame: what.get(frame, ("no pose", ""))):
+        frames = list(group)
+        first, last = frames[0], frames[-1]
+        cut = apart.get(last)
+        why = "; ".join(filter(None, (key[1], f"apart from what follows: {cut}" if cut else "")))
+        yield [str(first) if first == last else f"{first} to {last}", len(frames), key[0], why]
+
+
+def _surfaces(results: Sequence[SubmapResults]) -> list[Block]:
+    shown = [
+        (one.submap.title, quote(path))
+        for one in results
+        if "mesh" in one.stages
+        for path, what in one.stages["mesh"].files.items()
+        if what == SURFACE
+    ]
+    if not shown:
+        return [Paragraph("The surfaces are among the files. To turn them here: pip install 'coliags_plugin[viewer]'.")]
+    text = (
+        "Seen first from the frame that has most of it in view. Drag to turn, drag with the right button to move, "
+        "scroll to come nearer; the button at the top right shows the cameras."
+    )
+    return [Paragraph(text), Template("surfaces.html", {"surfaces": shown})]
+
+
+def _views(folder: Path, results: Sequence[SubmapResults]) -> list[Section]:
+    """The section of held-out views: those of each sub-map as of a scene of its own."""
+    from coliags_plugin.comparison.report.sources import read_study
+    from coliags_plugin.comparison.report.study import Study
+    from coliags_plugin.comparison.report.views import view_section
+    from coliags_plugin.results.reading import RESULT_FILE
+
+    runs = []
+    for one in results:
+        for path in one.stages["evaluate"].files if "evaluate" in one.stages else ():
+            evaluation = folder / path
+            if (evaluation / RESULT_FILE).is_file():
+                run = read_study([evaluation.parent.parent], evaluation.name).runs[0]
+                scene = run.result.scene.model_copy(update={"name": one.submap.title})
+                runs.append(replace(run, result=run.result.model_copy(update={"scene": scene})))
+    return [view_section(Study(tuple(runs)), runs[0].method, _VIEWS)] if runs else []
+
+
+def _files(record: Record, results: Sequence[SubmapResults]) -> Iterator[Block]:
+    own = {
+        path: what
+        for name in ("frames", "poses")
+        if name in record.stages
+        for path, what in record.stages[name].files.items()
+    }
+    if own:
+        yield _links(own)
+    for one in results:
+        files = {path: what for stage in one.stages.values() for path, what in stage.files.items()}
+        if len(results) == 1:
+            yield _links(files)
+        elif files:
+            yield Folded(one.submap.title, [_links(files)], is_open=one.submap.number == 0)
+
+
+def _links(files: Mapping[str, str]) -> Bullets:
+    return Bullets([Bullet(what, path, quote(path)) for path, what in files.items()])
+
+
+def _stage_table(record: Record) -> Table:
+    columns = [Column("stage"), Column("result", words=True), Column("time")]
+    rows = [
+        {"stage": name, "result": stage.summary, "time": duration(stage.seconds)}
+        for name, stage in record.stages.items()
+    ]
+    return Table("", columns, rows)

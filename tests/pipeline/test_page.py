@@ -1,0 +1,108 @@
+"""The page and the last lines of a reconstruction of several sub-maps."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from coliags_plugin.core.files import write_json
+from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table, write_index
+from coliags_plugin.pipeline.stages import Record, StageRecord
+from coliags_plugin.pipeline.training_stages import SURFACE
+from coliags_plugin.reporting.terminal import terminal_text
+
+SURFACE_FILE = "run/mesh/surface.html"
+
+
+def done(files=(), warnings=(), **figures):
+    return StageRecord({}, "done", "well", 60.0, dict(files), warnings, figures)
+
+
+def record_in(folder):
+    stages = {
+        "frames": done({"frames/images": "frames of use"}),
+        "poses": done({"poses": "scene"}),
+        "check": done({"check.html": "check"}, ["suspect: the camera jumps. Check it"], frames=14),
+        "train": done(steps=2000),
+        "evaluate": done(psnr=24.0, ssim=0.85, held_out=2, psnr_training=27.5),
+        "mesh": done({SURFACE_FILE: SURFACE}, area=4200.0, unit="mm"),
+        "coverage": done(seen=0.625),
+        "submap-1/check": done({"submap-1/check.html": "check"}, frames=12),
+        "submap-1/train": done(steps=500),
+        "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5),
+        "submap-1/mesh": done({f"submap-1/{SURFACE_FILE}": SURFACE}, area=900.0, unit="units"),
+        "submap-2/check": done(frames=5),
+        "submap-2/depth": StageRecord({}, "failed", "no surface that 5 frames agree on. Check the poses."),
+    }
+    return Record(folder, stages)
+
+
+def test_figures_of_sub_maps_and_their_means(tmp_path):
+    results = results_of(record_in(tmp_path))
+    table = submap_table(results, {0: "0 to 13"})
+    rows = [{column.key: cell.text for column, cell in zip(table.columns, row, strict=True)} for row in table.cells]
+    assert [row["submap"] for row in rows] == ["0, the largest", "1", "2", "mean"]
+    assert [row["psnr"] for row in rows] == ["24.00", "22.00", "", "23.00"]
+    assert [row["gap"] for row in rows] == ["3.50", "1.50", "", "2.50"]
+    assert [row["area"] for row in rows] == ["42.0 cm²", "900 square units", "", ""]
+    assert [row["seen"] for row in rows] == ["62", "", "", ""]
+    assert [row["steps"] for row in rows] == ["2000", "500", "", ""]
+    assert rows[0]["span"] == "0 to 13"
+    assert held_out_text(results) == "23.00 dB in the mean over 2 sub-maps (0: 24.00, 1: 22.00)"
+    assert held_out_text(results[:1]) == "24.00 dB"
+    assert held_out_text(results[2:]) == ""
+    assert "depth failed: no surface that 5 frames agree on" in terminal_text([submap_table(results)])
+    alone = submap_table(results[1:2])
+    assert not {"span", "seen"} & {column.key for column in alone.columns}
+    assert len(alone.rows) == 1
+
+
+def test_what_failed_and_what_is_suspect_is_said_with_what_to_do(tmp_path):
+    failed, suspect = remarks(record_in(tmp_path))
+    assert failed == "submap-2/depth failed: no surface that 5 frames agree on. Check the poses."
+    assert suspect.startswith("the poses of sub-map 0 (well): there the surface may be bent or torn. Compare")
+
+
+@pytest.fixture
+def page(atlas, tmp_path):
+    def written(record=None):
+        write_index(record or record_in(tmp_path / "out"), atlas, "Reconstruction of film.mp4")
+        return (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+
+    return written
+
+
+def test_the_page_tells_which_frames_have_a_pose_and_why_others_have_none(page, atlas):
+    joins = [{"after": 13, "joined": False, "reason": "7 points are seen from both sides"}]
+    content = read_atlas(atlas).model_dump()
+    write_json(atlas / ATLAS_FILE, content | {"joins": joins})
+    write_png(atlas / "atlas.png", np.full((60, 120, 3), 200, np.uint8))
+    text = page()
+    assert "31 of 32 (97 %)" in text
+    assert "3 reconstructed of 3" in text
+    assert "apart from what follows: 7 points are seen from both sides" in text
+    assert "blurred" in text
+    assert "index_files/" in text  # the ribbon is beside the page
+
+
+def test_the_page_shows_one_surface_of_all(page):
+    text = page()
+    assert f'<option value="{SURFACE_FILE}">sub-map 0</option>' in text
+    assert f'<option value="submap-1/{SURFACE_FILE}">sub-map 1</option>' in text
+    assert text.count("<iframe") == 1
+    assert "the camera jumps" in text
+    assert "data:image" not in text
+
+
+def test_the_page_does_without_atlas_and_surfaces(page, atlas, tmp_path):
+    shutil.rmtree(atlas)
+    record = record_in(tmp_path / "out")
+    record.stages = {"check": done({"check.html": "check"}, frames=14), "train": done()}
+    text = page(record)
+    assert "pip install" in text
+    assert "Frames with a pose" not in text
+    assert "sub-map 1" not in text
