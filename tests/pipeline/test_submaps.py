@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,17 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
+from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH, Submap, find_submaps
+from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
 from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas
 from tests.textured_tube import tube_frames
@@ -151,3 +157,41 @@ def test_warnings_and_figures_are_kept(done, atlas, tmp_path, monkeypatch, caplo
     content = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]
     assert content["check"]["warnings"] == list(outcome.warnings)
     assert content["check"]["figures"] == {"frames": 14}
+
+
+def test_each_model_is_scaled_by_the_diameter_or_else_to_its_median_depth(tmp_path, monkeypatch):
+    """Beside the path of the first lies a wall, beside that of the second too little; the third is too small."""
+    out = tmp_path / "out"
+    images = [out / "frames" / "images" / f"{index}.png" for index in range(14)]
+    for image in images:
+        write_image(image, np.zeros((32, 40, 3), np.uint8))
+    angles = np.linspace(0.0, 6.0, 40)
+    wall = np.stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), np.linspace(1.0, 4.0, 40)], axis=1)
+
+    def model(first, count, points):
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 2, 3] = np.arange(count)
+        frames = [
+            replace(frame, camera=replace(frame.camera, camera_to_world=torch.from_numpy(pose)))
+            for frame, pose in zip(tube_frames(count, 1.0, (40, 32)), poses, strict=True)
+        ]
+        registered = range(first, first + count)
+        posed = frame_model(frames, [images[index].name for index in registered])
+        seen = [SeenPoints(np.ones((len(points), 2)), np.arange(len(points))) for _ in range(count)]
+        add_points(posed, seen, points, np.zeros((len(points), 3), np.uint8))
+        return Reconstruction(tuple(images), tuple(registered), poses, tuple(path.name for path in images), posed)
+
+    models = (model(0, 6, wall), model(6, 5, wall[:2] + np.array([0.0, 0.0, 9.0])), model(11, 3, wall[:2]))
+    found = Atlas(tuple(images), models, {})
+    monkeypatch.setattr("coliags_plugin.reconstruction.structure.sfm.reconstruct", lambda *arguments: found)
+    settings = ReconstructionSettings(diameter=40.0, least_submap=4)
+    context = StageContext(out, tmp_path / "film", settings, None, None, torch.device("cpu"))
+    assert "unit mm, by a diameter of 40 mm" in capture_stages.make_poses(context).summary
+    atlas = read_atlas(context.posed)
+    assert [stretch.unit for stretch in atlas.submaps] == ["mm", "unknown", "unknown"]
+    steps = [
+        float(np.diff(colmap.read(context.posed / "sparse" / str(number)).camera_to_world[:, 2, 3]).mean())
+        for number in range(3)
+    ]
+    np.testing.assert_allclose(steps, [4.0, UNKNOWN_MEDIAN_DEPTH / models[1].median_depth, 1.0], rtol=1e-6)
+    assert [one.open_posed().is_metric for one in context.submaps()] == [True, False]
