@@ -55,6 +55,7 @@ def reconstruct(
     stages_of(context)  # what cannot be planned is found out before anything is written
     with locked(out / LOCK_FILE, out):
         record = Record.of(out)
+        record.is_anonymous = anonymous
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
         failure = run_stages(lambda: stages_of(context), record, overwrite)
         write_index(record, context.posed, f"Reconstruction of {source.resolve().name}")

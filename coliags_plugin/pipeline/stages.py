@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from coliags_plugin._version import __version__
+from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.errors import (
     InputError,
     NotFiniteError,
@@ -51,6 +52,7 @@ class Record:
 
     def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
         self.folder, self.stages = folder, dict(stages or {})
+        self.is_anonymous = False  # whether absolute paths are kept out of what stages say
 
     @classmethod
     def of(cls, folder: Path) -> Record:
@@ -74,6 +76,8 @@ class Record:
 
     def put(self, name: str, stage: StageRecord) -> None:
         """Set a stage, in the place it has."""
+        if self.is_anonymous:
+            stage = replace(stage, summary=without_places(stage.summary), warnings=without_places(stage.warnings))
         self.stages[name] = stage
         self.write()
 
