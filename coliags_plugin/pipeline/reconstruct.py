@@ -52,12 +52,12 @@ def reconstruct(
         _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written
     context = StageContext(out, source, settings, mask, data_format, device, progress, anonymous)
-    stages_of(context)  # what cannot be planned is found out before anything is written
+    stages = stages_of(context)
     with locked(out / LOCK_FILE, out):
         record = Record.of(out)
         record.is_anonymous = anonymous
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
-        failure = run_stages(lambda: stages_of(context), record, overwrite)
+        failure = run_stages(stages, record, overwrite, lambda: stages_of(context))
         write_index(record, context.posed, f"Reconstruction of {source.resolve().name}")
     if failure is not None:
         raise failure

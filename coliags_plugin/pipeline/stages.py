@@ -130,14 +130,19 @@ class Stage:
     is_plan: bool = False  # whether the stages after it are known only once it is done
 
 
-def run_stages(plan: Callable[[], Sequence[Stage]], record: Record, overwrite: bool = False) -> ReportedError | None:
-    """Run the stages that are not done, as they are planned now and after each stage that decides on others.
+def run_stages(
+    stages: Sequence[Stage],
+    record: Record,
+    overwrite: bool = False,
+    plan: Callable[[], Sequence[Stage]] | None = None,
+) -> ReportedError | None:
+    """Run the stages that are not done; ``plan`` gives them anew after one that decides on others.
 
     A stage that was begun with other options is an error, or with ``overwrite`` removed and repeated, along with those
     that need it. The options of one that failed may change. A stage of a part that fails ends that part alone: the
     error of part 0 is returned, those of others are in the record.
     """
-    stages, number, failed = plan(), 0, dict[int, ReportedError]()
+    number, failed = 0, dict[int, ReportedError]()
     _check_options(stages, record, overwrite)
     while number < len(stages):
         stage = stages[number]
@@ -156,7 +161,7 @@ def run_stages(plan: Callable[[], Sequence[Stage]], record: Record, overwrite: b
             failed[stage.part] = told
             if any(other.part not in (None, stage.part) for other in stages):
                 log.warning("%s; the others go on", str(told).rstrip("."))
-        if stage.is_plan:
+        if stage.is_plan and plan is not None:
             stages = plan()
             _check_options(stages, record, overwrite)
     return failed.get(0)

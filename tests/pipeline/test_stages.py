@@ -37,7 +37,7 @@ class Workshop:
 
     def run(self, overwrite=False, **options):
         self.done = []
-        failure = run_stages(lambda: self.stages(**options), Record.of(self.folder), overwrite)
+        failure = run_stages(self.stages(**options), Record.of(self.folder), overwrite)
         if failure is not None:
             raise failure
         return self.done
