@@ -105,9 +105,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         seen = figures.get("seen")
         rows.append(
             {
-                "submap": TableCell(
-                    f"{one.submap.number}{'' if one.submap.number else ', the largest'}", note=one.failure
-                ),
+                "submap": f"{one.submap.number}{'' if one.submap.number else ', the largest'}",
                 "frames": figures.get("frames"),
                 "span": (spans or {}).get(one.submap.number),
                 "held_out": figures.get("held_out"),
@@ -125,7 +123,10 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
     for key, unit in (("psnr", "dB"), ("ssim", "1"), ("psnr_training", "dB"), ("gap", "dB")):
         for row, cell in zip(rows, ranked_cells(measured[key], unit, None), strict=True):
             row[key] = cell
-    return Table("", columns, rows, notes=[one.failure for one in results if one.failure], name="submaps")
+    for row, one in zip(rows, results, strict=False):
+        if one.failure:
+            row["psnr"] = TableCell(note=one.failure)
+    return Table("", columns, rows, name="submaps")
 
 
 def _area(figures: Mapping[str, Any]) -> str | None:
@@ -196,7 +197,10 @@ def _facts(record: Record, results: Sequence[SubmapResults], atlas: AtlasRecord 
         posed = count - len(atlas.lost)
         yield Fact("Frames with a pose", f"{posed} of {count} ({100.0 * posed / count:.0f} %)")
         models = len({stretch.model for stretch in atlas.submaps})
-        yield Fact("Sub-maps", f"{len(results)} reconstructed of {models}")
+        failed = sum(bool(one.failure) for one in results)
+        yield Fact(
+            "Sub-maps", f"{len(results) - failed} reconstructed of {models}", note=f"{failed} failed" if failed else ""
+        )
     yield Fact("Held-out PSNR", held_out_text(results))
     units = {figures["unit"] for one in results if "unit" in (figures := one.figures)}
     if units:
