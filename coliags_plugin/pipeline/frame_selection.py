@@ -23,6 +23,14 @@ _NEIGHBOURS = 10
 _DARK, _MARGIN = 16, 3
 #: Shares of the image between which a dark border is believed.
 _BORDER = (0.002, 0.7)
+#: A pixel that changes by less than this over the video, of 255, is still; the others change by at least twice as much
+#: (median), or the camera rests. Largest share of them, and least gradient of the mean image at an overlay, per pixel:
+#: what moves leaves up to 6.
+_STILL, _OVERLAYS, _EDGE = 48, 0.3, 10.0
+
+#: Ratio of the differences of neighbouring rows and of rows two apart, median over the frames, above which a video is
+#: interlaced: 0.5 to 0.6 in images, 1 for noise alone, 1.6 to 9 where two fields show a moving scene.
+INTERLACED = 1.3
 
 #: Why frames are dropped, as the record says it.
 THINNED, BLURRED, EMPTY, RESTING = "thinned out", "blurred", "black or without any texture", "the camera rests"
@@ -64,6 +72,33 @@ def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | 
     outside = np.isin(labels, rim[rim > 0]) & (dark > 0)
     share = float(outside.mean())
     return ~dilated(outside, _MARGIN) if _BORDER[0] <= share <= _BORDER[1] else None
+
+
+def overlays(
+    darkest: UInt8[np.ndarray, "H W 3"], brightest: UInt8[np.ndarray, "H W 3"], mean: Float32[np.ndarray, "H W 3"]
+) -> Bool[np.ndarray, "H W"]:
+    """Text, logos and frames within the picture: what never changes, with edges, while the rest does.
+
+    True there. ``darkest`` and ``brightest`` are the extremes of each pixel over the frames, ``mean`` its mean.
+    """
+    import cv2
+
+    change = (brightest - darkest).max(axis=2)
+    dark = brightest.max(axis=2) <= _DARK
+    still = (change <= _STILL) & ~dark
+    others = change[~dark & ~still]
+    if not still.any() or still.sum() > _OVERLAYS * (~dark).sum() or np.median(others) < 2 * _STILL:
+        return np.zeros(still.shape, bool)
+    slope = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))).max(axis=2)
+    _, labels = cv2.connectedComponents(dilated(still, 1).astype(np.uint8))
+    marked = np.unique(labels[still & dilated(slope > _EDGE, 1)])
+    return dilated(np.isin(labels, marked[marked > 0]), _MARGIN)
+
+
+def combing(image: UInt8[np.ndarray, "H W 3"]) -> float:
+    """Mean difference of green between neighbouring rows, relative to that between rows two apart."""
+    green = image[..., 1].astype(np.int16)
+    return float(np.abs(green[1:] - green[:-1]).mean() / max(np.abs(green[2:] - green[:-2]).mean(), 1e-6))
 
 
 def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:

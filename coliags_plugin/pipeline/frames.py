@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frame_selection import (
+    INTERLACED,
     RESTING,
     THINNED,
+    combing,
     interval,
     lens_mask,
     motion,
+    overlays,
     reduced,
     sharp_frames,
 )
@@ -26,6 +30,8 @@ from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
+
+log = logging.getLogger(__name__)
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
@@ -41,17 +47,17 @@ def write_frames(
     """Choose frames and write them: ``images/NAME.png``, ``frames.json``, and ``mask.png`` where there is a mask.
 
     The video is read twice: for the sharpness of all frames, and to write those chosen. Without a mask, black
-    surroundings of the lens's image are found. Replaces the folder; returns a summary of one line.
+    surroundings of the lens's image and overlays are found. Replaces the folder; returns a summary of one line.
     """
     given = None if mask is None else read_mask(mask)
-    sharpnesses, brightest = _survey(source, progress)
-    size, total = brightest.shape, len(sharpnesses)
+    sharpnesses, found = _survey(source, progress)
+    size, total = found.shape, len(sharpnesses)
     if given is not None and given.shape != size:
         raise InputError(
             f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
             "a mask of the frames' size",
         )
-    used = lens_mask(brightest) if given is None else given
+    used = given if given is not None or found.all() else found
     chosen, dropped = sharp_frames(sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
         kept = []
@@ -97,20 +103,37 @@ def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
     return read_mask(folder / MASK) if (folder / MASK).is_file() else None
 
 
-def _survey(source: FrameSource, progress: Progress | None) -> tuple[list[float], UInt8[np.ndarray, "H W"]]:
-    """Sharpness of all frames, and the brightest value of each pixel."""
+def found_mask(source: FrameSource, progress: Progress | None = None) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of a video without black surroundings of the lens's image and overlays; None where it has neither."""
+    _, mask = _survey(source, progress)
+    return None if mask.all() else mask
+
+
+def _survey(source: FrameSource, progress: Progress | None) -> tuple[list[float], Bool[np.ndarray, "H W"]]:
+    """Sharpness of all frames; and False outside of the lens's image and on overlays. Says if they are interlaced."""
     total = source.expected
     values: list[float] = []
-    brightest: UInt8[np.ndarray, "H W"] | None = None
+    combs: list[float] = []
+    extremes: list[UInt8[np.ndarray, "H W 3"]] = []
+    summed: Float32[np.ndarray, "H W 3"] | None = None
     for done, (_, image) in enumerate(source, start=1):
         values.append(sharpness(reduced(image)))
-        peak = image.max(axis=2)
-        brightest = peak if brightest is None else np.maximum(brightest, peak)
+        combs.append(combing(image))
+        extremes = [np.minimum(extremes[0], image), np.maximum(extremes[1], image)] if extremes else [image, image]
+        summed = image.astype(np.float32) if summed is None else summed + image
         if progress is not None:
             progress("look at frames", done, max(done, total))
-    if brightest is None:
+    if summed is None:
         raise InputError(f"no frames in {source.path}", "a video")
-    return values, brightest
+    if np.median(combs) > INTERLACED:
+        log.warning(
+            "%s looks interlaced: every frame shows two moments in alternate rows, which spoils poses and surface. "
+            "Make whole frames with ffmpeg -i VIDEO -vf yadif NEW.mp4 and give these",
+            source.path,
+        )
+    inside = lens_mask(extremes[1].max(axis=2))
+    within = ~overlays(extremes[0], extremes[1], summed / len(values))
+    return values, within if inside is None else within & inside
 
 
 def _moving(

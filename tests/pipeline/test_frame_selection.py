@@ -8,12 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coliags_plugin.core.morphology import dilated
 from coliags_plugin.pipeline.frame_selection import (
     BLURRED,
     EMPTY,
     THINNED,
     lens_mask,
     motion,
+    overlays,
     reduced,
     sharp_frames,
 )
@@ -67,6 +69,32 @@ def test_the_mask_of_a_round_lens():
 def test_a_full_image_needs_no_mask():
     assert lens_mask(np.full((120, 160), 90, np.uint8)) is None
     assert lens_mask(np.full((120, 160), 2, np.uint8)) is None  # a black video
+
+
+def survey(frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    stack = np.stack(frames)
+    return stack.min(axis=0), stack.max(axis=0), stack.mean(axis=0, dtype=np.float32)
+
+
+def titled(image: np.ndarray) -> np.ndarray:
+    written = image.copy()
+    cv2.putText(written, "NAME 12:34", (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (250, 250, 250), 1, cv2.LINE_AA)
+    written[90:110, 120:150] = (20, 120, 200)
+    return written
+
+
+def test_overlays_are_found_where_the_rest_moves():
+    plain = film(range(0, 150, 5))
+    found = overlays(*survey([titled(image) for image in plain]))
+    written = (titled(np.zeros_like(plain[0])) > 0).any(axis=2)
+    assert found[written].all()
+    assert not found[~dilated(written, 8)].any()
+    assert not overlays(*survey(plain)).any()
+
+
+def test_a_camera_that_rests_shows_no_overlays():
+    assert not overlays(*survey([titled(film([0])[0])] * 9)).any()
+    assert not overlays(*survey([titled(image) for image in film([0, 1, 0, 1])])).any()
 
 
 def test_blur_lowers_sharpness():

@@ -10,7 +10,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_mask
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.frames import read_lens_mask, write_frames
+from coliags_plugin.pipeline.frames import found_mask, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
 from tests.pipeline.films import HEIGHT, WIDTH, blurred, film, write_images
 
@@ -73,3 +73,18 @@ def test_too_few_frames_of_use_are_refused(tmp_path, frames, message):
     with pytest.raises(InputError, match=message):
         write_frames(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
     assert not (tmp_path / "out").exists()
+
+
+def test_overlays_and_interlaced_frames_are_found(tmp_path, caplog):
+    labelled = [frame.copy() for frame in FILM]
+    for frame in labelled:
+        frame[80:100, 20:70] = (250, 250, 250)
+    mask = found_mask(frame_source(write_images(tmp_path / "labelled", labelled)))
+    assert not mask[80:100, 20:70].any() and mask[:70].all()
+    assert found_mask(frame_source(write_images(tmp_path / "plain", FILM))) is None
+    assert "interlaced" not in caplog.text
+    woven = [one.copy() for one in FILM[:-1]]
+    for frame, following in zip(woven, FILM[1:], strict=True):
+        frame[1::2] = following[1::2]
+    found_mask(frame_source(write_images(tmp_path / "woven", woven)))
+    assert "looks interlaced" in caplog.text

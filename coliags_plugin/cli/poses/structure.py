@@ -119,7 +119,8 @@ class PosesSfmCommand:
     distance: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
     mask: arguments.OptionalPath = None
-    """Mask image, black where pixels are ignored, or a folder with one per image."""
+    """Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings and
+    overlays of a video are ignored."""
     every: int = 1
     """Use every n-th image."""
     max_frames: arguments.OptionalInt = None
@@ -133,9 +134,10 @@ class PosesSfmCommand:
         """Reconstruct, write the scene and print a summary."""
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.pipeline.frame_sources import image_files
+        from coliags_plugin.pipeline.frame_sources import frame_source, image_files
+        from coliags_plugin.pipeline.frames import found_mask
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-        from coliags_plugin.reconstruction.structure.image_files import masks_for
+        from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for
         from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
         from coliags_plugin.reconstruction.structure.sfm import reconstruct
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -149,7 +151,14 @@ class PosesSfmCommand:
         settings = settings_of(SfmSettings, [*given, *self.set])
         with progress_callback() as progress, image_files(self.frames, progress) as files:
             images = files[:: self.every][: self.max_frames]
-            masks = None if self.mask is None else masks_for(self.mask, images)
+            masks: Masks = None
+            if self.mask is not None:
+                masks = masks_for(self.mask, images)
+            elif not self.frames.is_dir() and (found := found_mask(frame_source(self.frames), progress)) is not None:
+                _LOG.info(
+                    "ignored: black surroundings and overlays, %.0f %% of the image", 100.0 * (1.0 - found.mean())
+                )
+                masks = found
             atlas = reconstruct(images, settings, masks, progress)
             factor = millimetres(atlas.largest, self.diameter, known_distance)
             if factor is not None:
