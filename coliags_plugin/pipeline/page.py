@@ -32,6 +32,7 @@ from coliags_plugin.reporting.model import (
     TableCell,
     Template,
     Value,
+    as_cell,
     ranked_cells,
     simple_table,
 )
@@ -125,7 +126,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
             row[key] = cell
     for row, one in zip(rows, results, strict=False):
         if one.failure:
-            row["psnr"] = TableCell(note=one.failure)
+            row["psnr"] = replace(as_cell(row["psnr"]), note=one.failure)
     return Table("", columns, rows, name="submaps")
 
 

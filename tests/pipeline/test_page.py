@@ -14,6 +14,7 @@ from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, sub
 from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.pipeline.training_stages import SURFACE
 from coliags_plugin.reporting.terminal import terminal_text
+from tests.browser import Browser, find_chromium
 
 SURFACE_FILE = "run/mesh/surface.html"
 
@@ -106,3 +107,24 @@ def test_the_page_does_without_atlas_and_surfaces(page, atlas, tmp_path):
     assert "pip install" in text
     assert "Frames with a pose" not in text
     assert "sub-map 1" not in text
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width", [1400, 390])
+def test_another_surface_is_chosen_in_a_browser(page, tmp_path, width):
+    page()
+    for folder in ("", "submap-1"):
+        file = tmp_path / "out" / folder / SURFACE_FILE
+        file.parent.mkdir(parents=True)
+        file.write_text(f"<title>{folder}</title>")
+    with Browser(str(find_chromium())) as browser:
+        browser.open(tmp_path / "out" / "index.html", width, phone=width < 500)
+        assert browser.run("document.querySelector('iframe').src").endswith(f"out/{SURFACE_FILE}")
+        browser.run(
+            "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
+            "(document.querySelector('.surfaces select'))"
+        )
+        assert browser.run("document.querySelector('iframe').src").endswith(f"out/submap-1/{SURFACE_FILE}")
+        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+        assert browser.errors() == []
