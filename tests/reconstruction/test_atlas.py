@@ -11,7 +11,8 @@ import pytest
 
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
-from coliags_plugin.reconstruction.structure.atlas import Link, held_out_error, part_of, weak_links
+from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays, adjust, held_out_error
+from coliags_plugin.reconstruction.structure.atlas import Link, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
@@ -19,7 +20,6 @@ from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
 from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
-from coliags_plugin.reconstruction.structure.video import TEST_EVERY
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 #: Frames, the one after which most points change, and points seen from both sides of it.
@@ -101,6 +101,45 @@ def test_held_out_tracks_measure_the_poses(noise):
     assert held_out_error(model, [replace(frame, ids=frame.ids + 1) for frame in tracks]) is None
 
 
+def test_rays_of_exact_observations_meet_in_the_points():
+    model, _ = seen_points()
+    rays = Rays.of_points(model)
+    points = rays.triangulated()
+    expected = np.array([model.points3D[number].xyz for number in rays.ids])
+    np.testing.assert_allclose(points, expected, atol=1e-4)
+    np.testing.assert_allclose(rays.errors(model, points), 0.0, atol=1e-3)
+    few = rays.only(rays.images <= 2, 2)
+    assert set(few.images) == {1, 2}
+    np.testing.assert_array_equal(few.sums(np.ones(len(few.tracks))), 2)
+
+
+def test_adjustment_brings_poses_back_and_leaves_outliers_out():
+    model, observed = seen_points()
+    true = [model.images[number].cam_from_world().matrix() for number in range(1, COUNT + 1)]
+    ids = [points.points for points in observed]
+    rng = np.random.default_rng(0)
+    for number in range(3, COUNT + 1):  # of two cameras the gauge is fixed
+        pose = true[number - 1].copy()
+        pose[:, 3] += rng.normal(0.0, 0.3, 3)
+        model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+    wrong = model.images[5].points2D[3]
+    wrong.xy = wrong.xy + np.array([40.0, 0.0])
+    moved = model.images[5].points2D[3].xy
+    adjust(model, ids)
+    for number in range(1, COUNT + 1):
+        np.testing.assert_allclose(model.images[number].cam_from_world().matrix(), true[number - 1], atol=0.02)
+    np.testing.assert_array_equal(model.images[5].points2D[3].xy, moved)
+    assert not model.images[5].points2D[3].has_point3D()
+
+
+def test_images_that_see_few_points_are_not_held():
+    model, _ = seen_points()
+    assert held_part(model) is model
+    for observation in range(37):
+        model.delete_observation(8, observation)
+    assert sorted(held_part(model).reg_image_ids()) == list(range(1, COUNT))
+
+
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
     return reconstruct(list_images(write_tube(tmp_path_factory.mktemp("tube") / "scene", 8, 2.0) / "images"), TRACKED)
@@ -140,3 +179,12 @@ def test_the_ribbon_has_a_colour_for_every_model(tracked):
     colors = [tuple(int(value) for value in row[int((frame + 0.2) * 1160 / 8)]) for frame in range(8)]
     assert len(set(colors[:4])) == len(set(colors[4:7])) == 1
     assert len({colors[0], colors[4], colors[7]}) == 3
+
+
+def test_tracks_choose_the_lens_that_took_the_video(tmp_path):
+    images = list_images(write_tube(tmp_path / "scene", 16, 2.0) / "images")
+    atlas = reconstruct(images, SfmSettings(matching="tracks"))
+    (camera,) = atlas.largest.model.cameras.values()
+    assert camera.model_name == "SIMPLE_RADIAL_FISHEYE"
+    assert camera.params[3] == pytest.approx(0.333)  # of the three, the nearest to the tube's pinhole
+    assert len(atlas.largest.registered) == 16

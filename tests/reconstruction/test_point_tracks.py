@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.reconstruction.structure.point_tracks import epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 from coliags_plugin.reconstruction.structure.texture import wall_textures
+from coliags_plugin.reconstruction.structure.video import MatchedVideo
 from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
 
 #: Displacement of every pixel per frame, column and row.
@@ -109,3 +112,18 @@ def test_points_that_fit_no_motion_are_outliers():
     assert inliers[~wrong].mean() > 0.95
     assert inliers[wrong].mean() < 0.3
     assert not epipolar_inliers(pixels[:14], moved_to[:14], (HEIGHT, WIDTH), 2.5).any()
+
+
+def test_long_videos_are_cut_where_few_points_are_followed():
+    followed = [0, *[300] * 99]
+    followed[40], followed[70] = 20, 30
+    empty = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    frames = [FramePoints(*empty, count, shift=0.0, sharpness=1.0) for count in followed]
+    names = tuple(map(str, range(100)))
+    video = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * 100, (), (), {}, tuple(frames))
+    assert video.windows(100) == [range(100)]
+    assert video.windows(80) == [range(40), range(40, 100)]
+    windows = video.windows(50)
+    assert windows[:2] == [range(40), range(40, 70)]
+    assert [frame for window in windows for frame in window] == list(range(100))
+    assert max(map(len, windows)) <= 50

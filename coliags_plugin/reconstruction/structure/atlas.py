@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
 
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
-from coliags_plugin.reconstruction.structure.video import TEST_EVERY
+from coliags_plugin.reconstruction.structure.adjustment import Rays
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,6 +20,8 @@ _FEWEST_LINKING = 8
 #: Fewest points triangulated from either side alone that tell how the scales of the sides compare, largest difference
 #: of the scales, and largest uncertainty of it, as natural logarithms.
 _FEWEST_COMMON, _SAME_SCALE, _LEAST_CERTAIN = 5, 0.25, 0.15
+#: Points of a model that one of its images sees at least.
+_FEWEST_SEEN = 15
 #: Smallest angle between rays at a point of which the depth counts, degrees.
 _LEAST_ANGLE = 0.5
 
@@ -58,63 +58,35 @@ class Link:
 def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
     """Places of a model, image i having ID i + 1, at which few points are seen from both sides."""
     frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
-    points, first, last = _spans(model)
+    rays = Rays.of_points(model)
+    first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
     links = []
     for after, before in zip(frames[:-1].tolist(), frames[1:].tolist(), strict=True):
-        common = np.flatnonzero((first <= after) & (last >= before))
-        if len(common) < _STRONG_LINK:
-            links.append(_measured(model, after, points[common].tolist()))
+        common = (first <= after) & (last >= before)
+        if common.sum() < _STRONG_LINK:
+            links.append(_measured(rays.only(common[rays.tracks], 2), after))
     return links
 
 
-def _spans(
-    model: pycolmap.Reconstruction,
-) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
-    """IDs of the points, ascending, and the first and last frame of each."""
-    points = sorted(model.points3D)
-    seen = [[element.image_id for element in model.points3D[point].track.elements] for point in points]
-    return np.array(points), np.array([min(ids) for ids in seen]) - 1, np.array([max(ids) for ids in seen]) - 1
-
-
-def _measured(model: pycolmap.Reconstruction, after: int, common: Sequence[int]) -> Link:
+def _measured(rays: Rays, after: int) -> Link:
     """The link by points seen from both sides, with the ratio of their depths triangulated from either side alone."""
-    ratios = []
-    for point in common:
-        sides: tuple[list[Any], list[Any]] = ([], [])
-        for element in model.points3D[point].track.elements:
-            sides[element.image_id - 1 > after].append(_ray(model, element.image_id, element.point2D_idx))
-        positions = [_triangulated(side) for side in sides]
-        if positions[0] is None or positions[1] is None:
-            continue
-        origin = sides[0][-1][0]
-        ratios.append(float(np.log(np.linalg.norm(positions[1] - origin) / np.linalg.norm(positions[0] - origin))))
+    is_before = rays.images - 1 <= after
+    if not len(rays.ids):
+        return Link(after, 0, None, None)
+    origin = rays.centers[np.argmax(np.where(is_before, rays.images, 0))]
+    log_depths = np.full((2, len(rays.ids)), np.nan)
+    for row, side in enumerate((is_before, ~is_before)):
+        here = rays.only(side, 2)
+        points = here.triangulated()
+        depths = np.where(here.angles(points) >= _LEAST_ANGLE, np.linalg.norm(points - origin, axis=1), np.nan)
+        log_depths[row, np.searchsorted(rays.ids, here.ids)] = np.log(depths)
+    ratios = log_depths[1] - log_depths[0]
+    ratios = ratios[~np.isnan(ratios)]
     if len(ratios) < _FEWEST_COMMON:
-        return Link(after, len(common), None, None)
+        return Link(after, len(rays.ids), None, None)
     middle = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(np.array(ratios) - middle)))
-    return Link(after, len(common), middle, max(spread, 0.02) / np.sqrt(len(ratios)))
-
-
-def _ray(
-    model: pycolmap.Reconstruction, image_id: int, index: int
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Camera centre and direction of an observation, world, unit length."""
-    image = model.images[image_id]
-    x, y = image.camera.cam_from_img(image.points2D[index].xy)
-    direction = image.cam_from_world().rotation.matrix().T @ np.array([x, y, 1.0])
-    return np.asarray(image.projection_center()), direction / np.linalg.norm(direction)
-
-
-def _triangulated(rays: Sequence[tuple[np.ndarray, np.ndarray]]) -> Float[np.ndarray, "3"] | None:
-    """The point nearest to two or more rays; None where they are nearly parallel or it lies behind a camera."""
-    if len(rays) < 2:
-        return None
-    centers, directions = (np.array(column) for column in zip(*rays, strict=True))
-    if np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))).max() < _LEAST_ANGLE:
-        return None
-    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    point = np.linalg.solve(projectors.sum(axis=0), np.einsum("nij,nj->i", projectors, centers))
-    return point if (np.einsum("ni,ni->n", point - centers, directions) > 0.0).all() else None
+    spread = 1.4826 * float(np.median(np.abs(ratios - middle)))
+    return Link(after, len(rays.ids), middle, max(spread, 0.02) / np.sqrt(len(ratios)))
 
 
 def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.Reconstruction:
@@ -131,29 +103,14 @@ def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.R
     return part
 
 
-def held_out_error(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> float | None:
-    """Median distance of tracks that mapping has not used from where the model sees them, pixels; None without any.
+def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model without images that see too few of its points for their poses to be believed; itself if there are none.
 
-    Each is triangulated from three or more frames of the model; its error is the median over these.
+    Image i has ID i + 1.
     """
-    rays: dict[int, list[Any]] = {}
-    for number in sorted(model.reg_image_ids()):
-        frame, image = tracks[number - 1], model.images[number]
-        test = frame.ids % TEST_EVERY == 0
-        local = np.asarray(image.camera.cam_from_img(frame.pixels[test].astype(np.float64))).reshape(-1, 2)
-        rays_here = np.concatenate([local, np.ones((len(local), 1))], axis=1)
-        directions = rays_here @ image.cam_from_world().rotation.matrix()
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        for track, direction in zip(frame.ids[test].tolist(), directions, strict=True):
-            rays.setdefault(track, []).append((np.asarray(image.projection_center()), direction))
-    focal_length = next(iter(model.cameras.values())).mean_focal_length()
-    errors = []
-    for observations in rays.values():
-        point = _triangulated(observations) if len(observations) >= 3 else None
-        if point is None:
-            continue
-        offsets = np.array([point - center for center, _ in observations])
-        directions = np.array([direction for _, direction in observations])
-        angles = np.arctan2(np.linalg.norm(np.cross(offsets, directions), axis=1), (offsets * directions).sum(axis=1))
-        errors.append(float(np.median(angles)) * focal_length)
-    return float(np.median(errors)) if errors else None
+    while True:
+        numbers = sorted(model.reg_image_ids())
+        held = [number for number in numbers if model.images[number].num_points3D >= _FEWEST_SEEN]
+        if len(held) == len(numbers):
+            return model
+        model = part_of(model, [number - 1 for number in held])

@@ -26,10 +26,12 @@ def write_database(
     keypoints: Sequence[Float32[np.ndarray, "K D"]],
     matches: Matches,
     verified: bool,
+    first_index: int = 0,
 ) -> None:
     """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.
 
-    Matches that are ``verified`` are stored as inliers of a two-view geometry; the others COLMAP has to verify.
+    Images are counted from ``first_index``, those of the matches too. Matches that are ``verified`` are stored as
+    inliers of a two-view geometry; the others COLMAP has to verify.
     """
     import pycolmap
 
@@ -41,7 +43,8 @@ def write_database(
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
-        for number, ((name, camera_index), image_keypoints) in enumerate(zip(images, keypoints, strict=True), start=1):
+        numbered = enumerate(zip(images, keypoints, strict=True), start=first_index + 1)
+        for number, ((name, camera_index), image_keypoints) in numbered:
             image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +17,18 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.reconstruction.structure.adjustment import adjust, held_out_error
+from coliags_plugin.reconstruction.structure.atlas import held_part, part_of
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
-from coliags_plugin.reconstruction.structure.sfm_cameras import Start, distortion, field_of_view, is_refined, starts
+from coliags_plugin.reconstruction.structure.sfm_cameras import (
+    Start,
+    distortion,
+    field_of_view,
+    is_refined,
+    starting_cameras,
+    starts,
+    tracked_starts,
+)
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
@@ -242,3 +252,90 @@ def _compare(chosen: Hypothesis, hypotheses: Sequence[Hypothesis], plausible: tu
             name,
             *(100.0 * (getattr(rival, value) / getattr(chosen, value) - 1.0) for value in compared),
         )
+
+
+#: Models on which cameras are tried, and their fewest images; cameras whose errors differ by less than this factor are
+#: not told apart.
+_TRIED_MODELS, _FEWEST_TRIED, _SAME_TEST = 3, 12, 1.02
+
+
+def find_tracked_camera(
+    models: Sequence[pycolmap.Reconstruction],
+    video: MatchedVideo,
+    settings: SfmSettings,
+    progress: Progress | None = None,
+) -> Start:
+    """The most likely lens and focal length of least error of held-out tracks, on parts of the largest models.
+
+    First lenses of one focal length are tried, then the other focal lengths with the best lens.
+    """
+    lenses, factors = tracked_starts(settings.camera)
+    count = len(lenses) + len(factors) - 1
+    if count == 1:
+        return lenses[0]
+    large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
+    parts = [_middle_of(model, settings.search_images) for model in large]
+    errors: dict[Start, float] = {}
+
+    def likely(tried: Sequence[Start]) -> list[Start]:
+        for start in tried:
+            if progress is not None:
+                progress("try cameras", len(errors) + 1, count)
+            errors[start] = _test_error(parts, video, settings, start)
+            shape = "" if start.radial is None else f", distortion {start.radial:g}"
+            log.info(
+                "%s, focal length %.2f of the larger side%s: error of held-out tracks %.3f px",
+                *(start.model, start.focal_factor, shape, errors[start]),
+            )
+        return [start for start, error in errors.items() if error <= _SAME_TEST * min(errors.values())]
+
+    lens = likely(lenses)[0]
+    left = likely([replace(lens, focal_factor=factor) for factor in factors[1:]])
+    side = max(video.sizes[0])
+    least, *_, most = sorted([side * start.focal_factor for start in left] * 2)
+    if most > _OTHER_FOCAL_LENGTH * least:
+        log.warning(
+            "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
+            "and surface: give the camera's calibration (--camera, --params) if there is one",
+            *(least, most),
+        )
+    return left[0]
+
+
+def _middle_of(model: pycolmap.Reconstruction, count: int) -> pycolmap.Reconstruction:
+    """The model with at most ``count`` images around its middle."""
+    frames = [number - 1 for number in sorted(model.reg_image_ids())]
+    first = max(0, (len(frames) - count) // 2)
+    return part_of(model, frames[first : first + count])
+
+
+def _test_error(
+    parts: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings, start: Start
+) -> float:
+    """Geometric mean over the models of the error of held-out tracks with a camera, pixels; infinite if unknown."""
+    import pycolmap
+
+    errors = []
+    for part in parts:
+        tried = pycolmap.Reconstruction(part)
+        with_camera(tried, video, settings, start)
+        adjust(tried, video.track_ids)
+        errors.append(held_out_error(tried, video.tracks, 0.0))
+    known = [error for error in errors if error is not None]
+    return float(np.exp(np.mean(np.log(known)))) if known else np.inf
+
+
+def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings, start: Start) -> None:
+    """Set the parameters of the model's camera, in place; the images have one size."""
+    (camera,) = starting_cameras(settings.camera, video.images, video.sizes, start)
+    for mine in model.cameras.values():
+        mine.params = camera.params
+
+
+def adjusted(model: pycolmap.Reconstruction, video: MatchedVideo) -> Hypothesis:
+    """The model adjusted by all tracks, reversed in depth if the lamp tells so, without images that few points hold."""
+    adjust(model, video.track_ids)
+    chosen = best(both_signs(model, video, refined=False))
+    if chosen.is_reversed:
+        adjust(chosen.model, video.track_ids)
+    return Hypothesis.of(held_part(chosen.model), video.brightness, chosen.is_reversed)

@@ -12,15 +12,30 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.libraries import quiet_colmap
-from coliags_plugin.reconstruction.structure.atlas import Link, held_out_error, part_of, weak_links
-from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, best, both_signs, choose, find_start
+from coliags_plugin.reconstruction.structure.adjustment import held_out_error
+from coliags_plugin.reconstruction.structure.atlas import Link, part_of, weak_links
+from coliags_plugin.reconstruction.structure.hypotheses import (
+    Hypothesis,
+    adjusted,
+    best,
+    both_signs,
+    choose,
+    find_start,
+    find_tracked_camera,
+    with_camera,
+)
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
-from coliags_plugin.reconstruction.structure.sfm_cameras import field_of_view, has_known_camera, is_refined
+from coliags_plugin.reconstruction.structure.sfm_cameras import (
+    field_of_view,
+    has_known_camera,
+    is_refined,
+    tracked_starts,
+)
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, read_video
 
@@ -107,8 +122,9 @@ def reconstruct(
 ) -> Atlas:
     """Estimate poses and points by structure from motion.
 
-    An unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`), and refined on
-    the largest model; the others are adjusted with its cameras, unless their images have other sizes.
+    With features, an unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`),
+    and refined on the largest model; the others are adjusted with its cameras, unless their images have other sizes.
+    With tracks, its lens and focal length are those that held-out tracks favour (:func:`find_tracked_camera`).
 
     Args:
         images: Files in video order. Images of the same size share a camera.
@@ -126,8 +142,8 @@ def reconstruct(
         raise InputError(f"{len(images)} images", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         video = read_video(images, settings, masks, progress)
-        models = video.mapped(settings, find_start(video, settings, progress), progress)
-        if not models:
+        chosen = _tracked(video, settings, progress) if video.tracks else _matched(video, settings, progress)
+        if not chosen:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
             raise InputError(
@@ -137,18 +153,42 @@ def reconstruct(
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
             )
-        refined = is_refined(settings.camera)
-        known = has_known_camera(settings.camera) and not refined
-        first = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
-        chosen = [first]
-        for model in models[1:]:
-            has_its_cameras = set(model.cameras) <= set(first.model.cameras)
-            if has_its_cameras:
-                for number, camera in model.cameras.items():
-                    camera.params = first.model.cameras[number].params
-                bundle_adjust(model, refine_camera=False)
-            chosen.append(best(both_signs(model, video, refined and not has_its_cameras)))
         return _atlas(video, chosen, settings)
+
+
+def _tracked(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
+    """Models of tracks with one camera, the best of those tried on the largest of them."""
+    models = video.mapped(settings, tracked_starts(settings.camera)[0][0], progress)
+    if not models:
+        return []
+    start = find_tracked_camera(models, video, settings, progress)
+    for model in models:
+        with_camera(model, video, settings, start)
+    if settings.camera.refine:
+        bundle_adjust(models[0], refine_camera=True)
+        for model in models[1:]:
+            for number, camera in model.cameras.items():
+                camera.params = models[0].cameras[number].params
+    return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
+
+
+def _matched(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
+    """Models of matched features, with the cameras of the largest where image sizes are the same."""
+    models = video.mapped(settings, find_start(video, settings, progress), progress)
+    if not models:
+        return []
+    refined = is_refined(settings.camera)
+    known = has_known_camera(settings.camera) and not refined
+    first = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
+    chosen = [first]
+    for model in models[1:]:
+        has_its_cameras = set(model.cameras) <= set(first.model.cameras)
+        if has_its_cameras:
+            for number, camera in model.cameras.items():
+                camera.params = first.model.cameras[number].params
+            bundle_adjust(model, refine_camera=False)
+        chosen.append(best(both_signs(model, video, refined and not has_its_cameras)))
+    return chosen
 
 
 def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSettings) -> Atlas:

@@ -31,6 +31,7 @@ class Start:
 
     model: str  # of COLMAP, or of CALIBRATED
     focal_factor: float  # focal length relative to the image's larger side, where no parameters are known
+    radial: float | None = None  # the model's last parameter, its only one of distortion; None: undistorted
 
 
 def starts(settings: CameraSettings) -> list[Start]:
@@ -44,6 +45,21 @@ def starts(settings: CameraSettings) -> list[Start]:
         return [*(Start(_FISHEYE, factor) for factor in settings.focal_factors), Start(_UNDISTORTED, likely)]
     factors = (likely,) if has_known_camera(settings) else settings.focal_factors
     return [Start(settings.model, factor) for factor in factors]
+
+
+#: Distortion of the fisheye lenses tried on tracks, the most likely first: nearly a pinhole's image, whose radius is
+#: tan(x) = x + x^3 / 3 + ..., equal angles at equal distances, and between; and focal lengths, relative to the side.
+_RADIALS, _TRACKED_FACTORS = (0.333, 0.0, 0.167), (0.57, 0.4, 0.48, 0.68, 0.82, 1.0)
+
+
+def tracked_starts(settings: CameraSettings) -> tuple[list[Start], list[float]]:
+    """Lenses to try on tracks, the most likely first, all of one focal length; and focal lengths, this one first."""
+    factors = list(settings.focal_factors if settings.refine is False else _TRACKED_FACTORS)
+    if has_known_camera(settings):
+        factors = factors[:1]
+    if settings.model is not None or settings.refine is False:
+        return [Start(settings.model or _FISHEYE, factors[0])], factors
+    return [Start(_FISHEYE, factors[0], radial) for radial in _RADIALS], factors
 
 
 def has_known_camera(settings: CameraSettings) -> bool:
@@ -92,6 +108,8 @@ def starting_cameras(
             model, params = calibrated_camera(model, width, height)
         focal_length = start.focal_factor * max(width, height)
         camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, width, height)
+        if start.radial is not None:
+            camera.params = [*camera.params[:-1], start.radial]
         if params is not None:
             if len(params) != len(camera.params):
                 raise InputError(f"{len(params)} parameters for {model}", f"{len(camera.params)}: {camera.params_info}")

@@ -79,6 +79,11 @@ class TrackSettings(Settings):
         description="Where fewer points survive, those lost are searched for again in the next frames; 0: never.",
     )
     longest_bridge: int = Field(default=4, ge=0, description="Number of frames in which lost points are searched for.")
+    longest_window: int = Field(
+        default=400,
+        ge=8,
+        description="Largest number of frames mapped together; longer videos are cut where few points are followed.",
+    )
 
 
 class SfmSettings(Settings):
@@ -110,6 +115,9 @@ class SfmSettings(Settings):
     )
     min_model_size: int = Field(default=3, ge=2, description="Least number of registered images of a model.")
     search_images: int = Field(
-        default=24, ge=3, description="An unknown camera is chosen on this many images from the middle of the video."
+        default=24,
+        ge=3,
+        description="An unknown camera is chosen on this many images from the middle of the video; with tracks, from "
+        "the middle of each of the three largest models.",
     )
     seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")

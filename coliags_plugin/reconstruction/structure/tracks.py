@@ -75,16 +75,23 @@ class Tracks:
 
 
 def widest_angles(tracks: Tracks, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
-    """Upper bound of the widest angle between a point's rays, degrees: twice the largest angle to their mean."""
+    """Upper bound of the widest angle between a point's rays, degrees."""
     poses = _poses(cameras)[tracks.frames]
     rays = tracks.positions[tracks.points] - poses[:, :3, 3]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    mean = np.zeros((len(tracks), 3))
-    np.add.at(mean, tracks.points, rays)
+    return widest_between(rays / np.linalg.norm(rays, axis=1, keepdims=True), tracks.points, len(tracks))
+
+
+def widest_between(rays: Float[np.ndarray, "K 3"], points: Int[np.ndarray, "K"], count: int) -> Float[np.ndarray, "N"]:
+    """Upper bound of the widest angle between each point's rays, degrees: twice the largest angle to their mean.
+
+    ``rays`` have unit length; ``points`` are those that they belong to, of ``count``. NaN for a point with NaN rays.
+    """
+    mean = np.zeros((count, 3))
+    np.add.at(mean, points, rays)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    sines = np.linalg.norm(np.cross(rays, mean[tracks.points]), axis=1)
-    widest = np.zeros(len(tracks))
-    np.maximum.at(widest, tracks.points, sines)
+    sines = np.linalg.norm(np.cross(rays, mean[points]), axis=1)
+    widest = np.zeros(count)
+    np.maximum.at(widest, points, sines)
     return np.degrees(2.0 * np.arcsin(np.minimum(widest, 1.0)))
 
 

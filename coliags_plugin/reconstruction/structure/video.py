@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int64
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
@@ -42,29 +44,16 @@ class MatchedVideo:
     brightness: tuple[Float[np.ndarray, "K"], ...]  # at the keypoints
     matches: Matches
     tracks: tuple[FramePoints, ...] = ()  # of each image, where matches are of tracks
+    track_ids: tuple[Int64[np.ndarray, "K"], ...] = ()  # of the keypoints, where matches are of tracks
 
     def search_part(self, count: int) -> MatchedVideo:
-        """At most ``count`` images on which cameras are tried."""
-        return self._moving(count) if self.tracks else self._middle(count)
+        """At most ``count`` images around the middle, on which cameras are tried.
 
-    def _moving(self, count: int) -> MatchedVideo:
-        """Every second frame, or every one of a short video, of the stretch where points move and survive best."""
-        step = 2 if len(self.images) >= 2 * count else 1
-        good = [min(frame.followed / 300.0, 1.0) * min(frame.shift / 0.015, 1.0) for frame in self.tracks]
-        reach = min(step * count, len(good))
-        first = int(np.argmax(np.convolve(good, np.ones(reach), "valid")))
-        return self._part(list(range(first, first + reach, step))[:count])
-
-    def _middle(self, count: int) -> MatchedVideo:
-        """At most ``count`` images around the middle: every second or fourth, if there are enough.
-
-        These are matched like all (:func:`alike_pairs`).
+        Every second or fourth, if there are enough: these are matched like all (:func:`alike_pairs`).
         """
         step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
-        return self._part(list(range(first, len(self.images), step))[:count])
-
-    def _part(self, kept: list[int]) -> MatchedVideo:
+        kept = list(range(first, len(self.images), step))[:count]
         row_of = {index: row for row, index in enumerate(kept)}
         pick = itemgetter(*kept)  # of two or more, so that it gives tuples
         matches = {
@@ -81,12 +70,39 @@ class MatchedVideo:
         cameras = starting_cameras(settings.camera, self.images, self.sizes, start)
         kinds = list(dict.fromkeys(self.sizes))
         named = [(name, kinds.index(size)) for name, size in zip(self.names, self.sizes, strict=True)]
+        models = []
         with tempfile.TemporaryDirectory() as scratch:
-            database = Path(scratch) / "database.db"
-            write_database(database, cameras, named, self.keypoints, self.matches, verified=False)
-            if self.tracks:
-                return map_tracks(database, Path(scratch) / "models", settings)
-            return map_images(database, Path(scratch) / "models", settings, len(self.images), progress)
+            database, folder = Path(scratch) / "database.db", Path(scratch) / "models"
+            if not self.tracks:
+                write_database(database, cameras, named, self.keypoints, self.matches, verified=False)
+                return map_images(database, folder, settings, len(self.images), progress)
+            windows = self.windows(settings.tracks.longest_window)
+            if len(windows) > 1:
+                cuts = ", ".join(str(window.start) for window in windows[1:])
+                log.info("the video is mapped in %d windows, cut before frames %s", len(windows), cuts)
+            for window in with_progress(windows, "find poses", progress if len(windows) > 1 else None):
+                frames = slice(window.start, window.stop)
+                inside = {(i, j): pairs for (i, j), pairs in self.matches.items() if i in window and j in window}
+                write_database(database, cameras, named[frames], self.keypoints[frames], inside, False, window.start)
+                models += map_tracks(database, folder, settings)
+                database.unlink()
+                shutil.rmtree(folder)
+        return sorted(models, key=lambda model: -model.num_reg_images())
+
+    def windows(self, longest: int) -> list[range]:
+        """Stretches of frames, each mapped by itself: cut where few points are followed, if longer than ``longest``."""
+        followed = np.array([frame.followed for frame in self.tracks])
+        done, left = [], [range(len(self.images))]
+        while left:
+            window = left.pop()
+            if len(window) <= longest:
+                done.append(window)
+                continue
+            # In the middle half, so that windows are not shorter than a quarter of the longest.
+            start, stop = window.start + len(window) // 4, window.start + 3 * len(window) // 4
+            cut = start + int(np.argmin(followed[start:stop]))
+            left += [range(window.start, cut), range(cut, window.stop)]
+        return sorted(done, key=lambda window: window.start)
 
 
 def read_video(
@@ -174,8 +190,8 @@ def _with_features(
 
 #: Frames apart whose common tracks are matches, and fewest of them.
 _APART, _FEWEST_COMMON = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64), 15
-#: Fewest frames of a track that is used; of so many tracks one is kept for the test of the poses.
-_LEAST_LENGTH, TEST_EVERY = 3, 5
+#: Fewest frames of a track that is used.
+_LEAST_LENGTH = 3
 
 
 def _tracked(
@@ -192,4 +208,4 @@ def _tracked(
                 matches[first, second] = np.stack([one, other], axis=1).astype(np.uint32)
     keypoints = tuple(frame.pixels[rows] for frame, rows in zip(points, used, strict=True))
     brightness = tuple(frame.brightness[rows].astype(np.float64) for frame, rows in zip(points, used, strict=True))
-    return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points))
+    return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points), tuple(ids))

@@ -1,0 +1,217 @@
+"""Points of tracks, triangulated from the poses of a model and adjusted with them by a robust cost; cameras are fixed.
+
+Mapping keeps the points of which it is sure. Here every track that its rays agree on takes part, those at small angles
+too, which tell the rotations, and each frame is held by two to three times as many points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int64
+
+from coliags_plugin.reconstruction.structure.outliers import median_of_points
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
+from coliags_plugin.reconstruction.structure.tracks import widest_between
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Of so many tracks one is kept for the test of the poses, and fewest frames of such a track.
+TEST_EVERY, _FEWEST_FRAMES = 5, 3
+#: Smallest angle between the rays of a point that is adjusted, and of one that tests the poses, degrees.
+_LEAST_ANGLE, _LEAST_TEST_ANGLE = 0.4, 0.5
+#: Largest error of an observation that is adjusted, pixels: first, while poses are those of mapping, and then.
+_MAX_ERRORS = (20.0, 6.0)
+#: Error at which Cauchy's cost turns from squared to logarithmic, pixels.
+_SCALE = 1.0
+#: Steps of the triangulation's iteration, and of the adjustment's.
+_STEPS, _ADJUSTMENT_STEPS = 8, 30
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Observations of N tracks in the frames of a model, sorted by track, as rays."""
+
+    ids: Int64[np.ndarray, "N"]  # of the tracks
+    tracks: Int[np.ndarray, "K"]  # which of the tracks
+    images: Int[np.ndarray, "K"]  # image IDs
+    rows: Int[np.ndarray, "K"]  # which of the points of the image
+    pixels: Float[np.ndarray, "K 2"]
+    centers: Float[np.ndarray, "K 3"]  # of the cameras, world
+    directions: Float[np.ndarray, "K 3"]  # world, unit length
+
+    @classmethod
+    def of(
+        cls,
+        model: pycolmap.Reconstruction,
+        ids: Sequence[Int64[np.ndarray, "P"]],
+        pixels: Sequence[Any],
+    ) -> Rays:
+        """Observations in the frames of the model; image i has ID i + 1, and its tracks and pixels are given at i."""
+        parts = []
+        for number in sorted(model.reg_image_ids()):
+            image, here = model.images[number], np.asarray(pixels[number - 1], np.float64).reshape(-1, 2)
+            local = np.asarray(image.camera.cam_from_img(here)).reshape(-1, 2)
+            directions = np.concatenate([local, np.ones((len(local), 1))], axis=1)
+            directions = directions @ image.cam_from_world().rotation.matrix()
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            centers = np.tile(np.asarray(image.projection_center()), (len(local), 1))
+            count = len(local)
+            parts.append((ids[number - 1], np.full(count, number), np.arange(count), here, centers, directions))
+        every, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.argsort(every, kind="stable")
+        kept, tracks = np.unique(every[order], return_inverse=True)
+        return cls(kept, tracks, *(column[order] for column in columns))
+
+    @classmethod
+    def of_points(cls, model: pycolmap.Reconstruction) -> Rays:
+        """Observations of the model's points, by their IDs."""
+        ids: list[Any] = [None] * max(model.images)
+        pixels = ids.copy()
+        for number in model.reg_image_ids():
+            observed = list(model.images[number].get_observation_points2D())
+            ids[number - 1] = np.array([point.point3D_id for point in observed], np.int64)
+            pixels[number - 1] = [point.xy for point in observed]
+        return cls.of(model, ids, pixels)
+
+    def only(self, kept: Bool[np.ndarray, "K"], fewest: int) -> Rays:
+        """Some of the observations: of tracks that are left with ``fewest`` or more."""
+        lengths = np.bincount(self.tracks, kept, len(self.ids))
+        kept = kept & (lengths >= fewest)[self.tracks]
+        number = np.cumsum(lengths >= fewest) - 1
+        rows = (self.images, self.rows, self.pixels, self.centers, self.directions)
+        return Rays(self.ids[lengths >= fewest], number[self.tracks[kept]], *(column[kept] for column in rows))
+
+    def at_least(self, fewest: int) -> Rays:
+        """The tracks of ``fewest`` observations or more."""
+        return self.only(np.ones(len(self.tracks), bool), fewest)
+
+    @property
+    def starts(self) -> Int[np.ndarray, "N"]:
+        """The first observation of each track."""
+        return np.searchsorted(self.tracks, np.arange(len(self.ids)))
+
+    def sums(self, values: Float[np.ndarray, "K ..."]) -> Float[np.ndarray, "N ..."]:
+        """Sums over the observations of each track."""
+        return np.asarray(np.add.reduceat(values, self.starts)) if len(self.ids) else values[:0]
+
+    def triangulated(self) -> Float[np.ndarray, "N 3"]:
+        """The point of each track at the least angles to its rays, world; NaN where it is not in front of all cameras.
+
+        From the point nearest to the rays, by Levenberg and Marquardt's method.
+        """
+        across = np.eye(3) - self.directions[:, :, None] * self.directions[:, None, :]
+        normal = self.sums(across) + 1e-9 * np.eye(3)
+        points = _solved(normal, self.sums(np.einsum("kij,kj->ki", across, self.centers)))
+        damping = np.full(len(points), 1e-3)
+        away, inverse_lengths = self._away(points)
+        cost = self.sums(((away - self.directions) ** 2).sum(axis=1))
+        for _ in range(_STEPS):
+            slopes = (np.eye(3) - away[:, :, None] * away[:, None, :]) * inverse_lengths[:, None, None]
+            normal = self.sums(np.einsum("kij,kil->kjl", slopes, slopes))
+            normal += (damping[:, None] * np.einsum("nii->ni", normal) + 1e-15)[:, :, None] * np.eye(3)
+            pull = self.sums(np.einsum("kij,ki->kj", slopes, away - self.directions))
+            tried = points - _solved(normal, pull)
+            tried_cost = self.sums(((self._away(tried)[0] - self.directions) ** 2).sum(axis=1))
+            better = tried_cost < cost
+            points[better], cost[better] = tried[better], tried_cost[better]
+            damping *= np.where(better, 0.1, 10.0)
+            away, inverse_lengths = self._away(points)
+        behind = (away * self.directions).sum(axis=1) <= 0.0
+        points[self.tracks[behind]] = np.nan
+        return points
+
+    def angles(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+        """Upper bound of the widest angle between the lines from a point to its cameras, degrees."""
+        with np.errstate(invalid="ignore"):  # NaN points
+            return widest_between(self._away(points)[0], self.tracks, len(self.ids))
+
+    def errors(self, model: pycolmap.Reconstruction, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:
+        """Distances of the observations from where the model sees the points, pixels; infinite behind the camera."""
+        errors = np.full(len(self.tracks), np.inf)
+        for number in np.unique(self.images).tolist():
+            here, image = np.flatnonzero(self.images == number), model.images[number]
+            pose = image.cam_from_world().matrix()
+            local = points[self.tracks[here]] @ pose[:, :3].T + pose[:, 3]
+            front = local[:, 2] > 0.0
+            seen = np.asarray(image.camera.img_from_cam(local[front])).reshape(-1, 2)
+            errors[here[front]] = np.linalg.norm(seen - self.pixels[here[front]], axis=1)
+        return errors
+
+    def _away(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
+        """Directions from the cameras to the points, and one over their distances."""
+        offsets = points[self.tracks] - self.centers
+        inverse_lengths = 1.0 / np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+        return offsets * inverse_lengths[:, None], inverse_lengths
+
+
+def _solved(matrices: Float[np.ndarray, "N 3 3"], vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    return np.asarray(np.linalg.solve(matrices, vectors[..., None])[..., 0])
+
+
+def held_out_error(
+    model: pycolmap.Reconstruction, tracks: Sequence[FramePoints], least_angle: float = _LEAST_TEST_ANGLE
+) -> float | None:
+    """Median distance of tracks that mapping has not used from where the model sees them, pixels; None without any.
+
+    Each is triangulated from three or more frames of the model; its error is the median over these. Those at rays
+    within ``least_angle``, degrees, do not count.
+    """
+    rays = Rays.of(model, [frame.ids for frame in tracks], [frame.pixels for frame in tracks])
+    rays = rays.only((rays.ids % TEST_EVERY == 0)[rays.tracks], _FEWEST_FRAMES)
+    points = rays.triangulated()
+    counted = rays.angles(points) >= least_angle  # not NaN
+    if not counted.any():
+        return None
+    return float(np.median(median_of_points(rays.errors(model, points), rays.tracks, len(rays.ids))[counted]))
+
+
+def adjust(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]]) -> None:
+    """Triangulate all tracks again and adjust them with the poses, twice, in place.
+
+    ``ids`` are the tracks of the points2D of each image; image i has ID i + 1.
+    """
+    import pycolmap
+
+    options: Any = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    ceres = getattr(options, "ceres", options)
+    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = 1, _ADJUSTMENT_STEPS
+    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, _SCALE
+    for max_error in _MAX_ERRORS:
+        _triangulate(model, ids, max_error)
+        whole = pycolmap.BundleAdjustmentConfig()
+        for number in model.reg_image_ids():
+            whole.add_image(number)
+        whole.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, whole, model).solve()
+    pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERRORS[-1], _LEAST_ANGLE)
+    model.update_point_3d_errors()
+
+
+def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]], max_error: float) -> None:
+    """Replace the points of a model by those of all tracks that two or more frames see within an error, pixels."""
+    import pycolmap
+
+    for number in list(model.points3D):
+        model.delete_point3D(number)
+    pixels: list[Any] = [None] * len(ids)
+    for number in model.reg_image_ids():
+        pixels[number - 1] = [point.xy for point in model.images[number].points2D]
+    rays = Rays.of(model, ids, pixels).at_least(2)
+    points = rays.triangulated()
+    fits: Bool[np.ndarray, "K"] = rays.errors(model, points) <= max_error
+    lengths = np.bincount(rays.tracks, fits, len(rays.ids))
+    kept = (lengths >= 2) & (rays.angles(points) >= _LEAST_ANGLE)
+    black = np.zeros(3, np.uint8)
+    starts = np.append(rays.starts, len(rays.tracks))
+    for index in np.flatnonzero(kept).tolist():
+        track = pycolmap.Track()
+        for row in range(starts[index], starts[index + 1]):
+            if fits[row]:
+                track.add_element(int(rays.images[row]), int(rays.rows[row]))
+        model.add_point3D(points[index], track, black)
