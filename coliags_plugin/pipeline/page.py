@@ -181,7 +181,7 @@ def write_index(record: Record, posed: Path, title: str) -> None:
     atlas = read_atlas(posed)
     spans = {} if atlas is None else _spans(atlas)
     sections = [
-        Section("Video", [] if atlas is None else list(_video(atlas, posed, results))),
+        Section("Video", list(_video(record, atlas, posed))),
         Section("Sub-maps", [submap_table(results, spans), *_remarks(record)]),
         Section("Surfaces", _surfaces(results)),
         *_views(record.folder, results),
@@ -196,7 +196,7 @@ def _facts(record: Record, results: Sequence[SubmapResults], atlas: AtlasRecord 
     if atlas is not None:
         count = len(atlas.frames)
         posed = count - len(atlas.lost)
-        yield Fact("Frames with a pose", f"{posed} of {count} ({100.0 * posed / count:.0f} %)")
+        yield Fact("Frames with a pose", f"{posed} of {count} used ({100.0 * posed / count:.0f} %)")
         models = len({stretch.model for stretch in atlas.submaps})
         failed = sum(bool(one.failure) for one in results)
         yield Fact(
@@ -218,16 +218,20 @@ def _spans(atlas: AtlasRecord) -> dict[int, str]:
     return {number: f"{min(own)} to {max(own)}" for number, own in frames.items() if own}
 
 
-def _video(atlas: AtlasRecord, posed: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
+def _video(record: Record, atlas: AtlasRecord | None, posed: Path) -> Iterator[Block]:
     from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE
 
+    if "frames" in record.stages:
+        yield Paragraph(f"Used are {record.stages['frames'].summary}. frames/frames.json lists them.", hint=False)
+    if atlas is None:
+        return
     if (posed / RIBBON_FILE).is_file():
         yield Paragraph(
             "From left to right, the frames: each colour is a model, with its number of frames, grey has no pose. A "
             "notch marks a place where few points are seen from both sides."
         )
         yield Figures([Image(EncodedImage.png(read_rgb(posed / RIBBON_FILE)), "", wide=True)])
-    rows = list(_stretches(atlas, {one.submap.number for one in results}))
+    rows = list(_stretches(atlas, {one.submap.number for one in results_of(record)}))
     table = simple_table(["Frames", "Number", "What", "Why"], rows)
     table = replace(table, columns=[replace(column, words=column.key != "Number") for column in table.columns])
     yield Folded(f"{len(rows)} stretches of frames, and why they end", [table], is_open=len(rows) <= _LONG)

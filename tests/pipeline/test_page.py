@@ -83,7 +83,7 @@ def test_the_page_tells_which_frames_have_a_pose_and_why_others_have_none(page, 
     write_json(atlas / ATLAS_FILE, content | {"joins": joins})
     write_png(atlas / "atlas.png", np.full((60, 120, 3), 200, np.uint8))
     text = page()
-    assert "31 of 32 (97 %)" in text
+    assert "31 of 32 used (97 %)" in text
     assert "2 reconstructed of 3 (1 failed)" in text
     assert "apart from what follows: 7 points are seen from both sides" in text
     assert "blurred" in text

@@ -173,7 +173,7 @@ def test_a_tube_is_reconstructed_from_its_frames(tmp_path):
     figures = record.stages["evaluate"].figures
     assert figures["held_out"] == 2 and figures["psnr_training"] > 10.0
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    assert "10 of 10 (100 %)" in page and f"{figures['psnr']:.2f}" in page
+    assert "10 of 10 used (100 %)" in page and f"{figures['psnr']:.2f}" in page
     pictures = set(re.findall(r'src="(index_files/[^"]+)"', page))
     assert len(pictures) == 1 + 2 * 4 + 1  # ribbon; truth, rendering, error and depth of two views; hatch
     assert all((tmp_path / "out" / picture).is_file() for picture in pictures)
