@@ -19,7 +19,7 @@ from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
 from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 #: Frames, the one after which most points change, and points seen from both sides of it.
@@ -65,6 +65,7 @@ def test_sides_of_another_scale_do_not_hold_together():
 def test_too_few_common_points_tell_no_scale():
     assert [Link(0, points, None, None).holds for points in (7, 8)] == [False, True]
     assert "too few to compare" in Link(0, 3, None, None).reason
+    assert "not mapped together" in Link(0, 99, None, None).reason
     assert not Link(0, 9, 0.0, 0.2).holds
 
 
@@ -150,6 +151,16 @@ def test_tracks_give_every_frame_a_pose(tracked):
     assert tracked.largest.registered == tuple(range(8))
     assert tracked.largest.test_error < 0.6
     assert tracked.submaps() == [(0, range(8))]
+
+
+def test_places_between_models_are_told(tmp_path):
+    images = list_images(write_tube(tmp_path / "scene", 16, 2.0) / "images")
+    windows = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=8)})
+    atlas = reconstruct(images, windows)
+    first, second = (span for _, span in atlas.submaps())
+    (link,) = atlas.refused
+    assert link.after == first[-1] == second[0] - 1
+    assert link.points > 30
 
 
 def test_the_atlas_is_written(tracked, tmp_path):

@@ -49,6 +49,8 @@ class Link:
     @property
     def reason(self) -> str:
         """Why it holds, or not, in words."""
+        if self.log_scale is None and self.points >= _STRONG_LINK:
+            return f"{self.points} points are followed across it, but the sides were not mapped together"
         if self.log_scale is None:
             return f"{self.points} points are seen from both sides, too few to compare the scales of the sides"
         factor, spread = np.exp(self.log_scale), 100.0 * (self.uncertainty or 0.0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,7 +85,8 @@ class Reconstruction:
 class Atlas:
     """Models of a video, each in a frame and scale of its own, and the images that none has.
 
-    ``refused`` are the places at which a model was split: too few points link its sides, or their scales differ.
+    ``refused`` are the places at which a model was split, as too few points link its sides or their scales differ, and
+    those between models of tracks that mapping has not linked.
     """
 
     images: tuple[Path, ...]  # all input images, in order
@@ -219,7 +221,19 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
     if len(found) > 1:
         sizes = ", ".join(str(len(one.registered)) for one in found)
         log.warning("%d models have %s images: what lies between them is not known", len(found), sizes)
-    return Atlas(video.images, tuple(found), lost, tuple(sorted(refused, key=lambda link: link.after)))
+    atlas = Atlas(video.images, tuple(found), lost)
+    refused += _gaps(video, atlas.submaps(), {link.after for link in refused})
+    return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
+
+
+def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], known: set[int]) -> list[Link]:
+    """Places between models at which mapping has found no link, with the number of tracks seen from both sides."""
+    gaps = []
+    for (model, before), (other, after) in pairwise(submaps):
+        if model != other and before[-1] not in known and video.tracks:
+            one, two = (np.concatenate([video.tracks[i].ids for i in span]) for span in (before, after))
+            gaps.append(Link(before[-1], len(np.intersect1d(one, two)), None, None))
+    return gaps
 
 
 #: Points that come from the image before, below which nothing is said to be in common; and the share of the median
