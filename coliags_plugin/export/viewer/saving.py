@@ -21,6 +21,7 @@ from coliags_plugin.export.viewer.serving import import_viser, set_start, start_
 from coliags_plugin.export.viewer.splats import merged_to, on_wire
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.html_page import refuse_folder
+from coliags_plugin.reporting.numbers import counted
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ def save_surface(trained: TrainedRun, mesh: TriangleMesh, output: Path) -> None:
         add_mesh(scene, "surface", mesh)
         add_own_colours_light(scene)
 
-    atomic_write(output, _filled_page(content, fill, f"{len(mesh):,} triangles"))
+    atomic_write(output, _filled_page(content, fill, counted(len(mesh), "triangle")))
 
 
 def _page(content: ViewerContent, splats: SplatCloud) -> str:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 from html import unescape
 
+import numpy as np
 import pytest
+import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.commands import refused, run
 
 pytest.importorskip("viser")
 
 from coliags_plugin.export.viewer.content import ViewerContent
-from coliags_plugin.export.viewer.saving import LARGEST_PAGE, fitting_page, save_page, scene_page
+from coliags_plugin.export.viewer.saving import LARGEST_PAGE, fitting_page, save_page, save_surface, scene_page
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +82,18 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
 def test_a_page_of_a_method_without_a_lamp_speaks_of_no_light(run_of):
     text = scene_page(run_of("3dgs").load())
     assert "step 2</div>" in text and "flattened" not in text
+
+
+def test_a_surface_is_seen_first_from_where_most_of_it_is_in_view(anchors, tmp_path):
+    trained = anchors.load()
+    cameras = [frame.camera.to("cpu", torch.float64) for frame in trained.scene.train]
+    center, axis = cameras[-1].center, cameras[-1].optical_axis
+    near = torch.stack([center + depth * axis for depth in (5.0, 6.0, 7.0)]).numpy()
+    seen = [int(camera.sees(torch.from_numpy(near))[1].sum()) for camera in cameras]
+    mesh = TriangleMesh(near.astype(np.float32), np.array([[0, 1, 2]]), np.full((3, 3), 200, np.uint8))
+    content = ViewerContent.of_mesh(trained, mesh)
+    assert seen[content.first] == max(seen) == 3
+    assert content.look_distance > 0.0
+    save_surface(trained, mesh, tmp_path / "surface.html")
+    text = (tmp_path / "surface.html").read_text(encoding="utf-8")
+    assert ">1 triangle<" in text and "__VISER_EMBED_DATA__" in text and "<title>coliags on wall</title>" in text
