@@ -154,7 +154,7 @@ def remarks(record: Record) -> list[str]:
     told = [
         f"{name} failed: {stage.summary}" if stage.state == "failed" else f"{name}: {warning}"
         for name, stage in record.stages.items()
-        if name.rpartition("/")[2] != "check"
+        if name.rpartition("/")[2] != "check" or stage.state == "failed"
         for warning in (stage.warnings or [""] * (stage.state == "failed"))
     ]
     checks = {one.submap.title: one.stages["check"] for one in results_of(record) if "check" in one.stages}

@@ -63,9 +63,12 @@ def test_figures_of_sub_maps_and_their_means(tmp_path):
 
 
 def test_what_failed_and_what_is_suspect_is_said_with_what_to_do(tmp_path):
-    failed, suspect = remarks(record_in(tmp_path))
+    record = record_in(tmp_path)
+    failed, suspect = remarks(record)
     assert failed == "submap-2/depth failed: no surface that 5 frames agree on. Check the poses."
     assert suspect.startswith("the poses of sub-map 0 (well): there the surface may be bent or torn. Compare")
+    record.stages["check"] = StageRecord({}, "failed", "no two frames overlap.")
+    assert remarks(record) == ["check failed: no two frames overlap.", failed]
 
 
 @pytest.fixture
