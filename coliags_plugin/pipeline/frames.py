@@ -73,8 +73,12 @@ def write_frames(
             raise InputError(
                 f"{len(kept)} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
                 f"at least {FEWEST}",
-                "Give a longer part of the video in which the camera moves, or keep more frames with --every, "
-                "--set frames.least_motion=0 or --set frames.least_sharpness=0",
+                "Give a longer part of the video in which the camera moves"
+                + (
+                    ", or keep more frames with --every, --set frames.least_motion=0 or --set frames.least_sharpness=0"
+                    if dropped
+                    else ""
+                ),
             )
         if used is not None:
             write_mask(scratch / MASK, used)
