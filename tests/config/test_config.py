@@ -65,6 +65,20 @@ def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only(
         ),
         ("coliags-sparse-depth", "coliags", "sparse-depth", {}),
         ("coliags-plus-sparse-depth", "coliags-plus", "sparse-depth", {}),
+        (
+            "coliags-in-vivo",
+            "coliags-plus",
+            "estimated-depth",
+            {
+                "datamanager.initial_points": "depth",
+                "datamanager.points_count": 30000,
+                "field.voxel_pixels": 1.4,
+                "field.geometry_head.frequencies": 2,
+                "field.appearance_head.initial": "given",
+                "modules.exposure.initial": "one",
+                "losses.smooth-gain.weight": 0.3,
+            },
+        ),
     ],
 )
 def test_methods_for_scenes_without_true_depth_differ_in_what_they_need_for_that(method, base, loss, elsewhere):

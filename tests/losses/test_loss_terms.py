@@ -8,13 +8,15 @@ import torch
 from pydantic import ValidationError
 
 from coliags_plugin.config import registry
-from coliags_plugin.contracts import LossSettings, log_linear
+from coliags_plugin.contracts import LossSettings, Schedule, log_linear
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.masked import zero_outside
 from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.core.ssim import ssim
 from coliags_plugin.engine.model import Model
 from coliags_plugin.losses.depth import DepthKind
+from coliags_plugin.losses.photometric import wall_weights
 from coliags_plugin.modules.gain import FrameGain
 from tests.fields.made import make_field
 from tests.losses import terms
@@ -167,6 +169,50 @@ def test_d_ssim_is_one_minus_the_ssim_that_is_reported(generator, image, rgb):
         1 - ssim(rgb, frame.rgb, mask).item(), abs=1e-6
     )
     assert make("d-ssim")(make_output(frame.rgb), frame).item() == pytest.approx(0.0, abs=1e-6)
+
+
+def flooded(generator):
+    """A grey image of 40 x 40 pixels, and a rendering 0.02 off, 0.6 in a block of 10 x 10 pixels."""
+    image = torch.full((40, 40, 3), 102, dtype=torch.uint8)
+    rgb = image / 255.0 + 0.02 * torch.where(torch.rand(40, 40, 1, generator=generator) < 0.5, -1.0, 1.0)
+    rgb[5:15, 5:15] += 0.6
+    return image, rgb
+
+
+@pytest.mark.parametrize("mask", [None, torch.arange(1600).view(40, 40) % 7 > 0])
+def test_what_the_rendering_does_not_explain_loses_weight(generator, mask):
+    image, rgb = flooded(generator)
+    rgb = rgb if mask is None else torch.where(mask[..., None], rgb, torch.nan)
+    difference = zero_outside(rgb - image / 255.0, mask)
+    weights = wall_weights(difference, torch.ones(40, 40, dtype=torch.bool) if mask is None else mask, 3.0)
+    assert (weights[7:13, 7:13] < 0.02).all()
+    assert (weights[18:] == 1).all() and (weights[:, 18:] == 1).all()
+
+
+def test_weights_count_from_their_step_on_and_take_the_gradient_along(generator):
+    image, rgb = flooded(generator)
+    rgb.requires_grad_()
+    for name in ("l1", "d-ssim"):
+        plain, robust = make(name), make(name, outliers=3.0, outliers_from=5)
+        early, late = (
+            robust.loss(terms.step(make_output(rgb), make_frame(image).target, number=number, schedule=Schedule(9, 9)))
+            for number in (5, 6)
+        )
+        assert early.item() == plain(make_output(rgb), make_frame(image)).item()
+        assert late < 0.8 * early
+        (gradient,) = torch.autograd.grad(late, rgb)
+        assert gradient[7:13, 7:13].abs().max() < 0.1 * gradient[20:].abs().max()
+
+
+def test_frames_that_are_explained_count_alike(generator):
+    image, rgb = flooded(generator)
+    rgb[5:15, 5:15] -= 0.6
+    for name in ("l1", "d-ssim"):
+        plain, robust = (make(name, **options) for options in ({}, {"outliers": 3.0, "outliers_from": 0}))
+        values = [term(make_output(rgb), make_frame(image)).item() for term in (plain, robust)]
+        assert values[0] == pytest.approx(values[1], rel=1e-6)
+    nowhere = make_frame(image, mask=torch.zeros(40, 40, dtype=torch.bool))
+    assert make("l1", outliers=3.0, outliers_from=0)(make_output(rgb), nowhere).item() == 0.0
 
 
 # -------------------------------------------------------------------------------------------------------------- depth
