@@ -63,7 +63,8 @@ def test_sides_of_another_scale_do_not_hold_together():
 
 
 def test_too_few_common_points_tell_no_scale():
-    assert [Link(0, points, None, None).holds for points in (7, 8)] == [False, True]
+    assert [Link(0, points, None, None).holds for points in (19, 20)] == [False, True]
+    assert [Link(0, points, 0.1, 0.1).holds for points in (7, 8)] == [False, True]
     assert "too few to compare" in Link(0, 3, None, None).reason
     assert "not mapped together" in Link(0, 99, None, None).reason
     assert not Link(0, 9, 0.0, 0.2).holds

@@ -218,7 +218,7 @@ def test_folders_without_images_are_refused(tmp_path):
     (tmp_path / "1.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"0.png \(0 bytes\) cannot be decoded"):
         reconstruct(list_images(tmp_path))
-    with pytest.raises(InputError, match="1 images"):
+    with pytest.raises(InputError, match="1 image"):
         reconstruct([tmp_path / "0.png"])
 
 

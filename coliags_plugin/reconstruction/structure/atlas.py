@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 #: Points seen on both sides of a frame gap below which a model's two sides have to prove that they fit together.
 _STRONG_LINK = 30
-#: Points below which the two sides are never taken to hold together.
-_FEWEST_LINKING = 8
+#: Points below which the two sides are never taken to hold together, and below which they are not unless their scales
+#: can be compared: across a cut to another patient, eight tracks fit by chance.
+_FEWEST_LINKING, _FEWEST_ALONE = 8, 20
 #: Fewest points triangulated from either side alone that tell how the scales of the sides compare, largest difference
 #: of the scales, and largest uncertainty of it, as natural logarithms.
 _FEWEST_COMMON, _SAME_SCALE, _LEAST_CERTAIN = 5, 0.25, 0.15
@@ -42,9 +43,11 @@ class Link:
     @property
     def holds(self) -> bool:
         """Whether enough points link the sides and, as far as can be measured, both have the same scale."""
-        if self.points < _FEWEST_LINKING or self.log_scale is None or self.uncertainty is None:
-            return self.points >= _FEWEST_LINKING
-        return abs(self.log_scale) < _SAME_SCALE and self.uncertainty < _LEAST_CERTAIN
+        if self.log_scale is None or self.uncertainty is None:
+            return self.points >= _FEWEST_ALONE
+        return (
+            self.points >= _FEWEST_LINKING and abs(self.log_scale) < _SAME_SCALE and self.uncertainty < _LEAST_CERTAIN
+        )
 
     @property
     def reason(self) -> str:

@@ -257,6 +257,9 @@ def _compare(chosen: Hypothesis, hypotheses: Sequence[Hypothesis], plausible: tu
 #: Models on which cameras are tried, and their fewest images; cameras whose errors differ by less than this factor are
 #: not told apart.
 _TRIED_MODELS, _FEWEST_TRIED, _SAME_TEST = 3, 12, 1.02
+#: Displacement of the points since the image before, as a share of the larger side, from which the camera has moved:
+#: repeated images agree with any camera.
+_MOVED = 0.0015
 
 
 def find_tracked_camera(
@@ -274,7 +277,7 @@ def find_tracked_camera(
     if count == 1:
         return lenses[0]
     large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
-    parts = [_middle_of(model, settings.search_images) for model in large]
+    parts = [_middle_of(model, video, settings.search_images) for model in large]
     errors: dict[Start, float] = {}
 
     def likely(tried: Sequence[Start]) -> list[Start]:
@@ -302,9 +305,11 @@ def find_tracked_camera(
     return left[0]
 
 
-def _middle_of(model: pycolmap.Reconstruction, count: int) -> pycolmap.Reconstruction:
-    """The model with at most ``count`` images around its middle."""
-    frames = [number - 1 for number in sorted(model.reg_image_ids())]
+def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) -> pycolmap.Reconstruction:
+    """The model with at most ``count`` images around its middle, of those before which the camera has moved."""
+    every = [number - 1 for number in sorted(model.reg_image_ids())]
+    frames = [frame for frame in every if video.tracks[frame].shift >= _MOVED]
+    frames = frames if len(frames) >= _FEWEST_TRIED else every
     first = max(0, (len(frames) - count) // 2)
     return part_of(model, frames[first : first + count])
 

@@ -18,7 +18,7 @@ from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error
-from coliags_plugin.reconstruction.structure.atlas import Link, part_of, weak_links
+from coliags_plugin.reconstruction.structure.atlas import Link, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     adjusted,
@@ -141,11 +141,12 @@ def reconstruct(
     settings = settings or SfmSettings()
     images = tuple(images)
     if len(images) < 2:
-        raise InputError(f"{len(images)} images", "at least two", "Give more of the video")
+        raise InputError(f"{len(images) or 'no'} image", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         video = read_video(images, settings, masks, progress)
         chosen = _tracked(video, settings, progress) if video.tracks else _matched(video, settings, progress)
-        if not chosen:
+        atlas = _atlas(video, chosen, settings)
+        if not atlas.models:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
             raise InputError(
@@ -155,7 +156,7 @@ def reconstruct(
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
             )
-        return _atlas(video, chosen, settings)
+        return atlas
 
 
 def _tracked(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
@@ -203,17 +204,22 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
         refused += broken
         frames = np.array(sorted(hypothesis.model.reg_image_ids())) - 1
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
-            if len(part) < settings.min_model_size:
-                continue
-            held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
+            one = hypothesis
             if broken:
-                one = Hypothesis.of(part_of(hypothesis.model, part.tolist()), video.brightness)
-            else:
-                one = hypothesis
-            found.append(_result(video, one, held))
+                one = Hypothesis.of(held_part(part_of(hypothesis.model, part.tolist())), video.brightness)
+            if one.images >= settings.min_model_size:
+                held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
+                found.append(_result(video, one, held))
     found.sort(key=lambda one: -len(one.registered))
-    posed = {index for one in found for index in one.registered}
-    lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
+    lost = {index: _reason(video, index) for index in range(len(video.images))}
+    for unlike in [part for part in found if _is_unlike(part, found[0])]:
+        found.remove(unlike)
+        why = (
+            f"its model of {len(unlike.registered)} images is {unlike.test_error:.1f} px from points that are followed"
+        )
+        lost |= dict.fromkeys(unlike.registered, why)
+    for index in (index for part in found for index in part.registered):
+        del lost[index]
     if lost:
         names = [video.images[index].name for index in lost]
         shown = ", ".join([*names[:10], *(["..."] if len(names) > 10 else [])])
@@ -222,15 +228,27 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
         sizes = ", ".join(str(len(one.registered)) for one in found)
         log.warning("%d models have %s images: what lies between them is not known", len(found), sizes)
     atlas = Atlas(video.images, tuple(found), lost)
-    refused += _gaps(video, atlas.submaps(), {link.after for link in refused})
+    refused += _gaps(video, atlas.submaps(), [link.after for link in refused])
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
 
 
-def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], known: set[int]) -> list[Link]:
+#: Images of a model below which it is not believed if its error is so many times that of the largest.
+_SHORT, _WORSE = 12, 2.0
+
+
+def _is_unlike(one: Reconstruction, largest: Reconstruction) -> bool:
+    """Whether a short model agrees much less with held-out tracks than the largest, as in contact with the wall."""
+    if len(one.registered) >= _SHORT or one.test_error is None or largest.test_error is None:
+        return False
+    return one.test_error > _WORSE * largest.test_error
+
+
+def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], known: Sequence[int]) -> list[Link]:
     """Places between models at which mapping has found no link, with the number of tracks seen from both sides."""
     gaps = []
     for (model, before), (other, after) in pairwise(submaps):
-        if model != other and before[-1] not in known and video.tracks:
+        is_known = any(before[-1] <= place < after[0] for place in known)
+        if model != other and not is_known and video.tracks:
             one, two = (np.concatenate([video.tracks[i].ids for i in span]) for span in (before, after))
             gaps.append(Link(before[-1], len(np.intersect1d(one, two)), None, None))
     return gaps
@@ -254,6 +272,10 @@ def _reason(video: MatchedVideo, index: int) -> str:
     return "too few points are seen in three frames or more"
 
 
+#: Correlation of log brightness with log depth below which the lamp at the lens shows: -0.25 to -0.8 in colons.
+_LIT = -0.15
+
+
 def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) -> Reconstruction:
     images, model = video.images, chosen.model
     registered = sorted(number - 1 for number in model.reg_image_ids())
@@ -266,10 +288,10 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
     reconstruction = Reconstruction(
         images, tuple(registered), poses, video.names, model, chosen.correlation, links, error
     )
-    if not chosen.is_lit_from_the_camera:
+    if chosen.correlation is None or chosen.correlation > _LIT:
         log.warning(
-            "images %s to %s: nearer points are not brighter (correlation of brightness with depth %s): the model may "
-            "be reversed in depth, or the lamp is not at the lens. Give the camera's calibration, or other frames",
+            "images %s to %s: nearer points are hardly brighter (correlation of brightness with depth %s): the model "
+            "may be reversed in depth, or the lamp is not at the lens. Give the camera's calibration, or other frames",
             images[registered[0]].name,
             images[registered[-1]].name,
             "unknown" if chosen.correlation is None else f"{chosen.correlation:.2f}",
