@@ -99,7 +99,8 @@ def images_of(options: Options, wave: float, rate: float, seed: int) -> tuple[Pa
 def row_of(options: Options, wave: float, rate: float, seed: int) -> dict[str, Any]:
     """What structure from motion makes of one phantom."""
     scene, images = images_of(options, wave, rate, seed)
-    truth = np.load(scene / "truth" / "camera_to_wall.npy")
+    moved, rigid = (scene / "truth" / f"camera_to_{frame}.npy" for frame in ("wall", "world"))
+    truth = np.load(moved if moved.is_file() else rigid)
     before, start = time.process_time(), time.perf_counter()
     try:
         atlas = reconstruct(images)
