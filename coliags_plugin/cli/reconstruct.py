@@ -37,7 +37,7 @@ class ReconstructCommand:
     size: arguments.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
     method: arguments.OptionalText = None
-    """Method to train; default: coliags-estimated-depth, or coliags for a scene with depth."""
+    """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
     steps: arguments.OptionalInt = None
     """Training steps of the largest sub-map; default 2000. Smaller ones get fewer (docs/reconstruct.md 1)."""
     set: arguments.Assignments = ()

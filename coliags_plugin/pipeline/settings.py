@@ -70,7 +70,7 @@ class ReconstructionSettings(Settings):
     )
     method: str | None = Field(
         default=None,
-        description="Method to train. None: coliags-estimated-depth, or coliags where the scene has depth.",
+        description="Method to train. None: coliags-in-vivo, or coliags where the scene has depth.",
     )
     steps: int = Field(
         default=2000,

@@ -27,7 +27,7 @@ _ALL_STEPS, _LEAST_SHARE = 100, 0.25
 def method_for(context: StageContext) -> str:
     """Name of the method to train: the one given, or else by what is known of the depth."""
     given = context.settings.method
-    return given or ("coliags-estimated-depth" if context.estimates_depth or context.has_estimates else "coliags")
+    return given or ("coliags-in-vivo" if context.estimates_depth or context.has_estimates else "coliags")
 
 
 def steps_for(context: StageContext) -> int:
