@@ -224,7 +224,7 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
         (("--set", "overlapp=3"), "unknown key 'overlapp'"),
         (("--every", "0"), "--every 0"),
         (("--max-frames", "1"), "--max-frames 1"),
-        (("--every", "20"), "1 images"),
+        (("--every", "20"), "1 image"),
         (("--mask", "tube/nothing"), "has no mask for 0000_color.png"),
         (("--output", "tube/images"), "a folder apart from the input"),
     ],
