@@ -103,6 +103,14 @@ def test_held_out_tracks_measure_the_poses(noise):
     assert held_out_error(model, [replace(frame, ids=frame.ids + 1) for frame in tracks]) is None
 
 
+def test_images_of_another_scale_are_not_held():
+    model = part_of(seen_points()[0], range(1, COUNT))
+    for point in model.points3D.values():
+        if {element.image_id for element in point.track.elements} <= {2, 3, 4}:
+            point.xyz = 1000.0 * point.xyz  # what the first three images see alone
+    assert sorted(held_part(model).reg_image_ids()) == list(range(5, COUNT + 1))
+
+
 def test_rays_of_exact_observations_meet_in_the_points():
     model, _ = seen_points()
     rays = Rays.of_points(model)

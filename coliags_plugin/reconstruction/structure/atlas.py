@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coliags_plugin.reconstruction.structure.adjustment import Rays
+from coliags_plugin.reconstruction.structure.mapping import depths_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -21,8 +22,9 @@ _FEWEST_LINKING, _FEWEST_ALONE = 8, 20
 #: Fewest points triangulated from either side alone that tell how the scales of the sides compare, largest difference
 #: of the scales, and largest uncertainty of it, as natural logarithms.
 _FEWEST_COMMON, _SAME_SCALE, _LEAST_CERTAIN = 5, 0.25, 0.15
-#: Points of a model that one of its images sees at least.
-_FEWEST_SEEN = 15
+#: Points of a model that one of its images sees at least, and factor by which their median depth differs at most from
+#: that of the median image.
+_FEWEST_SEEN, _OTHER_SCALE = 15, 20.0
 #: Smallest angle between rays at a point of which the depth counts, degrees.
 _LEAST_ANGLE = 0.5
 
@@ -109,13 +111,17 @@ def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.R
 
 
 def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The model without images that see too few of its points for their poses to be believed; itself if there are none.
+    """The model without images whose poses are not believed; itself if there are none. Image i has ID i + 1.
 
-    Image i has ID i + 1.
+    These see too few of its points, or points at a depth that is another by orders: a part whose scale nothing holds.
     """
     while True:
-        numbers = sorted(model.reg_image_ids())
-        held = [number for number in numbers if model.images[number].num_points3D >= _FEWEST_SEEN]
-        if len(held) == len(numbers):
+        depths = {number: depth for number, (_, depth) in depths_of(model).items() if len(depth) >= _FEWEST_SEEN}
+        medians = {number: float(np.median(depth)) for number, depth in depths.items()}
+        middle = float(np.median(list(medians.values()))) if medians else 0.0
+        held = [
+            number for number, median in medians.items() if middle <= _OTHER_SCALE * median <= _OTHER_SCALE**2 * middle
+        ]
+        if len(held) == model.num_reg_images():
             return model
         model = part_of(model, [number - 1 for number in held])
