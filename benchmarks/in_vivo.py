@@ -49,12 +49,12 @@ LOST_MM = 10.0
 
 @dataclass(frozen=True)
 class Options:
-    """Measure structure from motion on phantoms whose wall moves."""
+    """Options of the benchmark of structure from motion on phantoms with a moving wall."""
 
     folder: Path
-    """Where phantoms, compressed images and rows.jsonl are kept."""
+    """Folder of the phantoms, their compressed images and the measured rows (rows.jsonl)."""
     waves: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
-    """Amplitudes of the peristaltic wave, mm. At 0 nothing moves: no breathing, fluid or bubbles either."""
+    """Amplitudes of the peristaltic wave, mm; 0 is a rigid wall, also without breathing, fluid and bubbles."""
     rates: tuple[float, ...] = (15.0, 30.0)
     """Frames per second: the fewer, the faster all motion."""
     seeds: tuple[int, ...] = (0, 1)
@@ -72,7 +72,7 @@ class Options:
 
 
 def images_of(options: Options, wave: float, rate: float, seed: int) -> tuple[Path, list[Path]]:
-    """A phantom and its images as the video of an endoscope has them; made where they are not there."""
+    """Folder of a phantom, and its images, compressed as in a video; both are generated if missing."""
     from coliags_plugin.api.scenes import make_phantom
 
     kind = "easy" if options.easy else "hard"
@@ -97,7 +97,7 @@ def images_of(options: Options, wave: float, rate: float, seed: int) -> tuple[Pa
 
 
 def row_of(options: Options, wave: float, rate: float, seed: int) -> dict[str, Any]:
-    """What structure from motion makes of one phantom."""
+    """Run structure from motion on one phantom and compare its poses with the true ones: one row of the table."""
     scene, images = images_of(options, wave, rate, seed)
     moved, rigid = (scene / "truth" / f"camera_to_{frame}.npy" for frame in ("wall", "world"))
     truth = np.load(moved if moved.is_file() else rigid)
@@ -153,7 +153,7 @@ def aligned(model: Reconstruction, truth: np.ndarray, frames: Sequence[int] | np
 
 
 def judged(model: Reconstruction, truth: np.ndarray, after: int) -> bool | None:
-    """Whether the sides of a join contradict each other, given the truth; None where both are too short to tell.
+    """Whether a join is wrong by the true poses; None if both sides have too few frames to tell.
 
     The longer side is aligned with the truth; where it puts the first frames of the other is compared with these.
     """
@@ -185,7 +185,7 @@ def _length(poses: np.ndarray) -> float:
 
 
 def main(options: Options) -> None:
-    """Make and measure what is missing, and print the table."""
+    """Measure the rows that are missing, and print the table."""
     options.folder.mkdir(parents=True, exist_ok=True)
     kept = options.folder / "rows.jsonl"
     done = [json.loads(line) for line in kept.read_text().splitlines()] if kept.is_file() else []

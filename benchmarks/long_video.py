@@ -13,6 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from machine import show
+
 from coliags_plugin.reconstruction.structure.image_files import list_images
 
 
@@ -27,17 +29,20 @@ def write_loop(images: list[Path], folder: Path, count: int) -> None:
 
 
 def measure(folder: Path, out: Path, options: list[str]) -> dict[str, float | int]:
-    """Run the command, and read what it used and found."""
+    """Run the command on a folder: processor time, s, peak memory, MB, number of posed frames and of models."""
     command = [str(Path(sys.executable).with_name("coliags")), "poses", "sfm", str(folder), "-o", str(out), *options]
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
     _, status, used = os.wait4(child.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} failed")
     atlas = json.loads((out / "atlas.json").read_text())
+    count, cpu = len(atlas["frames"]), used.ru_utime + used.ru_stime
     return {
-        "cpu_s": round(used.ru_utime + used.ru_stime, 1),
-        "memory_mb": round(used.ru_maxrss / 1024),
-        "posed": len(atlas["frames"]) - len(atlas["lost"]),
+        "frames": count,
+        "CPU, s": cpu,
+        "CPU a frame, s": cpu / count,
+        "memory, MB": used.ru_maxrss / 1024,
+        "posed": count - len(atlas["lost"]),
         "models": len({submap["model"] for submap in atlas["submaps"]}),
     }
 
@@ -50,15 +55,11 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="new folder for the loops and results")
     asked, options = parser.parse_known_args()  # the others are those of coliags poses sfm
     images = list_images(asked.images)
-    print("frames  cpu s  s/frame  memory MB  posed  models")
+    rows = []
     for count in map(int, asked.counts.split(",")):
         write_loop(images, asked.work / f"{count}", count)
-        row = measure(asked.work / f"{count}", asked.work / f"{count}-scene", options)
-        each = row["cpu_s"] / count
-        print(
-            f"{count:6} {row['cpu_s']:6} {each:8.3f} {row['memory_mb']:10} {row['posed']:6} {row['models']:7}",
-            flush=True,
-        )
+        rows.append(measure(asked.work / f"{count}", asked.work / f"{count}-scene", options))
+    show(rows, None)
 
 
 if __name__ == "__main__":

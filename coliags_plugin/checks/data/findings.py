@@ -187,7 +187,7 @@ def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
 
 
 def points_findings(facts: Mapping[str, Any]) -> Iterator[Finding]:
-    """Points of a model that its poses do not project to where its images see them; ``facts`` are of the data."""
+    """Points of a model that do not project to their observations; ``facts`` are the scene's provenance."""
     count, misplaced = facts.get("observations", 0), facts.get("misplaced_observations", 0)
     if count and misplaced > MAX_MISPLACED * count:
         yield Finding(

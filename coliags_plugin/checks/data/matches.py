@@ -119,7 +119,7 @@ def follow(stretches: Sequence[Sequence[Frame]], progress: Progress | None = Non
 
 
 def _explained(source: Frame, target: Frame, here: np.ndarray, there: np.ndarray) -> list[FrameMatches]:
-    """The matches that one epipolar geometry explains, or nothing."""
+    """Matches of two frames that fit one epipolar geometry, as a list of one; an empty list where they are too few."""
     inlier = supported(here, there)
     return [] if inlier is None else [FrameMatches(source, target, here[inlier], there[inlier])]
 

@@ -119,8 +119,8 @@ class PosesSfmCommand:
     distance: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
     mask: arguments.OptionalPath = None
-    """Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings and
-    overlays of a video are ignored."""
+    """Mask image, black where pixels are ignored, or a folder with one per image; default: found for a video (black
+    surroundings and overlays), none for images."""
     every: int = 1
     """Use every n-th image."""
     max_frames: arguments.OptionalInt = None

@@ -123,7 +123,7 @@ def _explanation(study: Study, views: Sequence[ViewPixels], scales: _Scales, ref
 
 
 def _in_row(view: ViewPixels) -> bool:
-    """Whether the pictures of a view stand side by side: there is one method, and nothing true below it to compare."""
+    """Whether all images of a view are in one row: of one method, without true depth."""
     return len(view.runs) == 1 and view.true_depth is None
 
 

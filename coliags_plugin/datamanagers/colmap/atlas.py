@@ -53,7 +53,7 @@ class AtlasRecord(_Part):
 
 
 def read_atlas(scene: Path) -> AtlasRecord | None:
-    """The record of a scene; None where there is none."""
+    """Read a scene's ``atlas.json``; None if it has none."""
     file = scene / ATLAS_FILE
     if not file.is_file():
         return None
@@ -65,7 +65,7 @@ def read_atlas(scene: Path) -> AtlasRecord | None:
 
 
 def model_unit(scene: Path, model: Path) -> Unit:
-    """The unit of one of a scene's models: that of the record, where it has the model, else that of the scene."""
+    """Unit of length of one of a scene's models: from ``atlas.json`` if it lists the model, else from ``unit.txt``."""
     atlas = read_atlas(scene)
     units = {} if atlas is None else {scene / stretch.model: stretch.unit for stretch in atlas.submaps}
     return units.get(model) or read_unit(scene)

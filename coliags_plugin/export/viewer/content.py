@@ -149,7 +149,7 @@ class ViewerContent:
 
     @classmethod
     def of_mesh(cls, trained: TrainedRun, mesh: TriangleMesh) -> ViewerContent:
-        """A run of which frames and its mesh alone are to be shown, at first from where most of the mesh is in view."""
+        """Content without Gaussians, to show frames and a mesh; the view starts where most of the mesh is in view."""
         vertices = torch.as_tensor(mesh.vertices, dtype=torch.float64)
         seen = [int(frame.camera.to("cpu", torch.float64).sees(vertices)[1].sum()) for frame in trained.scene.train]
         best, video = int(np.argmax(seen)), trained.scene.video

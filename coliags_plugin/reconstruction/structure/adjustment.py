@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
+from coliags_plugin.reconstruction.structure.mapping import solve_bundle
 from coliags_plugin.reconstruction.structure.outliers import median_of_points
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.tracks import widest_between
@@ -90,7 +92,7 @@ class Rays:
         """The tracks of ``fewest`` observations or more."""
         return self.only(np.ones(len(self.tracks), bool), fewest)
 
-    @property
+    @cached_property
     def starts(self) -> Int[np.ndarray, "N"]:
         """The first observation of each track."""
         return np.searchsorted(self.tracks, np.arange(len(self.ids)))
@@ -116,11 +118,13 @@ class Rays:
             normal += (damping[:, None] * np.einsum("nii->ni", normal) + 1e-15)[:, :, None] * np.eye(3)
             pull = self.sums(np.einsum("kij,ki->kj", slopes, away - self.directions))
             tried = points - _solved(normal, pull)
-            tried_cost = self.sums(((self._away(tried)[0] - self.directions) ** 2).sum(axis=1))
+            tried_away, tried_lengths = self._away(tried)
+            tried_cost = self.sums(((tried_away - self.directions) ** 2).sum(axis=1))
             better = tried_cost < cost
             points[better], cost[better] = tried[better], tried_cost[better]
+            moved = better[self.tracks]
+            away[moved], inverse_lengths[moved] = tried_away[moved], tried_lengths[moved]
             damping *= np.where(better, 0.1, 10.0)
-            away, inverse_lengths = self._away(points)
         behind = (away * self.directions).sum(axis=1) <= 0.0
         points[self.tracks[behind]] = np.nan
         return points
@@ -177,18 +181,9 @@ def adjust(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]]
     """
     import pycolmap
 
-    options: Any = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
-    ceres = getattr(options, "ceres", options)
-    ceres.solver_options.num_threads, ceres.solver_options.max_num_iterations = 1, _ADJUSTMENT_STEPS
-    ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, _SCALE
     for max_error in _MAX_ERRORS:
         _triangulate(model, ids, max_error)
-        whole = pycolmap.BundleAdjustmentConfig()
-        for number in model.reg_image_ids():
-            whole.add_image(number)
-        whole.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(options, whole, model).solve()
+        solve_bundle(model, refine_camera=False, robust_scale=_SCALE, max_iterations=_ADJUSTMENT_STEPS)
     pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERRORS[-1], _LEAST_ANGLE)
     model.update_point_3d_errors()
 

@@ -120,7 +120,7 @@ def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         medians = {number: float(np.median(depth)) for number, depth in depths.items()}
         middle = float(np.median(list(medians.values()))) if medians else 0.0
         held = [
-            number for number, median in medians.items() if middle <= _OTHER_SCALE * median <= _OTHER_SCALE**2 * middle
+            number for number, median in medians.items() if middle / _OTHER_SCALE <= median <= middle * _OTHER_SCALE
         ]
         if len(held) == model.num_reg_images():
             return model

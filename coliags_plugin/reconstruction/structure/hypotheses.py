@@ -294,8 +294,8 @@ def find_tracked_camera(
 
     lens = likely(lenses)[0]
     left = likely([replace(lens, focal_factor=factor) for factor in factors[1:]])
-    side = max(video.sizes[0])
-    least, *_, most = sorted([side * start.focal_factor for start in left] * 2)
+    lengths = [max(video.sizes[0]) * start.focal_factor for start in left]
+    least, most = min(lengths), max(lengths)
     if most > _OTHER_FOCAL_LENGTH * least:
         log.warning(
             "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -102,22 +102,43 @@ def bundle_adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> None:
     """Global bundle adjustment of poses, points and, if refined, intrinsics, then point filtering; twice, in place."""
     import pycolmap
 
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = refine_camera
-    getattr(options, "ceres", options).solver_options.num_threads = 1
     mapper = pycolmap.IncrementalPipelineOptions().mapper
     for _ in range(2):
-        # pycolmap.bundle_adjustment would do the same, but turns COLMAP's log on (4.2.1).
-        whole = pycolmap.BundleAdjustmentConfig()
-        for number in model.reg_image_ids():
-            whole.add_image(number)
-        whole.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(options, whole, model).solve()
+        solve_bundle(model, refine_camera)
         pycolmap.ObservationManager(model).filter_all_points3D(
             mapper.filter_max_reproj_error, mapper.filter_min_tri_angle
         )
     model.update_point_3d_errors()
+
+
+def solve_bundle(
+    model: pycolmap.Reconstruction,
+    refine_camera: bool,
+    robust_scale: float | None = None,
+    max_iterations: int | None = None,
+) -> None:
+    """Adjust all poses and points of a model once, in place.
+
+    By squared errors, or with ``robust_scale`` by Cauchy's cost, which is logarithmic above that error, pixels.
+    ``max_iterations``: None for COLMAP's default.
+    """
+    import pycolmap
+
+    options: Any = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = refine_camera
+    ceres = getattr(options, "ceres", options)
+    ceres.solver_options.num_threads = 1
+    if max_iterations is not None:
+        ceres.solver_options.max_num_iterations = max_iterations
+    if robust_scale is not None:
+        ceres.loss_function_type, ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, robust_scale
+    # pycolmap.bundle_adjustment would do the same, but turns COLMAP's log on (4.2.1).
+    whole = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        whole.add_image(number)
+    whole.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, whole, model).solve()
 
 
 #: Observations of an image below which it does not count for the correlation.

@@ -170,8 +170,7 @@ def _tracked(video: MatchedVideo, settings: SfmSettings, progress: Progress | No
     if settings.camera.refine:
         bundle_adjust(models[0], refine_camera=True)
         for model in models[1:]:
-            for number, camera in model.cameras.items():
-                camera.params = models[0].cameras[number].params
+            _take_cameras(model, models[0])
     return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
 
 
@@ -187,11 +186,16 @@ def _matched(video: MatchedVideo, settings: SfmSettings, progress: Progress | No
     for model in models[1:]:
         has_its_cameras = set(model.cameras) <= set(first.model.cameras)
         if has_its_cameras:
-            for number, camera in model.cameras.items():
-                camera.params = first.model.cameras[number].params
+            _take_cameras(model, first.model)
             bundle_adjust(model, refine_camera=False)
         chosen.append(best(both_signs(model, video, refined and not has_its_cameras)))
     return chosen
+
+
+def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> None:
+    """Set the parameters of the model's cameras to those of another model that has them, in place."""
+    for number, camera in model.cameras.items():
+        camera.params = other.cameras[number].params
 
 
 def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSettings) -> Atlas:
@@ -211,15 +215,15 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
                 held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
                 found.append(_result(video, one, held))
     found.sort(key=lambda one: -len(one.registered))
-    lost = {index: _reason(video, index) for index in range(len(video.images))}
-    for unlike in [part for part in found if _is_unlike(part, found[0])]:
+    posed = {index for one in found for index in one.registered}
+    lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
+    for unlike in [one for one in found if _is_unlike(one, found[0])]:
         found.remove(unlike)
-        why = (
-            f"its model of {len(unlike.registered)} images is {unlike.test_error:.1f} px from points that are followed"
+        count, error = len(unlike.registered), unlike.test_error
+        lost |= dict.fromkeys(
+            unlike.registered, f"its model of {count} images is {error:.1f} px from points that are followed"
         )
-        lost |= dict.fromkeys(unlike.registered, why)
-    for index in (index for part in found for index in part.registered):
-        del lost[index]
+    lost = dict(sorted(lost.items()))
     if lost:
         names = [video.images[index].name for index in lost]
         shown = ", ".join([*names[:10], *(["..."] if len(names) > 10 else [])])
