@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -247,6 +247,14 @@ class Scene:
         """The scene with another near plane of all cameras, scene units."""
         train = [frame.with_near_plane(near_plane) for frame in self.train]
         tests = {name: [frame.with_near_plane(near_plane) for frame in part] for name, part in self.test_sets.items()}
+        return replace(self, train=train, test_sets=tests)
+
+    def without(self, names: Collection[str]) -> Scene:
+        """The scene without the frames of these names."""
+        train = [frame for frame in self.train if frame.name not in names]
+        tests = {
+            part: [frame for frame in frames if frame.name not in names] for part, frames in self.test_sets.items()
+        }
         return replace(self, train=train, test_sets=tests)
 
     @property

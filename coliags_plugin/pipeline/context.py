@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.pipeline.frames import read_blurred
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps, scale_of
 
@@ -67,13 +68,14 @@ class StageContext:
         return self.folder / "run"
 
     def open_posed(self, stored_size: bool = False) -> Scene:
-        """The posed scene at the working size, its images read when they are needed."""
+        """The posed scene at the working size without blurred frames, its images read when they are needed."""
         from coliags_plugin.engine.data_formats import open_scene
 
         size = self.settings.size
         options = ["initial_points=none", "keep_pixels=false", *self.model_options]
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]
-        return open_scene(self.posed, self.data_format, options, self.progress, stored_size)
+        scene = open_scene(self.posed, self.data_format, options, self.progress, stored_size)
+        return scene if self.data_format is not None else scene.without(read_blurred(self.frames))
 
     @cached_property
     def model_options(self) -> list[str]:

@@ -33,7 +33,7 @@ _STILL, _OVERLAYS, _EDGE = 48, 0.3, 10.0
 INTERLACED = 1.3
 
 #: Why frames are dropped, as the record says it.
-THINNED, BLURRED, EMPTY, RESTING = "thinned out", "blurred", "black or without any texture", "the camera rests"
+THINNED, EMPTY, RESTING = "thinned out", "black or without any texture", "the camera rests"
 
 
 def interval(count: int, settings: FrameSettings) -> int:
@@ -41,21 +41,24 @@ def interval(count: int, settings: FrameSettings) -> int:
     return settings.every or max(1, math.ceil(count / settings.at_most))
 
 
-def sharp_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[list[int], dict[int, str]]:
+def sharpest_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[list[int], dict[int, str]]:
     """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped."""
     values, step = np.asarray(sharpness), interval(len(sharpness), settings)
     best = [first + int(np.argmax(values[first : first + step])) for first in range(0, len(values), step)]
     dropped = dict.fromkeys(set(range(len(values))) - set(best), THINNED)
     some = [index for index in best if values[index] > 0.0]
-    dropped |= dict.fromkeys(set(best) - set(some), EMPTY)
-    kept = []
-    for position, index in enumerate(some):
-        around = some[max(0, position - _NEIGHBOURS) : position + _NEIGHBOURS + 1]
-        if values[index] < settings.least_sharpness * np.median(values[around]):
-            dropped[index] = BLURRED
-        else:
-            kept.append(index)
-    return kept, dropped
+    return some, dropped | dict.fromkeys(set(best) - set(some), EMPTY)
+
+
+def blurred_frames(chosen: Sequence[int], sharpness: Sequence[float], settings: FrameSettings) -> set[int]:
+    """Those of the chosen frames, ascending, that are much less sharp than the ones around them."""
+    values = np.asarray(sharpness)
+    return {
+        index
+        for place, index in enumerate(chosen)
+        if values[index]
+        < settings.least_sharpness * np.median(values[chosen[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]])
+    }
 
 
 def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | None:

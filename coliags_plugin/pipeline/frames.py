@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import Counter
 from collections.abc import Iterator
@@ -18,13 +19,14 @@ from coliags_plugin.pipeline.frame_selection import (
     INTERLACED,
     RESTING,
     THINNED,
+    blurred_frames,
     combing,
     interval,
     lens_mask,
     motion,
     overlays,
     reduced,
-    sharp_frames,
+    sharpest_frames,
 )
 from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
@@ -58,7 +60,8 @@ def write_frames(
             "a mask of the frames' size",
         )
     used = given if given is not None or found.all() else found
-    chosen, dropped = sharp_frames(sharpnesses, settings)
+    chosen, dropped = sharpest_frames(sharpnesses, settings)
+    blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
         kept = []
         for index, name, image, moved in _moving(source, set(chosen), settings, progress, total):
@@ -69,9 +72,12 @@ def write_frames(
             write_image(scratch / IMAGES / f"{name}.png", image)
         counts = Counter(dropped.values())
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
-        if len(kept) < FEWEST:
+        blurred &= {index for index, _ in kept}
+        if blurred:
+            why = ", ".join([f"{len(blurred)} blurred, of use for poses alone", *([why] if why else [])])
+        if (count := len(kept) - len(blurred)) < FEWEST:
             raise InputError(
-                f"{len(kept)} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
+                f"{count} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
                 f"at least {FEWEST}",
                 "Give a longer part of the video in which the camera moves"
                 + (
@@ -90,7 +96,10 @@ def write_frames(
                 "every": interval(total, settings),
                 "size": [size[1], size[0]],
                 "masked": None if used is None else round(float(1.0 - used.mean()), 4),
-                "kept": [{"frame": index, "name": name, "sharpness": sharpnesses[index]} for index, name in kept],
+                "kept": [
+                    {"frame": index, "name": name, "sharpness": sharpnesses[index], "blurred": index in blurred}
+                    for index, name in kept
+                ],
                 "dropped": [
                     {"frame": index, "why": why, "sharpness": sharpnesses[index]}
                     for index, why in sorted(dropped.items())
@@ -105,6 +114,12 @@ def write_frames(
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
     """The mask of written frames; None where there is none."""
     return read_mask(folder / MASK) if (folder / MASK).is_file() else None
+
+
+def read_blurred(folder: Path) -> set[str]:
+    """Names of the written frames that are blurred; none where there is no record."""
+    kept = json.loads((folder / RECORD).read_text())["kept"] if (folder / RECORD).is_file() else []
+    return {frame["name"] for frame in kept if frame.get("blurred")}
 
 
 def found_mask(source: FrameSource, progress: Progress | None = None) -> Bool[np.ndarray, "H W"] | None:

@@ -26,7 +26,7 @@ class FrameSettings(Settings):
         description="Use the sharpest of every n frames. None: such that at most 'at_most' are left.",
     )
     at_most: int = Field(
-        default=300,
+        default=1500,
         ge=2,
         description="Largest number of frames where 'every' is not given, spread over the whole video.",
     )
@@ -34,7 +34,8 @@ class FrameSettings(Settings):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="Frames less sharp than this share of the median of their neighbours are dropped; 0: none.",
+        description="Frames less sharp than this share of the median of their neighbours are blurred: points are "
+        "followed through them, but depth and training do without them; 0: none.",
     )
     least_motion: float = Field(
         default=0.0015,

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.pipeline.frame_selection import (
-    BLURRED,
     EMPTY,
     THINNED,
+    blurred_frames,
     lens_mask,
     motion,
     overlays,
     reduced,
-    sharp_frames,
+    sharpest_frames,
 )
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.texture import sharpness
@@ -27,30 +27,31 @@ SHARPNESS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60)
 
 
 def test_the_sharpest_of_every_few_is_used():
-    kept, dropped = sharp_frames([0.5, 0.9, 0.6, 0.8, 0.7, 0.75, 0.6], FrameSettings(every=3))
+    kept, dropped = sharpest_frames([0.5, 0.9, 0.6, 0.8, 0.7, 0.75, 0.6], FrameSettings(every=3))
     assert kept == [1, 3, 6]
     assert dropped == dict.fromkeys([0, 2, 4, 5], THINNED)
 
 
-def test_blurred_and_empty_frames_are_dropped():
+def test_empty_frames_are_dropped_and_blurred_ones_marked():
     values = [0.5] * 20
     values[4], values[5], values[9] = 0.1, 0.2, 0.0
-    kept, dropped = sharp_frames(values, FrameSettings())
-    assert dropped == {4: BLURRED, 5: BLURRED, 9: EMPTY}
-    assert kept == [index for index in range(20) if index not in dropped]
-    assert sharp_frames(values, FrameSettings(least_sharpness=0.0))[1] == {9: EMPTY}
+    kept, dropped = sharpest_frames(values, FrameSettings())
+    assert dropped == {9: EMPTY}
+    assert kept == [index for index in range(20) if index != 9]
+    assert blurred_frames(kept, values, FrameSettings()) == {4, 5}
+    assert not blurred_frames(kept, values, FrameSettings(least_sharpness=0.0))
 
 
 def test_sharpness_is_compared_with_neighbours_as_the_view_changes():
     values = [1.0] * 60 + [0.2] * 60  # a textured, then a smooth part of the wall
-    kept, dropped = sharp_frames(values, FrameSettings())
-    assert len(kept) > 108
-    assert set(dropped) <= set(range(60, 70))
+    blurred = blurred_frames(range(120), values, FrameSettings())
+    assert len(blurred) < 12
+    assert blurred <= set(range(60, 70))
 
 
 @given(SHARPNESS, st.integers(2, 30))
 def test_every_frame_is_kept_or_dropped_and_no_more_than_asked_for(values, at_most):
-    kept, dropped = sharp_frames(values, FrameSettings(at_most=at_most))
+    kept, dropped = sharpest_frames(values, FrameSettings(at_most=at_most))
     assert sorted([*kept, *dropped]) == list(range(len(values)))
     assert kept == sorted(kept)
     assert len(kept) <= at_most

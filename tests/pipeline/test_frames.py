@@ -10,7 +10,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_mask
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.frames import found_mask, read_lens_mask, write_frames
+from coliags_plugin.pipeline.frames import found_mask, read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
 from tests.pipeline.films import HEIGHT, WIDTH, blurred, film, write_images
 
@@ -21,15 +21,16 @@ def test_frames_are_written_without_loss_and_what_is_dropped_is_recorded(tmp_pat
     frames = [*FILM[:5], blurred(FILM[5]), *FILM[6:10], FILM[9], FILM[9], np.zeros_like(FILM[0]), *FILM[10:]]
     out = tmp_path / "frames"
     summary = write_frames(frame_source(write_images(tmp_path / "film", frames)), out, FrameSettings())
-    dropped = {5: "blurred", 10: "the camera rests", 11: "the camera rests", 12: "black or without any texture"}
+    dropped = {10: "the camera rests", 11: "the camera rests", 12: "black or without any texture"}
     record = json.loads((out / "frames.json").read_text())
     assert {each["frame"]: each["why"] for each in record["dropped"]} == dropped
     kept = [index for index in range(len(frames)) if index not in dropped]
     assert [each["frame"] for each in record["kept"]] == kept
+    assert read_blurred(out) == {"5"}
     assert sorted(path.name for path in (out / "images").iterdir()) == sorted(f"{index}.png" for index in kept)
     for index in kept:
         np.testing.assert_array_equal(read_rgb(out / "images" / f"{index}.png"), frames[index])
-    assert summary.startswith(f"19 of 23 frames, {WIDTH} x {HEIGHT} px; 1 black")
+    assert summary.startswith(f"20 of 23 frames, {WIDTH} x {HEIGHT} px; 1 blurred, of use for poses alone, 1 black")
     assert read_lens_mask(out) is None
 
 

@@ -6,9 +6,11 @@ import json
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
@@ -125,6 +127,19 @@ def test_an_implausible_focal_length_is_refused(tube):
     refusal(told, tube, SfmSettings(camera=camera))
     wide = camera.model_copy(update={"field_of_view": (20.0, 150.0)})
     assert reconstruct(list_images(tube), SfmSettings(camera=wide)).largest.registered
+
+
+def test_features_of_a_long_video_are_those_of_its_sharpest_images(tube, tmp_path):
+    for place, path in enumerate(list_images(tube)):
+        image = read_rgb(path)
+        soft = cv2.GaussianBlur(image, (0, 0), 3.0)
+        first, second = (soft, image) if place % 2 else (image, soft)
+        write_png(tmp_path / f"{2 * place}.png", torch.from_numpy(first))
+        write_png(tmp_path / f"{2 * place + 1}.png", torch.from_numpy(second))
+    settings = KNOWN.model_copy(update={"features_at_most": COUNT})
+    found = reconstruct(list_images(tmp_path), settings)
+    assert [path.stem for path in found.images] == ["0", "3", "4", "7", "8", "11"]
+    assert share_of_path(found.largest.trajectory, TRUTH)[0] < 0.005
 
 
 def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):

@@ -100,6 +100,11 @@ class SfmSettings(Settings):
     )
     tracks: TrackSettings = TrackSettings()
     """Tracking of points."""
+    features_at_most: int = Field(
+        default=300,
+        ge=2,
+        description="Largest number of images of which features are matched: of more, the sharpest of every n.",
+    )
     exhaustive_up_to: int = Field(default=25, ge=0, description="Up to this many images are matched exhaustively.")
     min_alike: int = Field(
         default=12,

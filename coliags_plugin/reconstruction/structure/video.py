@@ -26,6 +26,7 @@ from coliags_plugin.reconstruction.structure.matching import Matches, alike_pair
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.texture import sharpness
 
 if TYPE_CHECKING:
     import pycolmap
@@ -108,7 +109,10 @@ class MatchedVideo:
 def read_video(
     images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
 ) -> MatchedVideo:
-    """Match the images of a video, by tracks or by features; masks are False where a pixel is ignored."""
+    """Match the images of a video, by tracks or by features; masks are False where a pixel is ignored.
+
+    Tracks are of all images, features of at most ``features_at_most``.
+    """
     # Before the minutes of matching: what cannot be read, and a camera that does not fit.
     sizes = tuple(_size(path, mask_of(path, masks)) for path in images)
     starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
@@ -120,13 +124,28 @@ def read_video(
         features = extract(image, mask_of(images[index], masks))
         return features, brightness_at(image, features.pixels)
 
-    if _needs_tracks(sizes, settings, features_of):
+    some = _sharpest(images, settings)
+    if _needs_tracks([sizes[index] for index in some], some, settings, features_of):
         features_of.cache_clear()
         points = track_points(images, settings.tracks, masks, progress)
         if settings.matching == "tracks" or np.median([frame.followed for frame in points]) >= _FOLLOWED:
             return _tracked(images, sizes, points)
         log.info("points cannot be followed from image to image: features are matched instead")
-    return _with_features(images, sizes, settings, features_of, progress)
+    if len(some) < len(images):
+        log.info("features of %d of %d images are matched", len(some), len(images))
+    taken, own = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
+    return _with_features(taken, own, settings, lambda row: features_of(some[row]), progress)
+
+
+def _sharpest(images: Sequence[Path], settings: SfmSettings) -> list[int]:
+    """Indices of the sharpest of every few images, so that features are matched of no more than are asked for."""
+    import cv2
+
+    step = -(-len(images) // settings.features_at_most)
+    if step == 1 or settings.matching == "tracks":
+        return list(range(len(images)))
+    values = [sharpness(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)) for path in images]
+    return [first + int(np.argmax(values[first : first + step])) for first in range(0, len(images), step)]
 
 
 #: Features of an image by its index, and the brightness at them.
@@ -137,13 +156,15 @@ _COMPARED, _PLENTY, _MOST = 24, 150, 0.9
 _FEWEST_FRAMES, _FOLLOWED = 8, 60
 
 
-def _needs_tracks(sizes: Sequence[tuple[int, int]], settings: SfmSettings, features_of: _FeaturesOf) -> bool:
+def _needs_tracks(
+    sizes: Sequence[tuple[int, int]], images: Sequence[int], settings: SfmSettings, features_of: _FeaturesOf
+) -> bool:
     """Whether points are to be tracked: as the settings say, or where neighbours have few features in common."""
     if settings.matching != "auto" or len(sizes) < _FEWEST_FRAMES or len(set(sizes)) > 1:
         return settings.matching == "tracks"
     strong = []
     for first in np.unique(np.linspace(0, len(sizes) - 2, _COMPARED).round().astype(int)).tolist():
-        pair = [features_of(index)[0] for index in (first, first + 1)]
+        pair = [features_of(images[row])[0] for row in (first, first + 1)]
         matches = mutual_matches(pair[0], pair[1], settings.max_ratio, settings.max_distance)
         one, other = (features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True))
         inliers = epipolar_inliers(one, other, sizes[first][::-1], settings.max_error)
