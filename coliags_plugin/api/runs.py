@@ -119,13 +119,17 @@ class Run:
             self._loaded = kept = load_trained(self.path, choose_device(self.device), self.data)
         return kept
 
-    def evaluate(self, protocol: str | None = None, *, truth: str | Path | None = None) -> Result:
+    def evaluate(
+        self, protocol: str | None = None, *, truth: str | Path | None = None, refine_poses: bool = False
+    ) -> Result:
         """Evaluate the run on its held-out frames, writing ``eval/PROTOCOL/`` in its folder.
 
         Args:
             protocol: Name of a protocol; None: the method config's.
             truth: Folder of a scene of the same frames and poses with true depth, to evaluate a run that was trained on
                 estimated depth; writes ``eval/PROTOCOL-truth/``.
+            refine_poses: Also measure views from poses refined on the held-out images themselves, as
+                ``psnr_pose_refined`` (docs/protocols.md).
 
         Raises:
             InputError: See :meth:`load`; the protocol is unknown, no frame is held out, the run was relit, or ``truth``
@@ -136,7 +140,8 @@ class Run:
 
         trained = self.load()
         other = None if truth is None else _scene_of_size(Path(truth), trained.scene)
-        return read_result(evaluator.evaluate(trained, protocol or trained.config.protocol, other) / RESULT_FILE)
+        folder = evaluator.evaluate(trained, protocol or trained.config.protocol, other, refine_poses)
+        return read_result(folder / RESULT_FILE)
 
     def frame_names(self, frames: str = "test") -> list[str]:
         """Names of frames that can be rendered.

@@ -70,6 +70,9 @@ class EvaluateCommand:
     truth: arguments.OptionalPath = None
     """A scene of the same frames and poses with true depth, to evaluate against instead of the run's own, for runs
     trained on estimated depth; results go into eval/PROTOCOL-truth."""
+    refine_poses: bool = False
+    """Also measure views from poses refined on the held-out images themselves, as psnr_pose_refined
+    (docs/protocols.md); not comparable with psnr."""
     data: arguments.MovedData = None
     device: arguments.Device = "auto"
     json: arguments.AsJson = False
@@ -80,7 +83,7 @@ class EvaluateCommand:
         from coliags_plugin.results.summaries import means_summary
 
         run = load_run(self.path, data=self.data, device=self.device)
-        result = run.evaluate(self.protocol, truth=self.truth)
+        result = run.evaluate(self.protocol, truth=self.truth, refine_poses=self.refine_poses)
         name = result.evaluation_name
         shown = () if name == "paper" else ("--protocol", name)
         print_summary(

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from coliags_plugin.core.intrinsics import NEAR_PLANE, Intrinsics
+from coliags_plugin.core.rotations import rotation_of_vector
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,21 @@ class Camera(Intrinsics):
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
         """World position of every pixel at its z-depth (NaN where the depth is NaN). [H, W, 3]"""
         return self.center + depth[..., None] * self.rays()
+
+    def moved(self, rotation: Float[Tensor, "3"], translation: Float[Tensor, "3"], depth: float) -> Camera:
+        """The camera turned about the point on its optical axis at a z-depth, and then moved; differentiable in both.
+
+        Args:
+            rotation: Rotation vector, radians, world axes. [3]
+            translation: World axes, scene units. [3]
+            depth: Scene units. About its own centre, a small turn would shift the image almost as a translation does,
+                and gradient descent could hardly tell the two apart.
+        """
+        pose = self.camera_to_world
+        turn, arm = rotation_of_vector(rotation.to(pose)), depth * pose[:3, 2]
+        center = pose[:3, 3] + translation.to(pose) + arm - turn @ arm
+        upper = torch.cat([turn @ pose[:3, :3], center[:, None]], dim=1)
+        return replace(self, camera_to_world=torch.cat([upper, pose[3:]]))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its pose on another device or of another dtype."""

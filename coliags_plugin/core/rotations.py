@@ -18,6 +18,13 @@ def rotation_matrices(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"
     return torch.stack(rows, dim=-1).view(-1, 3, 3)
 
 
+def rotation_of_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The rotation of a rotation vector (axis times angle, radians), smooth about zero. [3, 3]"""
+    x, y, z = vector.unbind()
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+
+
 def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:
     """Local axis of the smallest scale (or logarithm of one) of each Gaussian, in the frame its rotation leads to.
 

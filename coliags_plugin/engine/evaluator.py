@@ -17,6 +17,7 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.pose_refinement import refined_scores
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import EvaluatedSet, run_result
 from coliags_plugin.engine.scoring import Scorer
@@ -41,7 +42,7 @@ logger = logging.getLogger(__name__)
 EXPECTED_DEPTH = "expected_depth"
 
 
-def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None) -> Path:
+def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None, refine_poses: bool = False) -> Path:
     """Render every held-out view, write the protocol's metrics and the images, and return their folder.
 
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and
@@ -49,7 +50,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     with the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains;
     and the images. An earlier evaluation under the same protocol is replaced once the new one is complete. Frames of
     another scene with the true depth take the place of the run's own (:mod:`coliags_plugin.engine.truth`); the folder
-    is then ``eval/<protocol>-truth/``.
+    is then ``eval/<protocol>-truth/``. With ``refine_poses`` there are also metrics of views from poses refined on the
+    held-out images themselves, under names of their own (:mod:`coliags_plugin.engine.pose_refinement`).
     """
     if trained.relit:
         raise InputError(
@@ -71,6 +73,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 output = meter.render(partial(scorer.render, trained.model, placed))
                 comparison = scorer.protocol.compare(output, placed)
                 evaluated[set_name].add(placed, comparison, scorer, output.alpha)
+                if refine_poses:
+                    evaluated[set_name].add_refined(placed, refined_scores(trained.model, placed, scorer))
                 _write_images(scratch, set_name, frame, comparison)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import product
 from typing import Any
 
 import torch
@@ -24,6 +25,8 @@ from coliags_plugin.engine.truth import Truth
 from coliags_plugin.results.hashing import ArraysHash, metrics_sha256, plain_config, result_key
 from coliags_plugin.results.profiles import ErrorProfiles
 from coliags_plugin.results.record import (
+    REFINED_METRICS,
+    REFINED_SUFFIXES,
     SEEN_SUFFIX,
     CostRecord,
     MetricRecord,
@@ -71,6 +74,11 @@ class EvaluatedSet:
         )
         self._profiles.add(comparison, frame)
 
+    def add_refined(self, frame: Frame, scores: Mapping[str, Scores]) -> None:
+        """Take up the scores of a frame from its refined pose, by the suffixes of their names."""
+        for suffix, scored in scores.items():
+            self._add_scores(frame.name, scored, suffix)
+
     def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
         row = self._rows.setdefault(frame, {})
         row.update({name + suffix: value for name, value in scores.values.items()})
@@ -81,6 +89,12 @@ class EvaluatedSet:
     def seen_metrics(self) -> list[str]:
         """Names of the metrics over seen pixels that some frame has."""
         return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in self._scored]
+
+    @property
+    def refined_metrics(self) -> list[str]:
+        """Names of the metrics from refined poses that some frame has."""
+        names = (name + suffix for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS))
+        return [name for name in names if name in self._scored]
 
     @property
     def optional_metrics(self) -> list[str]:
@@ -95,7 +109,7 @@ class EvaluatedSet:
         """The set's record; the protocol's ``metrics`` are listed even where no frame has one."""
         rows = self._rows.values()
         lacking = set(self._optional) - set(self.optional_metrics)
-        names = [*metrics, *self.optional_metrics, *self.seen_metrics]
+        names = [*metrics, *self.optional_metrics, *self.seen_metrics, *self.refined_metrics]
         return SetRecord(
             frames=tuple(self._rows),
             values={name: tuple(row.get(name) for row in rows) for name in names},
@@ -131,6 +145,8 @@ def run_result(
     deviations = _deviations(trained.step, config["schedule"]["steps"], provenance)
     if truth is not None:
         deviations["truth"] = data.provenance.get("fingerprint")
+    if any(part.refined_metrics for part in evaluated.values()):
+        deviations["refined"] = list(REFINED_SUFFIXES)
     return Result(
         key=result_key(
             config,
@@ -190,8 +206,14 @@ def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -
         )
         for name, metric in metrics.items()
     }
+    refined = {name for part in evaluated.values() for name in part.refined_metrics}
     over_seen = {name + SEEN_SUFFIX: records[name] for name in SEEN_METRICS if name + SEEN_SUFFIX in seen}
-    return records | over_seen
+    from_refined = {
+        name + suffix: records[name]
+        for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS)
+        if name + suffix in refined
+    }
+    return records | over_seen | from_refined
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

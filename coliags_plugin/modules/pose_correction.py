@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import ClassVar, Literal
 
 import torch
@@ -33,9 +32,7 @@ class PoseCorrectionSettings(Settings):
 class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     """Learned rotation and translation of each training camera, in world axes.
 
-    It turns about the point on its optical axis at the median depth of the scene's points in view. About its own
-    centre, a small rotation would shift the image almost as a translation does, and gradient descent could hardly tell
-    the two apart.
+    It turns about the point on its optical axis at the median depth of the scene's points in view (its pivot).
 
     All poses and the field could move together without any image changing. The ``fixed`` frames hold them; without any,
     the mean rotation and translation are subtracted.
@@ -86,15 +83,9 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
 
     def _moved(self, camera: Camera, before: int, after: int, share: float) -> Camera:
         """The camera with the correction at a place in [0, 1] between two training frames."""
-        pose = camera.camera_to_world
-        rotation, translation = (
-            torch.lerp(values[before], values[after], share).to(pose) for values in self.corrections()
-        )
+        rotation, translation = (torch.lerp(values[before], values[after], share) for values in self.corrections())
         depth = (1.0 - share) * self._pivot_depths[before] + share * self._pivot_depths[after]
-        turn, arm = rotation_matrix(rotation), depth * pose[:3, 2]
-        center = pose[:3, 3] + translation + arm - turn @ arm
-        upper = torch.cat([turn @ pose[:3, :3], center[:, None]], dim=1)
-        return replace(camera, camera_to_world=torch.cat([upper, pose[3:]]))
+        return camera.moved(rotation, translation, depth)
 
     def corrections(self) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
         """Rotation vectors (radians) and translations (scene units) of the training frames, in their order.
@@ -119,10 +110,3 @@ def _median_depth(camera: Camera, scene: Scene) -> float:
     pixels, depths = camera.project(points.to(camera.camera_to_world))
     inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([camera.width, camera.height]))).all(dim=1) & (depths > 0)
     return float(depths[inside].median()) if inside.any() else 0.0
-
-
-def rotation_matrix(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation of a rotation vector (axis times angle, radians), smooth about zero."""
-    x, y, z = vector.unbind()
-    zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))

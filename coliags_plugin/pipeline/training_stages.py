@@ -74,10 +74,11 @@ def evaluate(context: StageContext) -> StageOutcome:
     from coliags_plugin.results.reading import RESULT_FILE, read_result
 
     trained = load_trained(context.run, context.device, context.scene)
-    folder = evaluator.evaluate(trained, trained.config.protocol)
+    folder = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
     result = read_result(folder / RESULT_FILE)
-    figures = {name: value for name in ("psnr", "ssim") if (value := result.mean(name)) is not None}
-    shown = ", ".join(f"{name.upper()} {value:.4g}" for name, value in figures.items())
+    figures = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
+    figures = {name: value for name, value in figures.items() if value is not None}
+    shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
     made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
     return StageOutcome(f"held-out frames: {shown}", made, figures=figures | _training_psnr(trained))

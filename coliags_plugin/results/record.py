@@ -24,6 +24,9 @@ MAIN_SET = "test"
 MANY_TRANSPARENT = 0.01
 #: Of metrics over the pixels that a training frame sees.
 SEEN_SUFFIX = "_seen"
+#: Metrics of views whose poses were refined on their own, held-out images, by their names without a suffix; suffixes of
+#: those, and of those with each rendered colour multiplied by its best factor, too (docs/protocols.md).
+REFINED_METRICS, REFINED_SUFFIXES = ("psnr", "ssim"), ("_pose_refined", "_pose_color_refined")
 #: Of folders of evaluations against another scene's true depth, behind the name of the protocol.
 TRUTH_SUFFIX = "-truth"
 
@@ -149,7 +152,7 @@ class Result(_Part):
     protocol: ProtocolRecord
     seed: int  # of all random generators of the run
     steps: int  # training steps taken
-    metrics: dict[str, MetricRecord]  # in the protocol's order; then those over seen pixels, <name>_seen
+    metrics: dict[str, MetricRecord]  # in the protocol's order; then <name>_seen and <name>_pose_refined
     sets: dict[str, SetRecord]  # by name; ``test`` is the split's own
     metrics_sha256: str  # hash of the raw values of all test sets
     cost: CostRecord

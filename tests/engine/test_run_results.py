@@ -123,6 +123,20 @@ def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
     assert result.metrics["depth_mse_seen"] == result.metrics["depth_mse"]
 
 
+def test_refined_poses_add_metrics_and_change_no_other(result, whole):
+    found = read_result(evaluate(whole, "paper", refine_poses=True) / RESULT_FILE)
+    added = ["psnr_pose_refined", "ssim_pose_refined", "psnr_pose_color_refined", "ssim_pose_color_refined"]
+    assert list(found.metrics) == [*result.metrics, *added]
+    for name, part in result.sets.items():
+        own = found.sets[name]
+        assert {key: own.values[key] for key in part.values} == part.values
+        assert own.predictions_sha256 == part.predictions_sha256
+        assert all(None not in own.values[key] for key in added)
+    assert found.metrics["psnr_pose_refined"] == result.metrics["psnr"] and found.key != result.key
+    assert means_summary(found)["psnr_pose_refined"] == found.mean("psnr_pose_refined")
+    evaluate(whole, "paper")  # as other tests expect it
+
+
 def test_the_other_files_are_made_of_it(result, whole):
     folder = whole.run.evaluation("paper")
     assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(means_summary(result)))

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import PointCloud, Scene, View
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.modules.pose_correction import PoseCorrection, PoseCorrectionSettings, rotation_matrix
+from coliags_plugin.modules.pose_correction import PoseCorrection, PoseCorrectionSettings
 from tests.scenes import wall_scene
 from tests.textured_tube import tube_frames
 
@@ -35,11 +36,11 @@ METHOD = (
 )
 
 
-def test_rotation_matrix_is_scipys():
+def test_rotation_of_vector_is_scipys():
     vectors = 3.0 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for vector in (*vectors, torch.zeros(3, dtype=torch.float64)):
         expected = torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
-        torch.testing.assert_close(rotation_matrix(vector), expected)
+        torch.testing.assert_close(rotation_of_vector(vector), expected)
 
 
 def make(frames=9, **options):
@@ -55,7 +56,7 @@ def test_corrections_turn_about_what_is_in_view():
         module.translation[3] = torch.tensor([0.1, 0.2, 0.3])
     moved = module.adjust_camera(frame.camera, frame.view(trained=True))
     pose, other = frame.camera.camera_to_world, moved.camera_to_world
-    torch.testing.assert_close(other[:3, :3], rotation_matrix(module.rotation[3].double()) @ pose[:3, :3])
+    torch.testing.assert_close(other[:3, :3], rotation_of_vector(module.rotation[3].double()) @ pose[:3, :3])
     torch.testing.assert_close(other[:3, :3] @ other[:3, :3].T, torch.eye(3, dtype=torch.float64))
     depth = 20.0 - frame.camera.center[2]  # of the wall
     assert module._pivot_depths[3] == pytest.approx(depth.item(), rel=1e-6)
@@ -91,7 +92,7 @@ def test_held_out_frames_follow_the_frames_around_them():
     assert (middle.name, last.name) == ("0008", "0016")
     moved = module.adjust_camera(middle.camera, middle.view(trained=False)).camera_to_world
     pose, depth = middle.camera.camera_to_world, 20.0 - middle.camera.center[2]
-    turn = rotation_matrix(7.0 * torch.tensor([0.001, -0.002, 0.003], dtype=torch.float64))
+    turn = rotation_of_vector(7.0 * torch.tensor([0.001, -0.002, 0.003], dtype=torch.float64))
     torch.testing.assert_close(moved[:3, :3], turn @ pose[:3, :3], rtol=0, atol=1e-7)
     pivots = [p[:3, 3] + depth * p[:3, 2] for p in (pose, moved)]
     expected = 7.0 * torch.tensor([0.02, 0.05, -0.03], dtype=torch.float64)
@@ -163,7 +164,7 @@ def test_known_perturbations_are_undone(tmp_path):
     for frame in frames:
         turn, shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
         pose = frame.camera.camera_to_world.clone()
-        pose[:3, :3] = pose[:3, :3] @ rotation_matrix(turn * math.radians(0.5) / turn.norm())
+        pose[:3, :3] = pose[:3, :3] @ rotation_of_vector(turn * math.radians(0.5) / turn.norm())
         pose[:3, 3] += 0.5 * shift / shift.norm()
         perturbed.append(replace(frame, camera=replace(frame.camera, camera_to_world=pose)))
     scene = Scene("tube", perturbed, {"test": []}, PointCloud(points, colors), {"fingerprint": "tube"})

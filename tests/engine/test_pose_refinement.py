@@ -1,0 +1,85 @@
+"""Refinement of held-out poses: a known perturbation is undone, and the model stays as it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.pose_refinement import refined_camera, refined_scores
+from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from tests.export.viewer.made import Scripted
+from tests.textured_tube import tube_frames
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Gaussians on the wall of a textured tube."""
+    frames = tube_frames(3, 1.0, (64, 52), coarseness=3.0)
+    points = torch.cat([frame.camera.unproject(frame.depth.double()).reshape(-1, 3)[::6] for frame in frames])
+    colors = torch.cat([frame.rgb.reshape(-1, 3)[::6] for frame in frames])
+    count = len(points)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
+    wall = Gaussians(
+        points.float(),
+        quats,
+        torch.full((count, 3), 0.7),
+        torch.full((count,), 0.7),
+        colors,
+        torch.arange(count),
+        torch.arange(count),
+    )
+    made = Model(Scripted(wall), TorchRenderer(TorchRendererSettings()), {})
+    made.register_parameter("weight", torch.nn.Parameter(torch.ones(1)))
+    return made
+
+
+@pytest.fixture(scope="module")
+def frame(model):
+    """A view of it, and half of its pixels masked."""
+    camera = tube_frames(3, 1.0, (64, 52))[1].camera.to(dtype=torch.float32)
+    image = (model.render(camera).rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+    mask = torch.ones(52, 64, dtype=torch.bool)
+    mask[40:] = False
+    return Frame("0001", 1, torch.where(mask[..., None], image, 0), camera, mask=mask)
+
+
+def errors(camera, other):
+    """Distance of two cameras, and the angle between them, degrees."""
+    turn = Rotation.from_matrix((camera.camera_to_world[:3, :3].T @ other.camera_to_world[:3, :3]).numpy())
+    return float((camera.center - other.center).norm()), math.degrees(turn.magnitude())
+
+
+def test_a_known_perturbation_is_undone(model, frame):
+    turn, shift = torch.tensor([0.01, -0.02, 0.03]), torch.tensor([0.4, 0.3, -0.5])
+    wrong = replace(frame, camera=frame.camera.moved(turn, shift, 40.0))
+    distance, angle = errors(wrong.camera, frame.camera)
+    assert distance > 0.7 and angle > 2.0
+    distance, angle = errors(refined_camera(model, wrong), frame.camera)
+    assert distance < 0.1 and angle < 0.2
+    assert model.weight.requires_grad and model.weight.grad is None
+
+
+def test_its_scores_have_names_of_their_own_and_are_better(model, frame):
+    scorer = Scorer("paper", ["psnr", "ssim"])
+    darker = replace(frame, image=(frame.image * 0.8).to(torch.uint8))
+    wrong = replace(darker, camera=frame.camera.moved(torch.zeros(3), torch.tensor([0.5, 0.0, 0.0]), 40.0))
+    given = scorer.score(scorer.compare(model, wrong, torch.device("cpu"))).values
+    scores = refined_scores(model, wrong, scorer)
+    assert list(scores) == ["_pose_refined", "_pose_color_refined"]
+    refined, fitted = (one.values for one in scores.values())
+    assert refined["psnr"] > given["psnr"] + 0.1
+    assert fitted["psnr"] > refined["psnr"] + 10.0 and fitted["psnr"] > 35.0
+
+
+def test_a_view_of_nothing_keeps_its_pose(model, frame):
+    away = frame.camera.moved(torch.tensor([0.0, math.pi, 0.0]), torch.tensor([0.0, 0.0, -500.0]), 0.0)
+    lost = replace(frame, camera=away)
+    assert refined_camera(model, lost) is away
