@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
@@ -109,6 +110,18 @@ def test_images_of_another_scale_are_not_held():
         if {element.image_id for element in point.track.elements} <= {2, 3, 4}:
             point.xyz = 1000.0 * point.xyz  # what the first three images see alone
     assert sorted(held_part(model).reg_image_ids()) == list(range(5, COUNT + 1))
+
+
+@pytest.mark.parametrize(("turn", "until", "leaps"), [(40.0, 4, True), (25.0, 4, False), (40.0, COUNT, False)])
+def test_an_image_turned_far_from_both_neighbours_is_not_held(turn, until, leaps):
+    """A turn of all that follow is one of the camera."""
+    model, _ = seen_points()
+    for number in range(4, until + 1):
+        pose = model.images[number].cam_from_world().matrix()
+        pose = Rotation.from_euler("z", turn, degrees=True).as_matrix() @ pose
+        model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+    expected = [number for number in range(1, COUNT + 1) if not (leaps and number == 4)]
+    assert sorted(held_part(model).reg_image_ids()) == expected
 
 
 def test_rays_of_exact_observations_meet_in_the_points():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.reconstruction.structure.adjustment import Rays
 from coliags_plugin.reconstruction.structure.mapping import depths_of
@@ -25,6 +26,9 @@ _FEWEST_COMMON, _SAME_SCALE, _LEAST_CERTAIN = 5, 0.25, 0.15
 #: Points of a model that one of its images sees at least, and factor by which their median depth differs at most from
 #: that of the median image.
 _FEWEST_SEEN, _OTHER_SCALE = 15, 20.0
+#: Turn of an image from those before and after it beyond which its pose is not believed, degrees, if these differ by
+#: less than half of it: no camera turns so far and back in one frame.
+_LEAP = 30.0
 #: Smallest angle between rays at a point of which the depth counts, degrees.
 _LEAST_ANGLE = 0.5
 
@@ -113,15 +117,33 @@ def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.R
 def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """The model without images whose poses are not believed; itself if there are none. Image i has ID i + 1.
 
-    These see too few of its points, or points at a depth that is another by orders: a part whose scale nothing holds.
+    These see too few of its points, or points at a depth that is another by orders: a part whose scale nothing holds;
+    or they are turned far from those before and after them, which agree.
     """
     while True:
         depths = {number: depth for number, (_, depth) in depths_of(model).items() if len(depth) >= _FEWEST_SEEN}
         medians = {number: float(np.median(depth)) for number, depth in depths.items()}
         middle = float(np.median(list(medians.values()))) if medians else 0.0
+        leaps = _leaps(model)
         held = [
-            number for number, median in medians.items() if middle / _OTHER_SCALE <= median <= middle * _OTHER_SCALE
+            number
+            for number, median in medians.items()
+            if middle / _OTHER_SCALE <= median <= middle * _OTHER_SCALE and number not in leaps
         ]
         if len(held) == model.num_reg_images():
             return model
         model = part_of(model, [number - 1 for number in held])
+
+
+def _leaps(model: pycolmap.Reconstruction) -> set[int]:
+    """IDs of images turned by more than :data:`_LEAP` from those before and after, which differ by half at most."""
+    numbers = sorted(model.reg_image_ids())
+    if len(numbers) < 3:
+        return set()
+    poses = Rotation.from_matrix([model.images[number].cam_from_world().rotation.matrix() for number in numbers])
+    before, after, across = (
+        np.degrees((one * other.inv()).magnitude())
+        for one, other in ((poses[:-2], poses[1:-1]), (poses[1:-1], poses[2:]), (poses[:-2], poses[2:]))
+    )
+    leaps = np.minimum(before, after) > np.maximum(_LEAP, 2.0 * across)
+    return {number for number, leap in zip(numbers[1:-1], leaps, strict=True) if leap}
