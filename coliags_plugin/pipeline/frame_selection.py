@@ -15,6 +15,8 @@ from coliags_plugin.pipeline.settings import FrameSettings
 _SIDE = 480
 #: Corners that are followed, at most, and fewest for a motion.
 _CORNERS, _FEWEST = 200, 12
+#: Width of the surroundings of a corner, which have to be of the lens's image, pixels.
+_RIM = 9
 #: Largest distance between a corner and where following it there and back ends, pixels.
 _RETURN = 0.5
 #: Neighbours to either side, of the frames left by thinning, that a frame's sharpness is compared with.
@@ -116,11 +118,21 @@ def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
-def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
-    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few."""
+def motion(
+    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
+) -> float:
+    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few.
+
+    ``mask``, of the frames before they were reduced, is False where corners do not count, as on text, which rests.
+    """
     import cv2
 
-    corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8)
+    counted = (
+        None if mask is None else cv2.resize(mask.astype(np.uint8), before.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    )
+    if counted is not None:
+        counted = cv2.erode(counted, np.ones((_RIM, _RIM), np.uint8))
+    corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8, mask=counted)
     if corners is None or len(corners) < _FEWEST:
         return float("inf")
     moved, tracked = _followed(before, after, corners)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,8 +149,14 @@ def _opened(path: Path) -> cv2.VideoCapture:
 
 
 @contextmanager
-def image_files(source: Path, progress: Progress | None = None) -> Iterator[list[Path]]:
+def image_files(
+    source: Path,
+    progress: Progress | None = None,
+    look: Callable[[UInt8[np.ndarray, "H W 3"]], None] | None = None,
+) -> Iterator[list[Path]]:
     """Image files of a folder, or of a video's frames, which are written to a temporary folder without loss.
+
+    ``look`` is given every frame of a video.
 
     Raises:
         InputError: As :func:`frame_source`, or a frame cannot be read.
@@ -161,9 +167,12 @@ def image_files(source: Path, progress: Progress | None = None) -> Iterator[list
         return
     with tempfile.TemporaryDirectory(prefix="coliags-frames-") as scratch:
         files = []
+        expected = frames.expected
         for done, (name, image) in enumerate(frames, start=1):
             files.append(Path(scratch) / f"{name}.png")
             write_image(files[-1], image)
+            if look is not None:
+                look(image)
             if progress is not None:
-                progress("read frames", done, max(done, frames.expected))
+                progress("read frames", done, max(done, expected))
         yield files

@@ -52,7 +52,12 @@ def write_frames(
     surroundings of the lens's image and overlays are found. Replaces the folder; returns a summary of one line.
     """
     given = None if mask is None else read_mask(mask)
-    sharpnesses, found = _survey(source, progress)
+    survey, expected = FrameSurvey(source.path), source.expected
+    for done, (_, image) in enumerate(source, start=1):
+        survey.add(image)
+        if progress is not None:
+            progress("look at frames", done, max(done, expected))
+    found, sharpnesses = survey.mask(), survey.sharpnesses
     size, total = found.shape, len(sharpnesses)
     if given is not None and given.shape != size:
         raise InputError(
@@ -64,7 +69,7 @@ def write_frames(
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
         kept = []
-        for index, name, image, moved in _moving(source, set(chosen), settings, progress, total):
+        for index, name, image, moved in _moving(source, set(chosen), settings, used, progress, total):
             if not moved:
                 dropped[index] = RESTING
                 continue
@@ -122,41 +127,49 @@ def read_blurred(folder: Path) -> set[str]:
     return {frame["name"] for frame in kept if frame.get("blurred")}
 
 
-def found_mask(source: FrameSource, progress: Progress | None = None) -> Bool[np.ndarray, "H W"] | None:
-    """The mask of a video without black surroundings of the lens's image and overlays; None where it has neither."""
-    _, mask = _survey(source, progress)
-    return None if mask.all() else mask
+class FrameSurvey:
+    """Sharpness of all frames of a video, and what they have in common: their mask, and whether they are interlaced."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.sharpnesses: list[float] = []
+        self._combs: list[float] = []
+        self._extremes: list[UInt8[np.ndarray, "H W 3"]] = []
+        self._sum: Float32[np.ndarray, "H W 3"] | None = None
 
-def _survey(source: FrameSource, progress: Progress | None) -> tuple[list[float], Bool[np.ndarray, "H W"]]:
-    """Sharpness of all frames; and False outside of the lens's image and on overlays. Says if they are interlaced."""
-    total = source.expected
-    values: list[float] = []
-    combs: list[float] = []
-    extremes: list[UInt8[np.ndarray, "H W 3"]] = []
-    summed: Float32[np.ndarray, "H W 3"] | None = None
-    for done, (_, image) in enumerate(source, start=1):
-        values.append(sharpness(reduced(image)))
-        combs.append(combing(image))
-        extremes = [np.minimum(extremes[0], image), np.maximum(extremes[1], image)] if extremes else [image, image]
-        summed = image.astype(np.float32) if summed is None else summed + image
-        if progress is not None:
-            progress("look at frames", done, max(done, total))
-    if summed is None:
-        raise InputError(f"no frames in {source.path}", "a video")
-    if np.median(combs) > INTERLACED:
-        log.warning(
-            "%s looks interlaced: every frame shows two moments in alternate rows, which spoils poses and surface. "
-            "Make whole frames with ffmpeg -i VIDEO -vf yadif NEW.mp4 and give these",
-            source.path,
+    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Look at the next frame, of the size of the first."""
+        self.sharpnesses.append(sharpness(reduced(image)))
+        self._combs.append(combing(image))
+        extremes = self._extremes
+        self._extremes = (
+            [np.minimum(extremes[0], image), np.maximum(extremes[1], image)] if extremes else [image, image]
         )
-    inside = lens_mask(extremes[1].max(axis=2))
-    within = ~overlays(extremes[0], extremes[1], summed / len(values))
-    return values, within if inside is None else within & inside
+        self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
+
+    def mask(self) -> Bool[np.ndarray, "H W"]:
+        """False outside of the lens's image and on overlays. Says if the frames are interlaced."""
+        if self._sum is None:
+            raise InputError(f"no frames in {self.path}", "a video")
+        if np.median(self._combs) > INTERLACED:
+            log.warning(
+                "%s looks interlaced: every frame shows two moments in alternate rows, which spoils poses and surface. "
+                "Make whole frames with ffmpeg -i VIDEO -vf yadif NEW.mp4 and give these",
+                self.path,
+            )
+        darkest, brightest = self._extremes
+        inside = lens_mask(brightest.max(axis=2))
+        within = ~overlays(darkest, brightest, self._sum / len(self.sharpnesses))
+        return within if inside is None else within & inside
 
 
 def _moving(
-    source: FrameSource, chosen: set[int], settings: FrameSettings, progress: Progress | None, total: int
+    source: FrameSource,
+    chosen: set[int],
+    settings: FrameSettings,
+    mask: Bool[np.ndarray, "H W"] | None,
+    progress: Progress | None,
+    total: int,
 ) -> Iterator[tuple[int, str, UInt8[np.ndarray, "H W 3"], bool]]:
     """The chosen frames: index, name, image, and whether the image has moved since the last that had."""
     last = None
@@ -166,6 +179,6 @@ def _moving(
         if index not in chosen:
             continue
         gray = reduced(image)
-        moved = last is None or motion(last, gray) >= settings.least_motion
+        moved = last is None or motion(last, gray, mask) >= settings.least_motion
         last = gray if moved else last
         yield index, name, image, moved

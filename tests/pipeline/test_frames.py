@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_mask
+from coliags_plugin.pipeline.frame_selection import motion, reduced
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.frames import found_mask, read_blurred, read_lens_mask, write_frames
+from coliags_plugin.pipeline.frames import FrameSurvey, read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
 from tests.pipeline.films import HEIGHT, WIDTH, blurred, film, write_images
 
@@ -76,16 +78,32 @@ def test_too_few_frames_of_use_are_refused(tmp_path, frames, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_overlays_and_interlaced_frames_are_found(tmp_path, caplog):
+def surveyed(frames):
+    survey = FrameSurvey(Path("film"))
+    for frame in frames:
+        survey.add(frame)
+    return survey
+
+
+def test_overlays_and_interlaced_frames_are_found(caplog):
     labelled = [frame.copy() for frame in FILM]
     for frame in labelled:
         frame[80:100, 20:70] = (250, 250, 250)
-    mask = found_mask(frame_source(write_images(tmp_path / "labelled", labelled)))
+    mask = surveyed(labelled).mask()
     assert not mask[80:100, 20:70].any() and mask[:70].all()
-    assert found_mask(frame_source(write_images(tmp_path / "plain", FILM))) is None
+    assert surveyed(FILM).mask().all()
     assert "interlaced" not in caplog.text
     woven = [one.copy() for one in FILM[:-1]]
     for frame, following in zip(woven, FILM[1:], strict=True):
         frame[1::2] = following[1::2]
-    found_mask(frame_source(write_images(tmp_path / "woven", woven)))
+    surveyed(woven).mask()
     assert "looks interlaced" in caplog.text
+
+
+def test_what_is_masked_does_not_rest():
+    one, two = (reduced(frame) for frame in FILM[:2])
+    two[:80] = one[:80]
+    mask = np.zeros(one.shape, bool)
+    mask[80:] = True
+    assert motion(one, two) == pytest.approx(0.0, abs=1e-4)
+    assert motion(one, two, mask) == pytest.approx(6 / WIDTH, rel=0.02)

@@ -5,48 +5,27 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays, adjust, held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Link, held_part, part_of, weak_links
-from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
 from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
-from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+from tests.reconstruction.seen_points import COMMON, COUNT, GAP, seen_points
+from tests.textured_tube import INTRINSICS, write_tube
 
-#: Frames, the one after which most points change, and points seen from both sides of it.
-COUNT, GAP, COMMON = 8, 3, 9
 TRACKED = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS), matching="tracks")
-
-
-def seen_points(shift=0.0):
-    """A posed model: 40 points on either side of a gap, and a few seen from both, ``shift`` mm farther after it."""
-    frames = tube_frames(COUNT, 3.0, (16, 12))
-    frames = [replace(frame, camera=frame.camera.resized(160, 128)) for frame in frames]
-    rng = np.random.default_rng(0)
-    positions = np.stack([*rng.uniform(-8, 8, (2, 80 + COMMON)), rng.uniform(45, 58, 80 + COMMON)], axis=1)
-    sides = np.repeat([0, 1, 2], [40, 40, COMMON])
-    observed = []
-    for index, frame in enumerate(frames):
-        after = index > GAP
-        numbers = np.flatnonzero((sides == 2) | (sides == after))
-        pose = frame.camera.camera_to_world.double().numpy()
-        moved = positions[numbers] + np.where(((sides[numbers] == 2) & after)[:, None], [0.0, 0.0, shift], 0.0)
-        local = (moved - pose[:3, 3]) @ pose[:3, :3]
-        fx, fy, cx, cy = INTRINSICS
-        observed.append(SeenPoints(local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy), numbers))
-    model = frame_model(frames)
-    add_points(model, observed, positions, np.zeros((len(positions), 3), np.uint8), np.ones(len(positions)))
-    return model, observed
 
 
 def test_a_model_is_weak_where_few_points_are_common():
@@ -95,6 +74,7 @@ def test_held_out_tracks_measure_the_poses(noise):
             followed=9,
             shift=0.0,
             sharpness=1.0,
+            fineness=3.0,
         )
         for points in observed
     ]
@@ -173,6 +153,14 @@ def test_tracks_give_every_frame_a_pose(tracked):
     assert tracked.largest.registered == tuple(range(8))
     assert tracked.largest.test_error < 0.6
     assert tracked.submaps() == [(0, range(8))]
+
+
+def test_blurred_images_get_no_poses(tmp_path):
+    images = list_images(write_tube(tmp_path / "scene", 8, 2.0) / "images")
+    for path in images:
+        write_png(path, cv2.GaussianBlur(read_rgb(path), (0, 0), 5.0))
+    with pytest.raises(InputError, match=r"no model from 8 images .* \(8 images: blurred, as most images of its model"):
+        reconstruct(images, TRACKED)
 
 
 def test_places_between_models_are_told(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -11,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
-from coliags_plugin.reconstruction.structure.texture import wall_textures
+from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
 
@@ -118,7 +119,7 @@ def test_long_videos_are_cut_where_few_points_are_followed():
     followed = [0, *[300] * 99]
     followed[40], followed[70] = 20, 30
     empty = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-    frames = [FramePoints(*empty, count, shift=0.0, sharpness=1.0) for count in followed]
+    frames = [FramePoints(*empty, count, shift=0.0, sharpness=1.0, fineness=3.0) for count in followed]
     names = tuple(map(str, range(100)))
     video = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * 100, (), (), {}, tuple(frames))
     assert video.windows(100) == [range(100)]
@@ -127,3 +128,13 @@ def test_long_videos_are_cut_where_few_points_are_followed():
     assert windows[:2] == [range(40), range(40, 70)]
     assert [frame for window in windows for frame in window] == list(range(100))
     assert max(map(len, windows)) <= 50
+
+
+def test_fineness_is_that_of_a_known_blur():
+    """Of white noise blurred by s, Laplacians smoothed by t have a power in proportion to (s^2 + t^2)^-3."""
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (384, 384)).astype(np.float32)
+    for blur in (2.0, 3.0, 6.0):
+        image = cv2.GaussianBlur(noise, (0, 0), blur)
+        gray = np.clip(128.0 + 40.0 * image / image.std(), 20, 230).round().astype(np.uint8)
+        assert fineness(gray) == pytest.approx(((blur**2 + 16.0) / (blur**2 + 4.0)) ** 1.5, rel=0.1)
+        assert fineness(gray // 2) == pytest.approx(fineness(gray), rel=0.1)

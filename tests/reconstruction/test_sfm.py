@@ -203,9 +203,43 @@ def refusal(match, tube, settings=KNOWN, masks=None):
 
 
 def test_images_without_motion_are_refused(tube, tmp_path):
+    image, rng = read_rgb(list_images(tube)[0]), np.random.default_rng(0)
     for index in range(4):
-        write_png(tmp_path / f"{index}.png", read_rgb(list_images(tube)[0]))
-    refusal(r"no model from 4 images with \d+ points.*the camera has to move", tmp_path)
+        write_png(
+            tmp_path / f"{index}.png", np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
+        )
+    refusal(r"no model from 4 images with \d+ points.*\(4 images: .*the camera has to move", tmp_path)
+
+
+def test_images_that_repeat_are_left_out_and_named(found, tube, tmp_path, caplog):
+    for index, path in enumerate(list_images(tube)):
+        for again in range(3):
+            write_png(tmp_path / f"{index}_{again}.png", read_rgb(path))
+    atlas = reconstruct(list_images(tmp_path), KNOWN)
+    assert [path.name for path in atlas.images] == [f"{index}_0.png" for index in range(COUNT)]
+    np.testing.assert_array_equal(atlas.largest.camera_to_world, found.camera_to_world)
+    assert "12 of 18 images repeat the one before and are left out: 0_1.png, 0_2.png, 1_1.png" in caplog.text
+    for path in list_images(tmp_path)[3:]:
+        path.unlink()
+    refusal("all 3 images show the same", tmp_path)
+
+
+def test_black_surroundings_move_the_cameras_centre(found, tube, tmp_path):
+    """Of an unknown camera: the same path as of the picture alone."""
+    settings = SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factors=(0.63,), refine=False))
+    alone = reconstruct(list_images(tube), settings).largest
+    shown = np.zeros((150, 260), bool)
+    shown[10:138, 80:240] = True
+    for path in list_images(tube):
+        image = np.zeros((150, 260, 3), np.uint8)
+        image[10:138, 80:240] = read_rgb(path)
+        write_png(tmp_path / path.name, image)
+    framed = reconstruct(list_images(tmp_path), settings, shown).largest
+    (camera,) = framed.model.cameras.values()
+    assert (camera.width, camera.height) == (260, 150)
+    assert tuple(camera.params) == pytest.approx((0.63 * 160, 80 + 80, 10 + 64))
+    assert framed.summary().split(", ")[-1] == alone.summary().split(", ")[-1]
+    assert share_of_path(framed.trajectory, alone.camera_to_world)[0] < 0.01
 
 
 def test_cameras_that_are_none_are_refused(tube, tmp_path):

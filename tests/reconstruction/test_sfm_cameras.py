@@ -11,6 +11,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     CALIBRATED,
+    Picture,
     Start,
     calibrated_camera,
     distortion,
@@ -20,6 +21,8 @@ from coliags_plugin.reconstruction.structure.sfm_cameras import (
     starts,
 )
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
+from tests.reconstruction.seen_points import seen_points
+from tests.textured_tube import HEIGHT, WIDTH
 
 
 def test_c3vd_at_full_size_is_the_official_calibration():
@@ -97,3 +100,32 @@ def test_an_unknown_camera_has_several_starts_and_a_known_one_has_one():
 def test_ranges_that_are_none_are_refused(wrong):
     with pytest.raises(ValidationError):
         CameraSettings(**wrong)
+
+
+# Pictures within black surroundings
+
+
+def test_the_lens_fills_what_is_neither_masked_nor_black():
+    image = np.zeros((60, 100, 3), np.uint8)
+    image[10:50, 30:90] = 120
+    image[3, :20] = 255  # text beside the picture
+    mask = image.max(axis=2) == 120
+    mask[44:50] = False  # text on the picture
+    assert Picture.in_mask(mask, image) == Picture((30, 10), (60, 40), (100, 60))
+    everything = np.ones((60, 100), bool)
+    assert Picture.in_mask(everything, image) is None
+    everything[:20, :20] = False  # corners do not matter
+    assert Picture.in_mask(everything, image) is None
+
+
+def test_models_of_a_picture_become_those_of_whole_images():
+    model, _ = seen_points()
+    picture = Picture((30, 10), (WIDTH, HEIGHT), (WIDTH + 50, HEIGHT + 20))
+    before = {number: np.array([point.xy for point in image.points2D]) for number, image in model.images.items()}
+    picture.to_frame(model)
+    (camera,) = model.cameras.values()
+    assert (camera.width, camera.height) == picture.frame
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() == pytest.approx(0.0, abs=1e-9)
+    for number, image in model.images.items():
+        np.testing.assert_allclose([point.xy for point in image.points2D], np.add(before[number], (30, 10)))

@@ -134,8 +134,8 @@ class PosesSfmCommand:
         """Reconstruct, write the scene and print a summary."""
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.pipeline.frame_sources import frame_source, image_files
-        from coliags_plugin.pipeline.frames import found_mask
+        from coliags_plugin.pipeline.frame_sources import image_files
+        from coliags_plugin.pipeline.frames import FrameSurvey
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for
         from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
@@ -149,12 +149,13 @@ class PosesSfmCommand:
         given = [] if self.camera is None else [f"camera.model={self.camera}"]
         given += [] if self.params is None else [f"camera.params=[{self.params}]"]
         settings = settings_of(SfmSettings, [*given, *self.set])
-        with progress_callback() as progress, image_files(self.frames, progress) as files:
+        survey = FrameSurvey(self.frames)
+        with progress_callback() as progress, image_files(self.frames, progress, survey.add) as files:
             images = files[:: self.every][: self.max_frames]
             masks: Masks = None
             if self.mask is not None:
                 masks = masks_for(self.mask, images)
-            elif not self.frames.is_dir() and (found := found_mask(frame_source(self.frames), progress)) is not None:
+            elif not self.frames.is_dir() and not (found := survey.mask()).all():
                 _LOG.info(
                     "ignored: black surroundings and overlays, %.0f %% of the image", 100.0 * (1.0 - found.mean())
                 )

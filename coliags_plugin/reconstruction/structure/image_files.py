@@ -46,6 +46,18 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     return np.ascontiguousarray(image[..., ::-1])
 
 
+#: Mean difference of neighbouring images, of 255, up to which one repeats the other: up to 0.3 where a video repeats
+#: frames, as compression changes them a little; 0.6 or more between frames of a slow video.
+_SAME = 0.4
+
+
+def is_repeated(before: UInt8[np.ndarray, "H W 3"], after: UInt8[np.ndarray, "H W 3"]) -> bool:
+    """Whether an image shows the same as the one before, as in videos converted to a higher frame rate."""
+    import cv2
+
+    return before.shape == after.shape and float(cv2.absdiff(before, after).mean()) <= _SAME
+
+
 def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     """Read a mask: True where the image is not black."""
     return np.asarray(read_image(path).max(axis=2) > 0)

@@ -19,7 +19,7 @@ from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
-from coliags_plugin.reconstruction.structure.texture import correlation_at, sharpness, wall_textures
+from coliags_plugin.reconstruction.structure.texture import correlation_at, fineness, sharpness, wall_textures
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,7 @@ class FramePoints:
         followed: Number of points that came from the frame before.
         shift: Their median displacement, as a share of the larger side.
         sharpness: Of the frame (:func:`sharpness`).
+        fineness: Of the frame at the size that is tracked (:func:`fineness`).
     """
 
     ids: Int64[np.ndarray, "K"]
@@ -41,6 +42,7 @@ class FramePoints:
     followed: int
     shift: float
     sharpness: float
+    fineness: float
 
     def with_points(self, other: FramePoints) -> FramePoints:
         """These points and others of the same frame, whose track numbers are larger."""
@@ -152,8 +154,8 @@ class _PointTracker:
         order = np.argsort(view.ids)
         pixels = (view.pixels[order] + 0.5) * stretch
         brightness = brightness_at(image, pixels.astype(np.float64)).astype(np.float32)
-        sharp = sharpness(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY))
-        return FramePoints(view.ids[order], pixels, brightness, followed, shift, sharp)
+        gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        return FramePoints(view.ids[order], pixels, brightness, followed, shift, sharpness(gray), fineness(gray))
 
     def _followed(self, before: _View, after: _View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
         """Indices of the points of one view that are found in another one, and where.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -50,7 +51,7 @@ log = logging.getLogger(__name__)
 class Reconstruction:
     """Result of structure from motion. Scale and world frame are arbitrary: images alone determine neither."""
 
-    images: tuple[Path, ...]  # all input images, in order
+    images: tuple[Path, ...]  # all images but those that repeat the one before, in order
     registered: tuple[int, ...]  # indices of the registered images, ascending
     camera_to_world: Float[np.ndarray, "M 4 4"]  # their poses, OpenCV axes
     names: tuple[str, ...]  # of all images in the model
@@ -58,6 +59,7 @@ class Reconstruction:
     correlation: float | None = None  # of log brightness with log depth; None: unknown
     links: tuple[Link, ...] = ()  # weak places that hold
     test_error: float | None = None  # median error of tracks that mapping has not used, pixels; None: unknown
+    lens_side: int | None = None  # larger side of the lens's picture, pixels; None: it fills the images
 
     @property
     def trajectory(self) -> Trajectory:
@@ -77,7 +79,7 @@ class Reconstruction:
             f"reprojection error {self.model.compute_mean_reprojection_error():.2f} px, {camera.model_name} "
             f"{', '.join(f'{value:.5g}' for value in camera.params)}"
             f"{f' and {len(others)} further cameras' if others else ''}, "
-            f"field of view {field_of_view(camera):.0f} degrees"
+            f"field of view {field_of_view(camera, self.lens_side):.0f} degrees"
         )
 
 
@@ -89,7 +91,7 @@ class Atlas:
     those between models of tracks that mapping has not linked.
     """
 
-    images: tuple[Path, ...]  # all input images, in order
+    images: tuple[Path, ...]  # all images but those that repeat the one before, in order
     models: tuple[Reconstruction, ...]  # the largest first
     lost: dict[int, str]  # why an image has no pose, by its index
     refused: tuple[Link, ...] = ()
@@ -149,9 +151,10 @@ def reconstruct(
         if not atlas.models:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
+            why, count = Counter(atlas.lost.values()).most_common(1)[0]
             raise InputError(
-                f"no model from {len(images)} images with {np.mean(counts):.0f} points and {np.mean(matches):.0f} "
-                "matches a pair",
+                f"no model from {len(video.images)} images with {np.mean(counts):.0f} points and "
+                f"{np.mean(matches):.0f} matches a pair ({count} images: {why})",
                 "overlapping images from different camera positions",
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
@@ -217,12 +220,10 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
     found.sort(key=lambda one: -len(one.registered))
     posed = {index for one in found for index in one.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
-    for unlike in [one for one in found if _is_unlike(one, found[0])]:
-        found.remove(unlike)
-        count, error = len(unlike.registered), unlike.test_error
-        lost |= dict.fromkeys(
-            unlike.registered, f"its model of {count} images is {error:.1f} px from points that are followed"
-        )
+    for model, reason in [(model, _refusal(video, model, found[0])) for model in found]:
+        if reason is not None:
+            found.remove(model)
+            lost |= dict.fromkeys(model.registered, reason)
     lost = dict(sorted(lost.items()))
     if lost:
         names = [video.images[index].name for index in lost]
@@ -236,15 +237,22 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
 
 
-#: Images of a model below which it is not believed if its error is so many times that of the largest.
-_SHORT, _WORSE = 12, 2.0
+#: Images of a model below which it is not believed if its error is so many times that of the largest; and the fineness
+#: of its images, in the median, below which none is: that of a blur by 3.5 px of 384.
+_SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
 
 
-def _is_unlike(one: Reconstruction, largest: Reconstruction) -> bool:
-    """Whether a short model agrees much less with held-out tracks than the largest, as in contact with the wall."""
+def _refusal(video: MatchedVideo, one: Reconstruction, largest: Reconstruction) -> str | None:
+    """Why a model of tracks is not believed: all is blurred, or it is short and held-out tracks contradict it."""
+    if not video.tracks:
+        return None
+    if np.median([video.tracks[index].fineness for index in one.registered]) < _LEAST_FINENESS:
+        return "blurred, as most images of its model"
     if len(one.registered) >= _SHORT or one.test_error is None or largest.test_error is None:
-        return False
-    return one.test_error > _WORSE * largest.test_error
+        return None
+    if one.test_error > _WORSE * largest.test_error:
+        return f"its model of {len(one.registered)} images is {one.test_error:.1f} px from points that are followed"
+    return None
 
 
 def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], known: Sequence[int]) -> list[Link]:
@@ -283,14 +291,24 @@ _LIT = -0.15
 def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) -> Reconstruction:
     images, model = video.images, chosen.model
     registered = sorted(number - 1 for number in model.reg_image_ids())
-    _color(model, images)
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
     error = held_out_error(model, video.tracks) if video.tracks else None
     poses = inverse(world_to_camera)
+    if video.picture is not None:
+        video.picture.to_frame(model)
+    _color(model, images)
     reconstruction = Reconstruction(
-        images, tuple(registered), poses, video.names, model, chosen.correlation, links, error
+        images,
+        tuple(registered),
+        poses,
+        video.names,
+        model,
+        chosen.correlation,
+        links,
+        error,
+        None if video.picture is None else max(video.picture.size),
     )
     if chosen.correlation is None or chosen.correlation > _LIT:
         log.warning(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens
@@ -32,6 +33,43 @@ class Start:
     model: str  # of COLMAP, or of CALIBRATED
     focal_factor: float  # focal length relative to the image's larger side, where no parameters are known
     radial: float | None = None  # the model's last parameter, its only one of distortion; None: undistorted
+
+
+#: Share of the image's width and height from which the lens's picture fills it; brightness (of 255) of surroundings.
+_FILLED, _DARK = 0.95, 16
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The part of the images that the lens's picture takes up within black surroundings; its centre is the lens's."""
+
+    corner: tuple[int, int]  # column and row of its first pixel
+    size: tuple[int, int]  # width and height
+    frame: tuple[int, int]  # width and height of the images
+
+    @classmethod
+    def in_mask(cls, mask: Bool[np.ndarray, "H W"], image: UInt8[np.ndarray, "H W 3"]) -> Picture | None:
+        """The rectangle around what is not masked, or masked but mostly bright; None where it is nearly all."""
+        lit = image.max(axis=2) > _DARK
+        spans = []
+        for axis in (0, 1):
+            used = np.flatnonzero(mask.any(axis=axis) | (lit.mean(axis=axis) > 0.5))
+            spans.append((int(used[0]), int(used[-1]) + 1) if len(used) else (0, mask.shape[1 - axis]))
+        size = (spans[0][1] - spans[0][0], spans[1][1] - spans[1][0])
+        frame = (mask.shape[1], mask.shape[0])
+        if all(part >= _FILLED * whole for part, whole in zip(size, frame, strict=True)):
+            return None
+        return cls((spans[0][0], spans[1][0]), size, frame)
+
+    def to_frame(self, model: pycolmap.Reconstruction) -> None:
+        """Change cameras and keypoints of a model of the picture to those of whole images, in place."""
+        for camera in model.cameras.values():
+            camera.width, camera.height = self.frame
+            camera.principal_point_x += self.corner[0]
+            camera.principal_point_y += self.corner[1]
+        for image in model.images.values():
+            for point in image.points2D:
+                point.xy = point.xy + np.array(self.corner, float)
 
 
 def starts(settings: CameraSettings) -> list[Start]:
@@ -129,9 +167,12 @@ def starting_cameras(
     return cameras
 
 
-def field_of_view(camera: pycolmap.Camera) -> float:
-    """Nominal (undistorted) field of view of the larger side, degrees: 2 atan(side / 2f), or side / f of a fisheye."""
-    return float(np.degrees(2.0 * _border(camera)[1]))
+def field_of_view(camera: pycolmap.Camera, side: float | None = None) -> float:
+    """Nominal (undistorted) field of view of the larger side, degrees: 2 atan(side / 2f), or side / f of a fisheye.
+
+    ``side``, pixels, is that of the lens's picture where it does not fill the images.
+    """
+    return float(np.degrees(2.0 * _border(camera, side)[1]))
 
 
 def distortion(camera: pycolmap.Camera) -> float:
@@ -144,8 +185,8 @@ def distortion(camera: pycolmap.Camera) -> float:
     return abs(float(camera.img_from_cam(ray[None])[0][axis] - center) / radius - 1.0)
 
 
-def _border(camera: pycolmap.Camera) -> tuple[float, float]:
+def _border(camera: pycolmap.Camera, side: float | None = None) -> tuple[float, float]:
     """Half of the larger side, pixels, and its nominal angle from the optical axis, radians."""
-    radius = 0.5 * max(camera.width, camera.height)
+    radius = 0.5 * (side or max(camera.width, camera.height))
     tangent = radius / camera.mean_focal_length()
     return radius, float(tangent if "FISHEYE" in camera.model_name else np.arctan(tangent))

@@ -22,6 +22,8 @@ _GAIN = 42.0
 _OVEREXPOSED, _BLACK = 235, 8
 #: Brightness (of 255) of highlights, whose edges are sharp in any frame, and pixels about them that do not count.
 _HIGHLIGHT, _HIGHLIGHT_MARGIN = 240, 5
+#: The same where coarse detail is measured too, as of black pixels.
+_COARSE_MARGIN = 12
 #: Pixels around highlights and without texture that are not usable, and at the image's edge.
 _MARGIN, _EDGE = 2, 4
 
@@ -97,6 +99,21 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
         return 0.0
     edges = cv2.Laplacian(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0), cv2.CV_32F)
     return float(np.sqrt(np.mean(np.square(edges[counted])))) / brightness
+
+
+def fineness(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Fine detail relative to coarse: root mean square Laplacians of log brightness, smoothed by 2 px and by 4 px.
+
+    2 to 3.5 where an image is sharp; at a blur of 3 px 1.7, of 6 px 1.2; infinity without coarse detail. It does not
+    depend on brightness or contrast, so that it tells a video that is blurred throughout.
+    """
+    import cv2
+
+    counted = ~dilated((gray >= _HIGHLIGHT) | (gray < _BLACK), _COARSE_MARGIN)
+    log = np.log(gray.astype(np.float32) + _DARK_OFFSET)
+    smoothed = (cv2.GaussianBlur(log, (0, 0), sigma) for sigma in (2.0, 4.0))
+    fine, coarse = (np.square(cv2.Laplacian(one, cv2.CV_32F)[counted]).sum() for one in smoothed)
+    return float(np.sqrt(fine / coarse)) if coarse > 0.0 else float("inf")
 
 
 def _patches(texture: np.ndarray, at: np.ndarray, reach: int) -> Float32[np.ndarray, "K P"]:

@@ -6,25 +6,31 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Float, Float32, Int64
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
-from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
+from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
-from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
+from coliags_plugin.reconstruction.structure.sfm_cameras import (
+    Picture,
+    Start,
+    has_known_camera,
+    starting_cameras,
+    starts,
+)
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
@@ -46,6 +52,7 @@ class MatchedVideo:
     matches: Matches
     tracks: tuple[FramePoints, ...] = ()  # of each image, where matches are of tracks
     track_ids: tuple[Int64[np.ndarray, "K"], ...] = ()  # of the keypoints, where matches are of tracks
+    picture: Picture | None = None  # that sizes, keypoints and tracks are of; None: whole images
 
     def search_part(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle, on which cameras are tried.
@@ -113,9 +120,11 @@ def read_video(
 
     Tracks are of all images, features of at most ``features_at_most``.
     """
-    # Before the minutes of matching: what cannot be read, and a camera that does not fit.
-    sizes = tuple(_size(path, mask_of(path, masks)) for path in images)
+    # Before the minutes of matching: what cannot be read or repeats, and a camera that does not fit.
+    images, sizes, picture = _looked_at(images, masks)
     starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
+    if has_known_camera(settings.camera):
+        picture = None
     extract = feature_extractor(settings.features)
 
     @cache
@@ -129,12 +138,13 @@ def read_video(
         features_of.cache_clear()
         points = track_points(images, settings.tracks, masks, progress)
         if settings.matching == "tracks" or np.median([frame.followed for frame in points]) >= _FOLLOWED:
-            return _tracked(images, sizes, points)
+            return _in_picture(_tracked(images, sizes, points), picture)
         log.info("points cannot be followed from image to image: features are matched instead")
     if len(some) < len(images):
         log.info("features of %d of %d images are matched", len(some), len(images))
     taken, own = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
-    return _with_features(taken, own, settings, lambda row: features_of(some[row]), progress)
+    video = _with_features(taken, own, settings, lambda row: features_of(some[row]), progress)
+    return _in_picture(video, picture)
 
 
 def _sharpest(images: Sequence[Path], settings: SfmSettings) -> list[int]:
@@ -146,6 +156,17 @@ def _sharpest(images: Sequence[Path], settings: SfmSettings) -> list[int]:
         return list(range(len(images)))
     values = [sharpness(cv2.cvtColor(read_image(path), cv2.COLOR_RGB2GRAY)) for path in images]
     return [first + int(np.argmax(values[first : first + step])) for first in range(0, len(images), step)]
+
+
+def _in_picture(video: MatchedVideo, picture: Picture | None) -> MatchedVideo:
+    """The video in pixels of a part of its images, which have one size."""
+    if picture is None:
+        return video
+    corner = np.array(picture.corner, np.float32)
+    tracks = tuple(replace(frame, pixels=frame.pixels - corner) for frame in video.tracks)
+    keypoints = tuple(np.concatenate([points[:, :2] - corner, points[:, 2:]], axis=1) for points in video.keypoints)
+    sizes = (picture.size,) * len(video.images)
+    return replace(video, keypoints=keypoints, sizes=sizes, tracks=tracks, picture=picture)
 
 
 #: Features of an image by its index, and the brightness at them.
@@ -173,15 +194,39 @@ def _needs_tracks(
     return float(np.mean(strong)) < _MOST
 
 
-def _size(path: Path, mask: Bool[np.ndarray, "H W"] | None) -> tuple[int, int]:
-    """Width and height of an image, the same as its mask's."""
-    height, width = read_image(path).shape[:2]
-    if mask is not None and mask.shape != (height, width):
+def _looked_at(
+    images: Sequence[Path], masks: Masks
+) -> tuple[tuple[Path, ...], tuple[tuple[int, int], ...], Picture | None]:
+    """Images without those that repeat the one before, their widths and heights, and the lens's picture in them."""
+    kept, sizes, repeated = list[Path](), list[tuple[int, int]](), list[str]()
+    last, shown = None, None
+    for path in images:
+        image, mask = read_image(path), mask_of(path, masks)
+        height, width = image.shape[:2]
+        if mask is not None and mask.shape != (height, width):
+            raise InputError(
+                f"the mask of {path} is {mask.shape[1]} x {mask.shape[0]}, the image {width} x {height}",
+                "a mask of the image's size",
+            )
+        if last is not None and is_repeated(last, image):
+            repeated.append(path.name)
+            continue
+        kept.append(path)
+        sizes.append((width, height))
+        last = image
+        if mask is not None and (shown is None or shown.shape == mask.shape):
+            shown = mask if shown is None else shown | mask
+    if repeated:
+        named = ", ".join([*repeated[:10], *(["..."] if len(repeated) > 10 else [])])
+        log.warning("%d of %d images repeat the one before and are left out: %s", len(repeated), len(images), named)
+    if len(kept) < 2:
         raise InputError(
-            f"the mask of {path} is {mask.shape[1]} x {mask.shape[0]}, the image {width} x {height}",
-            "a mask of the image's size",
+            f"all {len(images)} images show the same",
+            "images from different camera positions",
+            "Give another part of the video",
         )
-    return width, height
+    picture = None if last is None or shown is None or len(set(sizes)) > 1 else Picture.in_mask(shown, last)
+    return tuple(kept), tuple(sizes), picture
 
 
 def _named(images: Sequence[Path]) -> tuple[str, ...]:
