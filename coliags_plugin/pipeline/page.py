@@ -42,8 +42,10 @@ from coliags_plugin.reporting.numbers import duration
 _VIEWS = 6
 #: Rows of the table of stretches above which it is folded.
 _LONG = 12
+#: What else is told of the held-out PSNR.
+_APART = {"psnr_between": "PSNR between training frames", "psnr_pose_refined": "PSNR, pose refined"}
 #: Figures of a sub-map that have a mean over all, with their units.
-_MEASURED = (("psnr", "dB"), ("ssim", "1"), ("psnr_pose_refined", "dB"), ("psnr_training", "dB"), ("gap", "dB"))
+_MEASURED = {"psnr": "dB", "ssim": "1", **dict.fromkeys(_APART, "dB"), "psnr_training": "dB", "gap": "dB"}
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
@@ -83,7 +85,6 @@ def results_of(record: Record) -> list[SubmapResults]:
 
 def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | None = None) -> Table:
     """Figures of the sub-maps and their means; ``spans`` tell where in the video each is."""
-    refined = any("psnr_pose_refined" in one.figures for one in results)
     columns = [
         Column("submap", "Sub-map", words=True),
         Column("frames", "Frames"),
@@ -91,7 +92,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         Column("held_out", "Held out"),
         Column("psnr", "PSNR", "dB", "higher"),
         Column("ssim", "SSIM", "1", "higher"),
-        *([Column("psnr_pose_refined", "PSNR, pose refined", "dB")] if refined else []),
+        *([Column(key, text, "dB") for key, text in _APART.items() if any(key in one.figures for one in results)]),
         Column("psnr_training", "PSNR of training views", "dB"),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),
@@ -100,7 +101,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         Column("time", "Time"),
     ]
     rows: list[dict[str, Value | TableCell]] = []
-    measured: dict[str, list[float | None]] = {key: [] for key, _ in _MEASURED}
+    measured: dict[str, list[float | None]] = {key: [] for key in _MEASURED}
     for one in results:
         figures = one.figures
         if "psnr" in figures and "psnr_training" in figures:
@@ -125,7 +126,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
             known = [value for value in values if value is not None]
             values.append(sum(known) / len(known) if known else None)
         rows.append({"submap": "mean", "frames": None})
-    for key, unit in _MEASURED:
+    for key, unit in _MEASURED.items():
         for row, cell in zip(rows, ranked_cells(measured[key], unit, None), strict=True):
             row[key] = cell
     for row, one in zip(rows, results, strict=False):

@@ -21,6 +21,7 @@ from coliags_plugin.geometry.poses.association import associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.results.reading import read_result
 from tests import commands
 from tests.pipeline.conftest import CAPTURE, TRAINING, Killed
 from tests.pipeline.films import blurred, film, write_images
@@ -170,8 +171,9 @@ def test_a_tube_is_reconstructed_from_its_frames(tmp_path):
         for path in stage.files:
             assert (tmp_path / "out" / path).exists()
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
-    figures = record.stages["evaluate"].figures
-    assert figures["held_out"] == 2 and figures["psnr_training"] > 10.0
+    figures, result = record.stages["evaluate"].figures, read_result(tmp_path / "out/run/eval/paper/result.json")
+    assert figures["held_out"] == 2 and figures["psnr_training"] > 10.0 and figures["psnr_pose_refined"] > 10.0
+    assert figures["psnr_between"] == pytest.approx(result.sets["test"].values["psnr"][1])  # frames 0 and 8 of ten
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "10 of 10 used (100 %)" in page and f"{figures['psnr']:.2f}" in page
     pictures = set(re.findall(r'src="(index_files/[^"]+)"', page))
