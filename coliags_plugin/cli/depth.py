@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import print_summary, train_command
+from coliags_plugin.cli.summaries import ESTIMATED_DEPTH_METHOD, print_summary, train_command
 
 _Format = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 _OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH")]
@@ -58,7 +58,7 @@ class DepthEstimateCommand:
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
             summary = estimate_scene(scene, self.output, request, self.overwrite, progress)
-        train = train_command(self.output, "coliags-estimated-depth", training_options(scene))
+        train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))
         print_summary(str(summary), written=[self.output], then=[train], as_json=self.json)
 
 

@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+#: The method for scenes with estimated depth, as `coliags reconstruct` trains it.
+ESTIMATED_DEPTH_METHOD = "coliags-in-vivo"
+
 
 def print_summary(
     text: str = "",
@@ -57,7 +60,7 @@ def depth_commands(scene: Path, assignments: Sequence[str] = ()) -> list[str]:
     options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])
     return [
         coliags("depth", "estimate", scene, "--output", with_depth, *options),
-        train_command(with_depth, "coliags-estimated-depth", assignments),
+        train_command(with_depth, ESTIMATED_DEPTH_METHOD, assignments),
     ]
 
 

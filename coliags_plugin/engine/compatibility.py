@@ -115,7 +115,7 @@ def _warn_of_trusted_estimates(scene: Scene, losses: Mapping[str, Loss]) -> None
     if trusting and any(frame.depth_confidence is not None for frame in scene.train):
         log.warning(
             "the depth of scene '%s' is estimated, and loss term '%s' takes it for true, weighted by its confidence; "
-            "the method coliags-estimated-depth is made for such scenes",
+            "the method coliags-in-vivo is made for such scenes",
             scene.name,
             trusting[0],
         )

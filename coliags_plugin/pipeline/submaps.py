@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.datamanagers.colmap.atlas import model_unit
+from coliags_plugin.datamanagers.colmap.atlas import model_unit, read_atlas
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
 from coliags_plugin.geometry.poses import colmap
 
@@ -54,7 +54,7 @@ def find_submaps(scene: Path, least: int) -> list[Submap]:
 def scale_of(scene: Path, submap: Submap) -> float:
     """Factor to a median depth of ``UNKNOWN_MEDIAN_DEPTH``; 1 where the unit is known, or no point tells."""
     folder = scene / submap.model if submap.model is not None else find_models(scene)[0]
-    if model_unit(scene, folder) != "unknown":
+    if model_unit(scene, folder, read_atlas(scene)) != "unknown":
         return 1.0
     model = read_model(folder)
     depths = [

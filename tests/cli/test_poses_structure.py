@@ -59,7 +59,7 @@ def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
     assert end == [
         f"written: {out}",
         f"next:    coliags depth estimate {out} --output {out}-depth",
-        f"next:    coliags train coliags-estimated-depth --data {out}-depth",
+        f"next:    coliags train coliags-in-vivo --data {out}-depth",
     ]
     assert read_unit(out) == "mm"
     scene, source = open_scene(out), open_scene(tube)
@@ -170,7 +170,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert end == [
         f"written: {out}",
         f"next:    coliags depth estimate {out} --output {out}-depth",
-        f"next:    coliags train coliags-estimated-depth --data {out}-depth",
+        f"next:    coliags train coliags-in-vivo --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
     command = f"coliags train coliags-sparse-depth --data {out}"

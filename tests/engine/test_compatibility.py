@@ -119,10 +119,10 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
     assert start(tmp_path / "run", method="coliags-sparse-depth", scene=replace(scene, train=sparse))
     estimated = [replace(frame, depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
-    for method, warned in (("coliags", True), ("coliags-estimated-depth", False), ("scaffold-gs", False)):
+    for method, warned in (("coliags", True), ("coliags-in-vivo", False), ("scaffold-gs", False)):
         caplog.clear()
         start(tmp_path / "run", method=method, scene=replace(scene, train=estimated))
-        assert ("coliags-estimated-depth is made for such scenes" in caplog.text) == warned
+        assert ("coliags-in-vivo is made for such scenes" in caplog.text) == warned
     start(tmp_path / "run", method="coliags", scene=scene)
     assert "estimated" not in caplog.text
 

@@ -202,6 +202,12 @@ def test_the_ribbon_has_a_colour_for_every_model(tracked):
     assert len({colors[0], colors[4], colors[7]}) == 3
 
 
+def test_more_models_than_colours_are_told_apart(tracked):
+    models = tuple(replace(tracked.largest, registered=(number,)) for number in range(14))
+    row = draw_ribbon(Atlas(tracked.images * 2, models, {}))[75, 20:1180]
+    assert len({tuple(row[int((number + 0.2) * 1160 / 16)].tolist()) for number in range(14)}) == 14
+
+
 def test_tracks_choose_the_lens_that_took_the_video(tmp_path):
     images = list_images(write_tube(tmp_path / "scene", 16, 2.0) / "images")
     atlas = reconstruct(images, SfmSettings(matching="tracks"))

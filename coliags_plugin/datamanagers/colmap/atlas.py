@@ -64,8 +64,7 @@ def read_atlas(scene: Path) -> AtlasRecord | None:
         raise InputError(f"{file}: {key or 'the file'}: {message}", _EXPECTED) from error
 
 
-def model_unit(scene: Path, model: Path) -> Unit:
-    """Unit of length of one of a scene's models: from ``atlas.json`` if it lists the model, else from ``unit.txt``."""
-    atlas = read_atlas(scene)
+def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:
+    """Unit of length of one of a scene's models: from its atlas if that lists the model, else from ``unit.txt``."""
     units = {} if atlas is None else {scene / stretch.model: stretch.unit for stretch in atlas.submaps}
     return units.get(model) or read_unit(scene)

@@ -98,7 +98,8 @@ class ColmapDataManager(RecordedDataManager):
         rectification_of = rectifications(lenses, model.cameras_file, self.working_size, settings.focal_scale)
         names = short_names([image.name for image in model.images])
         others = unposed_images(paths, (*masks, *depths))
-        if read_atlas(path) is None:  # else it says why images have no pose, or which other model has one
+        atlas = read_atlas(path)
+        if atlas is None:  # else it says why images have no pose, or which other model has one
             warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
         shots, used, misplaced = [], 0, 0
@@ -126,7 +127,7 @@ class ColmapDataManager(RecordedDataManager):
         facts: dict[str, Any] = {
             "layout": "colmap",
             "model": str(model.folder),
-            "unit": model_unit(path, model.folder),
+            "unit": model_unit(path, model.folder, atlas),
             "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if set(kinds) - files.PINHOLES else None,
             "cameras": len(rectification_of),

@@ -12,7 +12,7 @@ from coliags_plugin.reconstruction.structure.sfm import Atlas
 _WIDTH, _LEFT, _RIGHT = 1200, 20, 20
 #: Top and bottom row of the ribbon, and height of a line of text, px.
 _TOP, _BOTTOM, _LINE = 60, 120, 22
-#: Colours of models, distinguishable with any colour vision (Okabe and Ito); repeated for more.
+#: Colours of models, distinguishable with any colour vision (Okabe and Ito); paler for every further six.
 _MODELS = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178))
 _LOST = ((70, 70, 70), (130, 130, 130), (185, 185, 185))
 
@@ -56,4 +56,6 @@ def draw_ribbon(atlas: Atlas) -> UInt8[np.ndarray, "H 1200 3"]:
 
 
 def _color(model: int) -> tuple[int, int, int]:
-    return _MODELS[model % len(_MODELS)]
+    strength = 0.5 ** (model // len(_MODELS))
+    red, green, blue = (round(255 - strength * (255 - value)) for value in _MODELS[model % len(_MODELS)])
+    return red, green, blue

@@ -120,7 +120,7 @@ def test_what_is_printed(wall, tmp_path, capsys):
     depths = np.concatenate([frame.depth[frame.depth_confidence >= 0.5] for frame in open_scene(out).video])
     assert [near, far] == pytest.approx(np.percentile(depths, [1.0, 99.0]), rel=2e-3)
     assert written == f"written: {out}"
-    assert command == f"next:    coliags train coliags-estimated-depth --data {out} --set datamanager.split=endogslam"
+    assert command == f"next:    coliags train coliags-in-vivo --data {out} --set datamanager.split=endogslam"
 
 
 def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, caplog):
