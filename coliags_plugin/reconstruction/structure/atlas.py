@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.reconstruction.structure.adjustment import Rays
@@ -34,8 +35,22 @@ _LEAST_ANGLE = 0.5
 
 
 @dataclass(frozen=True)
+class Again:
+    """How the wall seen before a place was found again after it.
+
+    ``similarity``, where the models were not made one, leads from the world of the later to that of the earlier one:
+    three rows of scale times rotation, and translation.
+    """
+
+    before: int  # first frame of the stretch that shows it again
+    agreeing: int  # comparisons of frames that tell the same similarity
+    spread: float  # standard deviation of the natural logarithm of its scale
+    similarity: tuple[tuple[float, ...], ...] | None = None
+
+
+@dataclass(frozen=True)
 class Link:
-    """A weak place of a model: between two frames, few points are seen from both sides.
+    """A place of a model at which few points are seen from both sides of two frames, or at which models were joined.
 
     ``log_scale`` is the natural logarithm of the ratio of the depths that either side gives by itself to the same
     points, and ``uncertainty`` its standard error; None where too few points can be compared.
@@ -45,6 +60,7 @@ class Link:
     points: int
     log_scale: float | None
     uncertainty: float | None
+    again: Again | None = None
 
     @property
     def holds(self) -> bool:
@@ -58,6 +74,11 @@ class Link:
     @property
     def reason(self) -> str:
         """Why it holds, or not, in words."""
+        if self.again is not None:
+            return (
+                f"the wall is seen again from frame {self.again.before}: {self.again.agreeing} comparisons of frames "
+                f"agree, in scale to {100.0 * self.again.spread:.0f} %"
+            )
         if self.log_scale is None and self.points >= _STRONG_LINK:
             return f"{self.points} points are followed across it, but the sides were not mapped together"
         if self.log_scale is None:
@@ -70,13 +91,23 @@ def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
     """Places of a model, image i having ID i + 1, at which few points are seen from both sides."""
     frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
     rays = Rays.of_points(model)
+    return [
+        _measured(rays.only(common[rays.tracks], 2), after)
+        for after in frames[:-1].tolist()
+        if (common := _common(rays, after)).sum() < _STRONG_LINK
+    ]
+
+
+def link_at(model: pycolmap.Reconstruction, after: int) -> Link:
+    """The place of a model after one of its frames, image i having ID i + 1."""
+    rays = Rays.of_points(model)
+    return _measured(rays.only(_common(rays, after)[rays.tracks], 2), after)
+
+
+def _common(rays: Rays, after: int) -> Bool[np.ndarray, "N"]:
+    """Which tracks are seen both up to a frame and beyond it."""
     first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
-    links = []
-    for after, before in zip(frames[:-1].tolist(), frames[1:].tolist(), strict=True):
-        common = (first <= after) & (last >= before)
-        if common.sum() < _STRONG_LINK:
-            links.append(_measured(rays.only(common[rays.tracks], 2), after))
-    return links
+    return np.asarray((first <= after) & (last > after))
 
 
 def _measured(rays: Rays, after: int) -> Link:

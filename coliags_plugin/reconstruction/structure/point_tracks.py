@@ -97,7 +97,7 @@ def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class View:
     """Textures of one reduced image, the points in it (pixel centres at integers), and frames since it was seen."""
 
     detail: UInt8[np.ndarray, "h w"]
@@ -105,32 +105,40 @@ class _View:
     usable: Bool[np.ndarray, "h w"]
     ids: Int64[np.ndarray, "K"]
     pixels: Float32[np.ndarray, "K 2"]
+    stretch: Float32[np.ndarray, "2"]  # factors from the reduced image to the whole one
+    sharpness: float
+    fineness: float
     age: int = 0
 
-    def only(self, kept: Int64[np.ndarray, "N"] | Bool[np.ndarray, "K"]) -> _View:
+    def in_image(self, pixels: Float32[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2"]:
+        """Pixels of the view in the whole image, pixel centres at integers + 0.5."""
+        return (pixels + 0.5) * self.stretch
+
+    def from_image(self, pixels: Float[np.ndarray, "N 2"]) -> Float32[np.ndarray, "N 2"]:
+        """Pixels of the whole image, centres at integers + 0.5, in the view."""
+        return (pixels / self.stretch - 0.5).astype(np.float32)
+
+    def only(self, kept: Int64[np.ndarray, "N"] | Bool[np.ndarray, "K"]) -> View:
         """The view with some of its points, in the order given."""
         return replace(self, ids=self.ids[kept], pixels=self.pixels[kept])
 
-    def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Float32[np.ndarray, "N 2"]) -> _View:
+    def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Float32[np.ndarray, "N 2"]) -> View:
         """The view with further points."""
         return replace(self, ids=np.concatenate([self.ids, ids]), pixels=np.concatenate([self.pixels, pixels]))
 
 
-class _PointTracker:
-    """State between frames: the last view, and views before frames in which most points were lost."""
+class PointFinder:
+    """Finds the points of one image in another, by the likeness of their surroundings alone."""
 
-    def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
+    def __init__(self, settings: TrackSettings) -> None:
         import cv2
 
         self.settings = settings
         self.flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self.flow.setFinestScale(1)
-        self.last: _View | None = None
-        self.bridges: list[_View] = []
-        self.next_id = first_id
 
-    def advance(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> FramePoints:
-        """Follow the points into the next image, and add corners."""
+    def view(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> View:
+        """Textures of an image, reduced to the side of the settings, without points."""
         import cv2
 
         scale = min(1.0, self.settings.side / max(image.shape[:2]))
@@ -138,34 +146,15 @@ class _PointTracker:
         small = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if mask is not None and scale < 1.0:
             mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        view = _View(*wall_textures(small, mask), np.empty(0, np.int64), np.empty((0, 2), np.float32))
-        shift = 0.0
-        if self.last is not None:
-            kept, moved = self._followed(self.last, view)
-            shift = _median_length(moved - self.last.pixels[kept]) / max(size)
-            view = view.with_points(self.last.ids[kept], moved)
-            self._bridge_later(self.last, len(kept))
-            view = self._bridged(view)
-        view = _without_collisions(view)
-        followed = len(view.ids)
-        view = self._with_corners(view)
-        self.last = view
         stretch = np.array([image.shape[1] / size[0], image.shape[0] / size[1]], np.float32)
-        order = np.argsort(view.ids)
-        pixels = (view.pixels[order] + 0.5) * stretch
-        brightness = brightness_at(image, pixels.astype(np.float64)).astype(np.float32)
         gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-        return FramePoints(view.ids[order], pixels, brightness, followed, shift, sharpness(gray), fineness(gray))
-
-    def _followed(self, before: _View, after: _View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
-        """Indices of the points of one view that are found in another one, and where.
-
-        All or none: half of those that come back, and 20 at least, have to satisfy one epipolar geometry. Where both
-        views of a patient showed the same wall, 23 or more did; between unrelated views at most 17, by chance.
-        """
         none = np.empty(0, np.int64), np.empty((0, 2), np.float32)
+        return View(*wall_textures(small, mask), *none, stretch, sharpness(gray), fineness(gray))
+
+    def found(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+        """Indices of the points of one view that are found in another one, and where."""
         if not len(before.ids):
-            return none
+            return np.empty(0, np.int64), np.empty((0, 2), np.float32)
         flows = self.flow.calc(before.folds, after.folds, None), self.flow.calc(after.folds, before.folds, None)
         moved, scores = before.pixels.copy(), np.full(len(before.ids), -1.0, np.float32)
         for guess in (flows, None):
@@ -182,18 +171,58 @@ class _PointTracker:
             better = score > scores[rows]
             moved[rows[better]], scores[rows[better]] = candidate[better], score[better]
         alike = np.flatnonzero(scores > self.settings.min_correlation)
-        consistent = epipolar_inliers(before.pixels[alike], moved[alike], after.detail.shape, self.settings.max_error)
-        kept = alike[consistent]
-        return none if len(kept) < max(_FEWEST, _LEAST_SHARE * len(alike)) else (kept, moved[kept].astype(np.float32))
+        return alike, moved[alike].astype(np.float32)
 
-    def _bridge_later(self, before: _View, followed: int) -> None:
+
+class _PointTracker:
+    """State between frames: the last view, and views before frames in which most points were lost."""
+
+    def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
+        self.settings = settings
+        self.finder = PointFinder(settings)
+        self.last: View | None = None
+        self.bridges: list[View] = []
+        self.next_id = first_id
+
+    def advance(self, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None) -> FramePoints:
+        """Follow the points into the next image, and add corners."""
+        view = self.finder.view(image, mask)
+        shift = 0.0
+        if self.last is not None:
+            kept, moved = self._followed(self.last, view)
+            shift = _median_length(moved - self.last.pixels[kept]) / max(view.detail.shape)
+            view = view.with_points(self.last.ids[kept], moved)
+            self._bridge_later(self.last, len(kept))
+            view = self._bridged(view)
+        view = _without_collisions(view)
+        followed = len(view.ids)
+        view = self._with_corners(view)
+        self.last = view
+        order = np.argsort(view.ids)
+        pixels = view.in_image(view.pixels[order])
+        brightness = brightness_at(image, pixels.astype(np.float64)).astype(np.float32)
+        return FramePoints(view.ids[order], pixels, brightness, followed, shift, view.sharpness, view.fineness)
+
+    def _followed(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+        """Indices of the points of one view that are found in another one, and where.
+
+        All or none: half of those that come back, and 20 at least, have to satisfy one epipolar geometry. Where both
+        views of a patient showed the same wall, 23 or more did; between unrelated views at most 17, by chance.
+        """
+        alike, moved = self.finder.found(before, after)
+        consistent = epipolar_inliers(before.pixels[alike], moved, after.detail.shape, self.settings.max_error)
+        if consistent.sum() < max(_FEWEST, _LEAST_SHARE * len(alike)):
+            return alike[:0], moved[:0]
+        return alike[consistent], moved[consistent]
+
+    def _bridge_later(self, before: View, followed: int) -> None:
         """Keep the view before a frame in which most points were lost, for the frames after it."""
         aged = [replace(bridge, age=bridge.age + 1) for bridge in self.bridges]
         self.bridges = [bridge for bridge in aged if bridge.age <= self.settings.longest_bridge]
         if followed < self.settings.bridge_below:
             self.bridges.append(before)
 
-    def _bridged(self, view: _View) -> _View:
+    def _bridged(self, view: View) -> View:
         """The view with points that were lost in one of the frames before and are found again."""
         for bridge in self.bridges:
             if bridge.age == 0:
@@ -204,7 +233,7 @@ class _PointTracker:
             view = view.with_points(before.ids[kept], moved)
         return view
 
-    def _with_corners(self, view: _View) -> _View:
+    def _with_corners(self, view: View) -> View:
         """The view with new points where there are few."""
         import cv2
 
@@ -224,7 +253,7 @@ class _PointTracker:
         return view.with_points(ids, corners.reshape(-1, 2))
 
 
-def _without_collisions(view: _View) -> _View:
+def _without_collisions(view: View) -> View:
     """The view without points that have met an older one."""
     order = np.argsort(view.ids)
     cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)

@@ -19,7 +19,7 @@ from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error
-from coliags_plugin.reconstruction.structure.atlas import Link, held_part, part_of, weak_links
+from coliags_plugin.reconstruction.structure.atlas import Again, Link, held_part, link_at, part_of, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     adjusted,
@@ -31,6 +31,7 @@ from coliags_plugin.reconstruction.structure.hypotheses import (
     with_camera,
 )
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
+from coliags_plugin.reconstruction.structure.joining import Part, join_models, stretches_of
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     field_of_view,
@@ -102,14 +103,11 @@ class Atlas:
         return self.models[0]
 
     def submaps(self) -> list[tuple[int, range]]:
-        """Stretches of images between weak places: number of the model, and span; in video order."""
-        stretches = []
-        for number, model in enumerate(self.models):
-            cuts = sorted(link.after for link in model.links)
-            for part in np.split(model.registered, np.searchsorted(model.registered, cuts, side="right")):
-                if len(part):
-                    stretches.append((number, range(int(part[0]), int(part[-1]) + 1)))
-        return sorted(stretches, key=lambda stretch: stretch[1].start)
+        """Stretches of images of one model without weak places: number of the model, and span; in video order."""
+        owner = {index: number for number, model in enumerate(self.models) for index in model.registered}
+        cuts = {link.after for model in self.models for link in model.links}
+        spans = stretches_of([model.registered for model in self.models], cuts)
+        return [(owner[span.start], span) for span in spans]
 
     def summary(self) -> str:
         """One line, or two where there are several models."""
@@ -147,7 +145,7 @@ def reconstruct(
     with quiet_colmap(settings.seed):
         video = read_video(images, settings, masks, progress)
         chosen = _tracked(video, settings, progress) if video.tracks else _matched(video, settings, progress)
-        atlas = _atlas(video, chosen, settings)
+        atlas = _atlas(video, chosen, settings, masks, progress)
         if not atlas.models:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
@@ -201,13 +199,18 @@ def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction
         camera.params = other.cameras[number].params
 
 
-def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSettings) -> Atlas:
-    """The models, those of tracks split where their sides do not hold together."""
-    found: list[Reconstruction] = []
+def _atlas(
+    video: MatchedVideo,
+    chosen: Sequence[Hypothesis],
+    settings: SfmSettings,
+    masks: Masks = None,
+    progress: Progress | None = None,
+) -> Atlas:
+    """The models, those of tracks split where their sides do not hold together, and joined where they show the same."""
+    kept: list[Hypothesis] = []
     refused: list[Link] = []
     for hypothesis in chosen:
-        links = weak_links(hypothesis.model) if video.tracks else []
-        broken = [link for link in links if not link.holds]
+        broken = [link for link in weak_links(hypothesis.model) if not link.holds] if video.tracks else []
         refused += broken
         frames = np.array(sorted(hypothesis.model.reg_image_ids())) - 1
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
@@ -215,8 +218,12 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
             if broken:
                 one = Hypothesis.of(held_part(part_of(hypothesis.model, part.tolist())), video.brightness)
             if one.images >= settings.min_model_size:
-                held = tuple(link for link in links if link.holds and part[0] <= link.after < part[-1])
-                found.append(_result(video, one, held))
+                kept.append(one)
+    apart: dict[int, Again] = {}
+    parts = [Part(one, {}) for one in kept]
+    if video.tracks:
+        video, parts, apart = join_models(video, kept, settings, masks, progress)
+    found = [_result(video, part.hypothesis, _links(part) if video.tracks else ()) for part in parts]
     found.sort(key=lambda one: -len(one.registered))
     posed = {index for one in found for index in one.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
@@ -234,7 +241,16 @@ def _atlas(video: MatchedVideo, chosen: Sequence[Hypothesis], settings: SfmSetti
         log.warning("%d models have %s images: what lies between them is not known", len(found), sizes)
     atlas = Atlas(video.images, tuple(found), lost)
     refused += _gaps(video, atlas.submaps(), [link.after for link in refused])
+    refused = [replace(link, again=apart.get(link.after)) for link in refused]
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
+
+
+def _links(part: Part) -> tuple[Link, ...]:
+    """Weak places of a model that hold, and those at which it was joined."""
+    model = part.hypothesis.model
+    weak = {link.after: link for link in weak_links(model)}
+    joined = {after: replace(link_at(model, after), again=again) for after, again in part.joins.items()}
+    return tuple(link for _, link in sorted({**weak, **joined}.items()))
 
 
 #: Images of a model below which it is not believed if its error is so many times that of the largest; and the fineness

@@ -1,0 +1,336 @@
+"""Joins between models of a video: the same wall found again by frames of another model, and both made one model.
+
+After wall contact or a fast turn the camera often comes back to what it had seen. The last frames of each stretch are
+compared with the first ones of those that follow: points of either model are searched for in the other's frame, a pose
+of that frame is found from them, and the depths of either model there give the ratio of their scales. One comparison
+may be chance; many between different frames that tell the same similarity are not.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.geometry.poses.alignment import Similarity
+from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error
+from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_links
+from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, adjusted
+from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
+from coliags_plugin.reconstruction.structure.mapping import brightness_at
+from coliags_plugin.reconstruction.structure.outliers import median_of_points
+from coliags_plugin.reconstruction.structure.point_tracks import PointFinder, View
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.video import MatchedVideo
+
+log = logging.getLogger(__name__)
+
+#: Frames at the end of a stretch and at the start of another that are compared, stretches after it, and fewest frames
+#: of a model: shorter ones, in wall contact, hardly follow the path.
+_FRAMES, _AHEAD, _LEAST_FRAMES = 4, 4, 12
+#: Smallest angle between the rays of a point that is searched for, degrees, and its largest median error, pixels.
+_LEAST_ANGLE, _LARGEST_ERROR = 0.5, 4.0
+#: RANSAC inlier threshold of the pose of a frame, pixels of the reduced image, fewest points that fit it (at most 15 do
+#: between a patient's video and a phantom, by chance), fewest of these that have a point of known depth near them, and
+#: how near, as a share of the larger side.
+_POSE_ERROR, _FEWEST_FOUND, _FEWEST_DEPTHS, _NEAR = 6.0, 20, 5, 0.02
+#: Fewest and most random samples from which the pose of a frame is found.
+_TRIALS = 300, 3000
+#: Similarities agree if their scales do, as natural logarithms, their rotations, degrees, and the places of a camera,
+#: as a share of its median depth.
+_SAME_SCALE, _SAME_ROTATION, _SAME_PLACE = 0.25, 12.0, 0.35
+#: Fewest comparisons that agree, and fewest frames of either side in these.
+_FEWEST_AGREEING, _FEWEST_SIDE = 10, 3
+#: Largest factor by which held-out tracks are farther off in a joined model than in its parts, and pixels beyond that.
+_WORSE, _MORE = 1.05, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A model of a video, and the places at which models were joined to it: by the last frame before each."""
+
+    hypothesis: Hypothesis
+    joins: dict[int, Again]
+
+    @property
+    def frames(self) -> list[int]:
+        """Frames with a pose, ascending."""
+        return [number - 1 for number in sorted(self.hypothesis.model.reg_image_ids())]
+
+
+def join_models(
+    video: MatchedVideo,
+    models: Sequence[Hypothesis],
+    settings: SfmSettings,
+    masks: Masks = None,
+    progress: Progress | None = None,
+) -> tuple[MatchedVideo, list[Part], dict[int, Again]]:
+    """Join models of tracks that show the same wall.
+
+    A joined model is adjusted as a whole, with the points that were found again, and kept if held-out tracks are
+    hardly farther off than in its parts, nearer points are brighter, and its sides hold together.
+
+    Returns:
+        The video with the points found again, the models, and joins that were found but not made.
+    """
+    compare = _Comparison(video, settings, masks)
+    parts = [Part(model, {}) for model in models]
+    left: list[tuple[range, range]] = []
+    cuts = {link.after for model in models for link in weak_links(model.model)}
+    stretches = stretches_of([part.frames for part in parts], cuts)
+    for number, earlier in enumerate(with_progress(stretches, "join models", progress)):
+        for later in stretches[number + 1 : number + 1 + _AHEAD]:
+            one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
+            if one is other or min(len(one.frames), len(other.frames)) < _LEAST_FRAMES:
+                continue
+            sightings = compare.agreeing(one, earlier, other, later)
+            if not sightings:
+                continue
+            extended, joined = _with_sightings(video, sightings), None
+            if len(one.frames) + len(other.frames) <= settings.tracks.longest_window:
+                joined = _joined(extended, one, other, sightings, earlier[-1], later[0])
+            log.info(
+                "frames %d and %d show the same wall: %d comparisons of frames agree; %s",
+                *(earlier[-1], later[0], len(sightings), "left apart" if joined is None else "joined"),
+            )
+            if joined is None:
+                left.append((earlier, later))
+            else:
+                video = extended
+                parts = [joined, *(part for part in parts if part is not one and part is not other)]
+    apart = {}
+    for earlier, later in left:  # between the models as they are now
+        one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
+        if one is not other and (sightings := compare.agreeing(one, earlier, other, later)):
+            again = _again(sightings, later[0])
+            apart[earlier[-1]] = replace(again, similarity=_rows(sightings[0].similarity))
+    return video, parts, apart
+
+
+def stretches_of(models: Sequence[Sequence[int]], cuts: Set[int]) -> list[range]:
+    """Stretches of a video in which all frames with a pose are of one model, and that no cut, after a frame, divides.
+
+    Models are given by their frames.
+    """
+    owned = sorted((frame, number) for number, frames in enumerate(models) for frame in frames)
+    runs: list[list[tuple[int, int]]] = []
+    for frame, number in owned:
+        if not runs or runs[-1][-1][1] != number or not cuts.isdisjoint(range(runs[-1][-1][0], frame)):
+            runs.append([])
+        runs[-1].append((frame, number))
+    return [range(run[0][0], run[-1][0] + 1) for run in runs]
+
+
+@dataclass(frozen=True, eq=False)
+class _Posed:
+    """A frame with a pose, and points of its model that it sees."""
+
+    number: int
+    view: View
+    points: Float[np.ndarray, "K 3"]  # of the view, world
+    pose: Float[np.ndarray, "3 4"]  # world to camera
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Of the camera, world."""
+        return np.asarray(-self.pose[:, :3].T @ self.pose[:, 3])
+
+    @property
+    def depths(self) -> Float[np.ndarray, "K"]:
+        """Of the points."""
+        return np.asarray(self.points @ self.pose[2, :3] + self.pose[2, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """Points of one model found in a frame of another, and the similarity from the later to the earlier model."""
+
+    frames: tuple[int, int]  # that were compared, of the earlier and the later model
+    seen_in: int  # which of them
+    ids: Int64[np.ndarray, "K"]  # of the tracks
+    pixels: Float32[np.ndarray, "K 2"]  # of the whole image
+    similarity: Similarity
+
+
+class _Comparison:
+    """Compares frames of models of a video."""
+
+    def __init__(self, video: MatchedVideo, settings: SfmSettings, masks: Masks) -> None:
+        self.video, self.seed = video, settings.seed
+        self.finder = PointFinder(settings.tracks)
+
+        @lru_cache(maxsize=2 * _FRAMES * (_AHEAD + 1))
+        def view(frame: int) -> View:
+            return self.finder.view(read_image(video.images[frame]), mask_of(video.images[frame], masks))
+
+        self.view = view
+
+    def agreeing(self, one: Part, earlier: range, other: Part, later: range) -> list[_Sighting]:
+        """What the frames at the ends of two stretches see of each other's models, the most typical first.
+
+        Empty if too little of it agrees.
+        """
+        firsts = self._posed(one, [frame for frame in one.frames if frame in earlier][-_FRAMES:])
+        seconds = self._posed(other, [frame for frame in other.frames if frame in later][:_FRAMES])
+        sightings = []
+        for first, second in product(firsts, seconds):
+            for source, target in ((first, second), (second, first)):
+                seen = self._sighting(source, target, one if target is first else other, target is second)
+                if seen is not None:
+                    ids, pixels, similarity = seen
+                    frames = first.number, second.number
+                    sightings.append(_Sighting(frames, target.number, ids, pixels, similarity))
+        if not sightings:
+            return []
+        kept = _same(sightings, seconds[0])
+        fewest = min(len({sighting.frames[side] for sighting in kept}) for side in (0, 1))
+        return kept if len(kept) >= _FEWEST_AGREEING and fewest >= _FEWEST_SIDE else []
+
+    def _posed(self, part: Part, frames: Sequence[int]) -> list[_Posed]:
+        """Frames of a model with its well-known points of tracks; those that see none are left out."""
+        model = part.hypothesis.model
+        rays = Rays.of(model, self.video.track_ids, [points[:, :2] for points in self.video.keypoints])
+        rays = rays.only(np.isin(rays.ids, np.concatenate([self.video.track_ids[i] for i in frames]))[rays.tracks], 3)
+        points = rays.triangulated()
+        errors = median_of_points(rays.errors(model, points), rays.tracks, len(rays.ids))
+        known = (rays.angles(points) >= _LEAST_ANGLE) & (errors < _LARGEST_ERROR)
+        posed = []
+        for frame in frames:
+            rows = np.flatnonzero((rays.images == frame + 1) & known[rays.tracks])
+            if len(rows):
+                view, tracks = self.view(frame), rays.tracks[rows]
+                view = view.with_points(rays.ids[tracks], view.from_image(rays.pixels[rows]))
+                pose = np.asarray(model.images[frame + 1].cam_from_world().matrix())
+                posed.append(_Posed(frame, view, points[tracks], pose))
+        return posed
+
+    def _sighting(
+        self, source: _Posed, target: _Posed, seen_by: Part, forwards: bool
+    ) -> tuple[Int64[np.ndarray, "K"], Float32[np.ndarray, "K 2"], Similarity] | None:
+        """Points of the source found in the target: tracks, pixels, and the similarity from later to earlier model."""
+        import pycolmap
+
+        rows, moved = self.finder.found(source.view, target.view)
+        if len(rows) < _FEWEST_FOUND:
+            return None
+        options = pycolmap.AbsolutePoseEstimationOptions()
+        options.ransac.max_error, options.ransac.random_seed = _POSE_ERROR * float(target.view.stretch.max()), self.seed
+        options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
+        pixels, points = target.view.in_image(moved), source.points[rows]
+        camera = next(iter(seen_by.hypothesis.model.cameras.values()))
+        found = pycolmap.estimate_and_refine_absolute_pose(pixels.astype(np.float64), points, camera, options)
+        if found is None or found["num_inliers"] < _FEWEST_FOUND:
+            return None
+        pose, fits = found["cam_from_world"].matrix(), np.asarray(found["inlier_mask"])
+        reach = _NEAR * max(target.view.detail.shape)
+        apart, nearest = cKDTree(target.view.pixels).query(moved)
+        compared = fits & (np.asarray(apart) < reach)
+        if compared.sum() < _FEWEST_DEPTHS:
+            return None
+        depths = points[compared] @ pose[2, :3] + pose[2, 3]
+        factor = float(np.exp(np.median(np.log(depths / target.depths[np.asarray(nearest)[compared]]))))
+        if forwards:
+            similarity = _between(pose, target.pose, factor)
+        else:
+            similarity = _between(target.pose, pose, 1.0 / factor)
+        return source.view.ids[rows[fits]], pixels[fits], similarity
+
+
+def _between(pose: Float[np.ndarray, "3 4"], same: Float[np.ndarray, "3 4"], factor: float) -> Similarity:
+    """The similarity from the second to the first world, by one camera's pose in both and the ratio of lengths."""
+    rotation = pose[:, :3].T @ same[:, :3]
+    return Similarity(factor, rotation, pose[:, :3].T @ (factor * same[:, 3] - pose[:, 3]))
+
+
+def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
+    """The largest set of sightings that agree with one of them, that one first, by where they place a later camera."""
+    one = [sighting.similarity for sighting in sightings]
+    scales = np.log([similarity.scale for similarity in one])
+    rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in one]))
+    places = np.array([similarity.points(camera.center[None])[0] for similarity in one])
+    depth = float(np.median(camera.depths))
+    sets = []
+    for index in range(len(one)):
+        agree = np.abs(scales - scales[index]) < _SAME_SCALE
+        agree &= (rotations * rotations[index].inv()).magnitude() < np.radians(_SAME_ROTATION)
+        agree &= np.linalg.norm(places - places[index], axis=1) < _SAME_PLACE * depth * np.exp(scales[index])
+        agree[index] = False
+        sets.append(agree)
+    points = np.array([len(sighting.ids) for sighting in sightings])
+    typical = int(np.argmax([points[agree].sum() + points[index] for index, agree in enumerate(sets)]))
+    return [sightings[typical], *(sightings[index] for index in np.flatnonzero(sets[typical]).tolist())]
+
+
+def _again(sightings: Sequence[_Sighting], before: int) -> Again:
+    """What is recorded of sightings that agree."""
+    scales = np.log([sighting.similarity.scale for sighting in sightings])
+    return Again(before, len(sightings), round(float(scales.std()), 4))
+
+
+def _rows(similarity: Similarity) -> tuple[tuple[float, ...], ...]:
+    """The similarity as a matrix of three rows and four columns."""
+    matrix = np.column_stack([similarity.scale * similarity.rotation, similarity.translation])
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _with_sightings(video: MatchedVideo, sightings: Sequence[_Sighting]) -> MatchedVideo:
+    """The video with the points that were found again among those of its frames."""
+    keypoints, brightness, track_ids = list(video.keypoints), list(video.brightness), list(video.track_ids)
+    for sighting in sightings:
+        frame = sighting.seen_in
+        new = ~np.isin(sighting.ids, track_ids[frame])
+        pixels = np.zeros((int(new.sum()), keypoints[frame].shape[1]), np.float32)
+        pixels[:, :2] = sighting.pixels[new]
+        keypoints[frame] = np.concatenate([keypoints[frame], pixels])
+        light = brightness_at(read_image(video.images[frame]), pixels[:, :2].astype(np.float64))
+        brightness[frame] = np.concatenate([brightness[frame], light])
+        track_ids[frame] = np.concatenate([track_ids[frame], sighting.ids[new]])
+    return replace(video, keypoints=tuple(keypoints), brightness=tuple(brightness), track_ids=tuple(track_ids))
+
+
+def _joined(
+    video: MatchedVideo, one: Part, other: Part, sightings: Sequence[_Sighting], after: int, before: int
+) -> Part | None:
+    """Both models as one, in the frame of the larger; None if it is not as good as they are."""
+    import pycolmap
+
+    change = pycolmap.Sim3d(np.array(_rows(sightings[0].similarity)))
+    larger, smaller = one, other
+    if len(one.frames) < len(other.frames):
+        larger, smaller, change = other, one, change.inverse()
+    moved = pycolmap.Reconstruction(smaller.hypothesis.model)
+    moved.transform(change)
+    model = pycolmap.Reconstruction()
+    for camera in larger.hypothesis.model.cameras.values():
+        model.add_camera_with_trivial_rig(camera)
+    for part in (larger.hypothesis.model, moved):
+        for number in sorted(part.reg_image_ids()):
+            image = part.images[number]
+            made = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=number)
+            model.add_image_with_trivial_frame(made, image.cam_from_world())
+    for number in model.reg_image_ids():
+        pixels = video.keypoints[number - 1][:, :2].astype(np.float64)
+        model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+    result = adjusted(model, video)
+    held = result.images == len(one.frames) + len(other.frames) and link_at(result.model, after).holds
+    if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
+        return None
+    return Part(result, {**one.joins, **other.joins, after: _again(sightings, before)})
+
+
+def _is_worse(joined: Hypothesis, parts: Sequence[Part], video: MatchedVideo) -> bool:
+    """Whether held-out tracks are farther off in a joined model than in its parts; also where they cannot tell."""
+    error = held_out_error(joined.model, video.tracks)
+    before = [held_out_error(part.hypothesis.model, video.tracks) for part in parts]
+    known = [one for one in before if one is not None]
+    if error is None or len(known) < len(before):
+        return True
+    return error > _MORE + _WORSE * float(np.average(known, weights=[len(part.frames) for part in parts]))
