@@ -36,14 +36,29 @@ def test_a_model_is_weak_where_few_points_are_common():
     assert f"{COMMON} points seen from both sides" in link.reason
 
 
+@pytest.mark.parametrize(("long", "is_weak"), [(3, True), (4, False)])
+def test_points_that_are_seen_for_long_carry_the_scale(long, is_weak):
+    """Before the gap 40 points are seen on both sides of every place, and few of them from the last frame."""
+    model = part_of(seen_points()[0], range(GAP + 2))
+    lasting = [number for number, point in model.points3D.items() if point.track.length() == GAP + 2]
+    for number in lasting[long:]:
+        model.delete_point3D(number)
+    links = {link.after: link for link in weak_links(model)}
+    assert (GAP - 1 in links) == is_weak
+    if is_weak:
+        assert (links[GAP - 1].points, links[GAP - 1].spanning) == (40 + long, long)
+        assert not links[GAP - 1].holds
+
+
 def test_sides_of_another_scale_do_not_hold_together():
-    (link,) = weak_links(seen_points(shift=25.0)[0])
-    assert link.log_scale > 0.3
-    assert not link.holds
+    links = {link.after: link for link in weak_links(seen_points(shift=25.0)[0])}
+    assert links[GAP].log_scale > 0.3
+    assert not links[GAP].holds
 
 
 def test_too_few_common_points_tell_no_scale():
-    assert [Link(0, points, None, None).holds for points in (19, 20)] == [False, True]
+    assert [Link(0, points, None, None, spanning=4).holds for points in (19, 20)] == [False, True]
+    assert not Link(0, 99, None, None, spanning=3).holds
     assert [Link(0, points, 0.1, 0.1).holds for points in (7, 8)] == [False, True]
     assert "too few to compare" in Link(0, 3, None, None).reason
     assert "not mapped together" in Link(0, 99, None, None).reason

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Int64
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.reconstruction.structure.adjustment import Rays
@@ -16,8 +16,11 @@ from coliags_plugin.reconstruction.structure.mapping import depths_of
 if TYPE_CHECKING:
     import pycolmap
 
-#: Points seen on both sides of a frame gap below which a model's two sides have to prove that they fit together.
-_STRONG_LINK = 30
+#: Points seen on both sides of a frame gap below which a model's two sides have to prove that they fit together; and
+#: points seen from three frames or farther on both sides, as only these carry the scale across a turn: below the first
+#: number they have to prove it, below the second they do not fit where nothing can be measured.
+_STRONG_LINK, _SPANNING, _FEWEST_SPANNING = 30, 20, 4
+_REACH = 3
 #: Points below which the two sides are never taken to hold together, and below which they are not unless their scales
 #: can be compared: across a cut to another patient, eight tracks fit by chance.
 _FEWEST_LINKING, _FEWEST_ALONE = 8, 20
@@ -60,13 +63,14 @@ class Link:
     points: int
     log_scale: float | None
     uncertainty: float | None
+    spanning: int | None = None  # of them seen from three frames or farther on both sides; None: not mapped together
     again: Again | None = None
 
     @property
     def holds(self) -> bool:
         """Whether enough points link the sides and, as far as can be measured, both have the same scale."""
         if self.log_scale is None or self.uncertainty is None:
-            return self.points >= _FEWEST_ALONE
+            return self.points >= _FEWEST_ALONE and (self.spanning or 0) >= _FEWEST_SPANNING
         return (
             self.points >= _FEWEST_LINKING and abs(self.log_scale) < _SAME_SCALE and self.uncertainty < _LEAST_CERTAIN
         )
@@ -79,35 +83,42 @@ class Link:
                 f"the wall is seen again from frame {self.again.before}: {self.again.agreeing} comparisons of frames "
                 f"agree, in scale to {100.0 * self.again.spread:.0f} %"
             )
-        if self.log_scale is None and self.points >= _STRONG_LINK:
+        if self.spanning is None and self.points >= _STRONG_LINK:
             return f"{self.points} points are followed across it, but the sides were not mapped together"
         if self.log_scale is None:
-            return f"{self.points} points are seen from both sides, too few to compare the scales of the sides"
+            few = "too few" if not self.spanning else f"{self.spanning} of them for long, too few"
+            return f"{self.points} points are seen from both sides, {few} to compare the scales of the sides"
         factor, spread = np.exp(self.log_scale), 100.0 * (self.uncertainty or 0.0)
         return f"{self.points} points seen from both sides; scales differ by a factor of {factor:.2f} +- {spread:.0f} %"
 
 
 def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
-    """Places of a model, image i having ID i + 1, at which few points are seen from both sides."""
+    """Places of a model, image i having ID i + 1, at which few points are seen from both sides.
+
+    And those that do not hold, though many points are seen from both sides, as few of these are seen for long.
+    """
     frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
     rays = Rays.of_points(model)
-    return [
-        _measured(rays.only(common[rays.tracks], 2), after)
-        for after in frames[:-1].tolist()
-        if (common := _common(rays, after)).sum() < _STRONG_LINK
-    ]
+    links = [_link(rays, frames, after) for after in frames[:-1].tolist()]
+    return [link for link in links if link.points < _STRONG_LINK or not link.holds]
 
 
 def link_at(model: pycolmap.Reconstruction, after: int) -> Link:
     """The place of a model after one of its frames, image i having ID i + 1."""
-    rays = Rays.of_points(model)
-    return _measured(rays.only(_common(rays, after)[rays.tracks], 2), after)
+    frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
+    return _link(Rays.of_points(model), frames, after, always_measured=True)
 
 
-def _common(rays: Rays, after: int) -> Bool[np.ndarray, "N"]:
-    """Which tracks are seen both up to a frame and beyond it."""
+def _link(rays: Rays, frames: Int64[np.ndarray, "M"], after: int, always_measured: bool = False) -> Link:
+    """The place after one of a model's frames, ascending; else measured only where it has to prove that it holds."""
     first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
-    return np.asarray((first <= after) & (last > after))
+    common, place = (first <= after) & (last > after), int(np.searchsorted(frames, after))
+    far = frames[max(0, place + 1 - _REACH)], frames[min(len(frames) - 1, place + _REACH)]
+    spanning = int(((first <= far[0]) & (last >= far[1])).sum())
+    link = Link(after, int(common.sum()), None, None)
+    if always_measured or link.points < _STRONG_LINK or spanning < _SPANNING:
+        link = _measured(rays.only(common[rays.tracks], 2), after)
+    return replace(link, spanning=spanning)
 
 
 def _measured(rays: Rays, after: int) -> Link:
