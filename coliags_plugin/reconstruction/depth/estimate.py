@@ -29,7 +29,8 @@ log = logging.getLogger(__name__)
 #: Fewest neighbours that a frame's depth is trusted with, and fewest frames that can have as many.
 FEWEST_NEIGHBOURS = 3
 FEWEST_FRAMES = FEWEST_NEIGHBOURS + 1
-#: Mean weight of a frame's own matches below which it shows nothing that others do: blur, darkness, a touched wall.
+#: Mean weight of a frame's own matches, outside of masks and highlights, below which it shows nothing that others do:
+#: blur, darkness, a touched wall.
 LEAST_MATCHED = 0.1
 #: Frames and depth maps held in memory.
 _HELD = 40
@@ -134,7 +135,8 @@ class Estimation:
             belief = first_belief(known, support, prior, rim) if whole else np.ones_like(support)
             log_depth = np.clip(complete(known, support, belief, prior, guide.intensity), low, high)
             confidence = depth_confidence(log_depth, support, result.spread, rim)
-            if len(neighbours[index]) < FEWEST_NEIGHBOURS or own.weight.mean() < LEAST_MATCHED:
+            matched = float(own.weight[guide.usable].mean()) if guide.usable.any() else 0.0
+            if len(neighbours[index]) < FEWEST_NEIGHBOURS or matched < LEAST_MATCHED:
                 confidence[:] = 0.0
             return {"depth": np.exp(log_depth), "confidence": confidence}
 
