@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
+#: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
+_FEWEST_STILL = 10
 
 
 def write_frames(
@@ -58,13 +60,13 @@ def write_frames(
         if progress is not None:
             progress("look at frames", done, max(done, expected))
     found, sharpnesses = survey.mask(), survey.sharpnesses
-    size, total = found.shape, len(sharpnesses)
+    size, total = survey.size, len(sharpnesses)
     if given is not None and given.shape != size:
         raise InputError(
             f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
             "a mask of the frames' size",
         )
-    used = given if given is not None or found.all() else found
+    used = found if given is None else given
     chosen, dropped = sharpest_frames(sharpnesses, settings)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
@@ -136,9 +138,13 @@ class FrameSurvey:
         self._combs: list[float] = []
         self._extremes: list[UInt8[np.ndarray, "H W 3"]] = []
         self._sum: Float32[np.ndarray, "H W 3"] | None = None
+        self._sizes: set[tuple[int, ...]] = set()
 
     def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
-        """Look at the next frame, of the size of the first."""
+        """Look at the next frame."""
+        self._sizes.add(image.shape)
+        if len(self._sizes) > 1:
+            return
         self.sharpnesses.append(sharpness(reduced(image)))
         self._combs.append(combing(image))
         extremes = self._extremes
@@ -147,8 +153,16 @@ class FrameSurvey:
         )
         self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
 
-    def mask(self) -> Bool[np.ndarray, "H W"]:
-        """False outside of the lens's image and on overlays. Says if the frames are interlaced."""
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the frames."""
+        return self._extremes[0].shape[0], self._extremes[0].shape[1]
+
+    def mask(self) -> Bool[np.ndarray, "H W"] | None:
+        """False outside of the lens's image and on overlays; None without any. Says if the frames are interlaced.
+
+        Frames of several sizes have none in common.
+        """
         if self._sum is None:
             raise InputError(f"no frames in {self.path}", "a video")
         if np.median(self._combs) > INTERLACED:
@@ -158,9 +172,11 @@ class FrameSurvey:
                 self.path,
             )
         darkest, brightest = self._extremes
-        inside = lens_mask(brightest.max(axis=2))
-        within = ~overlays(darkest, brightest, self._sum / len(self.sharpnesses))
-        return within if inside is None else within & inside
+        inside, count = lens_mask(brightest.max(axis=2)), len(self.sharpnesses)
+        mask = np.ones(self.size, bool) if inside is None else inside
+        if count >= _FEWEST_STILL:
+            mask &= ~overlays(darkest, brightest, self._sum / count)
+        return None if mask.all() or len(self._sizes) > 1 else mask
 
 
 def _moving(

@@ -119,8 +119,8 @@ class PosesSfmCommand:
     distance: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
     mask: arguments.OptionalPath = None
-    """Mask image, black where pixels are ignored, or a folder with one per image; default: found for a video (black
-    surroundings and overlays), none for images."""
+    """Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings and
+    overlays are found, of images of one size."""
     every: int = 1
     """Use every n-th image."""
     max_frames: arguments.OptionalInt = None
@@ -137,7 +137,7 @@ class PosesSfmCommand:
         from coliags_plugin.pipeline.frame_sources import image_files
         from coliags_plugin.pipeline.frames import FrameSurvey
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-        from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for
+        from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for, read_image
         from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
         from coliags_plugin.reconstruction.structure.sfm import reconstruct
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -155,11 +155,13 @@ class PosesSfmCommand:
             masks: Masks = None
             if self.mask is not None:
                 masks = masks_for(self.mask, images)
-            elif not self.frames.is_dir() and not (found := survey.mask()).all():
-                _LOG.info(
-                    "ignored: black surroundings and overlays, %.0f %% of the image", 100.0 * (1.0 - found.mean())
-                )
-                masks = found
+            else:
+                for path in images if self.frames.is_dir() else ():
+                    survey.add(read_image(path))
+                if (found := survey.mask()) is not None:
+                    share = 100.0 * (1.0 - found.mean())
+                    _LOG.info("ignored: black surroundings and overlays, %.0f %% of the image", share)
+                    masks = found
             atlas = reconstruct(images, settings, masks, progress)
             factor = millimetres(atlas.largest, self.diameter, known_distance)
             if factor is not None:
