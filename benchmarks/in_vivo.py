@@ -108,6 +108,8 @@ def row_of(options: Options, wave: float, rate: float, seed: int) -> dict[str, A
         print(f"{scene.name}: {error}")
         atlas = Atlas(tuple(images), (), dict.fromkeys(range(len(images)), "no model"))
     cpu, wall = time.process_time() - before, time.perf_counter() - start
+    # Images that repeat the one before are not in the atlas.
+    truth = truth[[images.index(path) for path in atlas.images]]
     if atlas.models:
         write_sfm_scene(scene.with_name(f"{scene.name}-poses"), atlas, None, overwrite=True)
     stretches = [
@@ -124,7 +126,7 @@ def row_of(options: Options, wave: float, rate: float, seed: int) -> dict[str, A
         "rate, Hz": rate,
         "seed": seed,
         "frames": len(images),
-        "posed, %": 100.0 * (1.0 - len(atlas.lost) / len(images)),
+        "posed, %": 100.0 * (len(atlas.images) - len(atlas.lost)) / len(images),
         "models": ", ".join(str(len(model.registered)) for model in atlas.models),
         "ATE of stretches, mm": f"{np.median(errors):.2f} (worst {max(errors):.2f} of {len(errors)})" if errors else "",
         "ATE of models, mm": ", ".join("-" if one is None else f"{one.ate.rmse:.2f}" for one in whole),
