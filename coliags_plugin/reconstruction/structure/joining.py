@@ -85,7 +85,11 @@ def join_models(
     parts = [Part(model, {}) for model in models]
     left: list[tuple[range, range]] = []
     cuts = {link.after for model in models for link in weak_links(model.model)}
-    stretches = stretches_of([part.frames for part in parts if len(part.frames) >= _LEAST_FRAMES], cuts)
+    stretches = [
+        stretch
+        for stretch in stretches_of([part.frames for part in parts if len(part.frames) >= _LEAST_FRAMES], cuts)
+        if len(stretch) >= _FRAMES
+    ]
     for number, earlier in enumerate(with_progress(stretches, "join models", progress)):
         for later in stretches[number + 1 : number + 1 + _AHEAD]:
             one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
