@@ -15,12 +15,12 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays, adjust, held_out_error
-from coliags_plugin.reconstruction.structure.atlas import Link, held_part, part_of, weak_links
+from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
-from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
+from coliags_plugin.reconstruction.structure.sfm import Atlas, _apart, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
 from tests.reconstruction.seen_points import COMMON, COUNT, GAP, seen_points
 from tests.textured_tube import INTRINSICS, write_tube
@@ -230,3 +230,26 @@ def test_tracks_choose_the_lens_that_took_the_video(tmp_path):
     assert camera.model_name == "SIMPLE_RADIAL_FISHEYE"
     assert camera.params[3] == pytest.approx(0.333)  # of the three, the nearest to the tube's pinhole
     assert len(atlas.largest.registered) == 16
+
+
+def test_sides_that_give_points_another_depth_contradict_each_other():
+    model, _ = seen_points()
+    assert contradictions(model) == []
+    first = model.images[GAP + 1].projection_center()
+    for number in range(GAP + 2, COUNT + 1):  # moves three times as far as what it sees tells
+        pose = model.images[number].cam_from_world().matrix()
+        center = first + 3.0 * (model.images[number].projection_center() - first)
+        pose[:, 3] = -pose[:, :3] @ center
+        model.frames[model.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+    (link,) = contradictions(model)
+    assert abs(link.after - GAP) <= 1
+    assert link.log_scale == pytest.approx(np.log(3.0), abs=0.2)
+    assert not link.holds
+    assert contradictions(model, [Link(GAP, 9, None, None)]) == []
+
+
+def test_places_next_to_each_other_are_one():
+    links = [Link(after, points, None, None) for after, points in ((9, 40), (2, 30), (4, 20), (6, 25), (12, 8))]
+    assert [link.after for link in _apart(links, 3)] == [4, 9, 12]
+    assert [link.after for link in _apart(links, 1)] == [2, 4, 6, 9, 12]
+    assert _apart([], 3) == []

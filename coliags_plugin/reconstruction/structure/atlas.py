@@ -27,6 +27,9 @@ _FEWEST_LINKING, _FEWEST_ALONE = 8, 20
 #: Fewest points triangulated from either side alone that tell how the scales of the sides compare, largest difference
 #: of the scales, and largest uncertainty of it, as natural logarithms.
 _FEWEST_COMMON, _SAME_SCALE, _LEAST_CERTAIN = 5, 0.25, 0.15
+#: Scales of the sides of a place, as natural logarithms, and standard errors of this, from which they contradict each
+#: other although many points link them; frames over which such places are one; and points that are compared.
+_OTHER_SIZE, _SURE, _ONE_PLACE, _COMPARED = 0.6, 3.0, 6, 120
 #: Points of a model that one of its images sees at least, and factor by which their median depth differs at most from
 #: that of the median image.
 _FEWEST_SEEN, _OTHER_SCALE = 15, 20.0
@@ -101,6 +104,29 @@ def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
     rays = Rays.of_points(model)
     links = [_link(rays, frames, after) for after in frames[:-1].tolist()]
     return [link for link in links if link.points < _STRONG_LINK or not link.holds]
+
+
+def contradictions(model: pycolmap.Reconstruction, known: Sequence[Link] = ()) -> list[Link]:
+    """Places at which many points link the sides of a model but get a much different depth from either of them.
+
+    A part of the model is too large or too small there. Of neighbouring places the worst, and none near those that are
+    ``known``; image i has ID i + 1.
+    """
+    rays = Rays.of_points(model)
+    first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
+    found: list[Link] = []
+    for after in (number - 1 for number in sorted(model.reg_image_ids())[:-1]):
+        common = np.flatnonzero((first <= after) & (last > after))
+        compared = np.isin(rays.tracks, common[:: 1 + len(common) // _COMPARED])
+        link = replace(_measured(rays.only(compared, 2), after), points=len(common))
+        if link.log_scale is None or abs(link.log_scale) < max(_OTHER_SIZE, _SURE * (link.uncertainty or 0.0)):
+            continue
+        if any(abs(after - other.after) <= _ONE_PLACE for other in known):
+            continue
+        if found and after - found[-1].after <= _ONE_PLACE:
+            link = max(found.pop(), link, key=lambda one: abs(one.log_scale or 0.0))
+        found.append(link)
+    return found
 
 
 def link_at(model: pycolmap.Reconstruction, after: int) -> Link:

@@ -19,7 +19,7 @@ from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error
-from coliags_plugin.reconstruction.structure.atlas import Again, Link, held_part, link_at, part_of, weak_links
+from coliags_plugin.reconstruction.structure.atlas import Again, Link, contradictions, link_at, part_of, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     adjusted,
@@ -210,14 +210,17 @@ def _atlas(
     kept: list[Hypothesis] = []
     refused: list[Link] = []
     for hypothesis in chosen:
-        broken = [link for link in weak_links(hypothesis.model) if not link.holds] if video.tracks else []
+        broken: list[Link] = []
+        if video.tracks:
+            weak = [link for link in weak_links(hypothesis.model) if not link.holds]
+            broken = _apart([*weak, *contradictions(hypothesis.model, weak)], settings.min_model_size)
         refused += broken
         frames = np.array(sorted(hypothesis.model.reg_image_ids())) - 1
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
             one = hypothesis
-            if broken:
-                one = Hypothesis.of(held_part(part_of(hypothesis.model, part.tolist())), video.brightness)
-            if one.images >= settings.min_model_size:
+            if broken and len(part) >= settings.min_model_size:
+                one = adjusted(part_of(hypothesis.model, part.tolist()), video)
+            if min(one.images, len(part)) >= settings.min_model_size:
                 kept.append(one)
     apart: dict[int, Again] = {}
     parts = [Part(one, {}) for one in kept]
@@ -245,10 +248,20 @@ def _atlas(
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
 
 
+def _apart(links: Sequence[Link], least: int) -> list[Link]:
+    """Places in order; of those between which ``least`` frames would not be left, the one that fewest points link."""
+    groups: list[list[Link]] = []
+    for link in sorted(links, key=lambda link: link.after):
+        if not groups or link.after - groups[-1][-1].after >= least:
+            groups.append([])
+        groups[-1].append(link)
+    return [min(group, key=lambda link: link.points) for group in groups]
+
+
 def _links(part: Part) -> tuple[Link, ...]:
     """Weak places of a model that hold, and those at which it was joined."""
     model = part.hypothesis.model
-    weak = {link.after: link for link in weak_links(model)}
+    weak = {link.after: link for link in weak_links(model) if link.holds}
     joined = {after: replace(link_at(model, after), again=again) for after, again in part.joins.items()}
     return tuple(link for _, link in sorted({**weak, **joined}.items()))
 
