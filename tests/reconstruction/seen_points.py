@@ -8,6 +8,7 @@ import numpy as np
 
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from tests.textured_tube import INTRINSICS, tube_frames
 
 #: Frames, the one after which most points change, and points seen from both sides of it.
@@ -33,3 +34,9 @@ def seen_points(shift=0.0):
     model = frame_model(frames)
     add_points(model, observed, positions, np.zeros((len(positions), 3), np.uint8), np.ones(len(positions)))
     return model, observed
+
+
+def frame_points(ids, pixels):
+    """Points of a frame that is sharp and follows the one before it well."""
+    dark = np.zeros(len(ids), np.float32)
+    return FramePoints(ids, pixels.astype(np.float32), dark, followed=9, shift=0.0, sharpness=1.0, fineness=3.0)

@@ -18,11 +18,10 @@ from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays,
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
 from coliags_plugin.reconstruction.structure.sfm import Atlas, _apart, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
-from tests.reconstruction.seen_points import COMMON, COUNT, GAP, seen_points
+from tests.reconstruction.seen_points import COMMON, COUNT, GAP, frame_points, seen_points
 from tests.textured_tube import INTRINSICS, write_tube
 
 TRACKED = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS), matching="tracks")
@@ -82,15 +81,7 @@ def test_held_out_tracks_measure_the_poses(noise):
     model, observed = seen_points()
     rng = np.random.default_rng(0)
     tracks = [
-        FramePoints(
-            TEST_EVERY * points.points,
-            (points.pixels + rng.normal(0.0, noise, points.pixels.shape)).astype(np.float32),
-            np.zeros(len(points.points), np.float32),
-            followed=9,
-            shift=0.0,
-            sharpness=1.0,
-            fineness=3.0,
-        )
+        frame_points(TEST_EVERY * points.points, points.pixels + rng.normal(0.0, noise, points.pixels.shape))
         for points in observed
     ]
     error = held_out_error(model, tracks)

@@ -105,6 +105,7 @@ def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:
                 "points": int(model.model.num_points3D()),
                 "reprojection_error_px": round(float(model.model.compute_mean_reprojection_error()), 3),
                 "held_out_error_px": None if model.test_error is None else round(model.test_error, 3),
+                "rigidity_px": {str(apart): round(value, 3) for apart, value in model.rigidity.items()},
                 "brightness_depth_correlation": None if model.correlation is None else round(model.correlation, 3),
             }
         )

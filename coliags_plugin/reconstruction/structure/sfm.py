@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +33,7 @@ from coliags_plugin.reconstruction.structure.hypotheses import (
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
 from coliags_plugin.reconstruction.structure.joining import Part, join_models, stretches_of
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
+from coliags_plugin.reconstruction.structure.rigidity import LIMIT, rigidity
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     field_of_view,
     has_known_camera,
@@ -61,6 +62,7 @@ class Reconstruction:
     links: tuple[Link, ...] = ()  # weak places that hold
     test_error: float | None = None  # median error of tracks that mapping has not used, pixels; None: unknown
     lens_side: int | None = None  # larger side of the lens's picture, pixels; None: it fills the images
+    rigidity: Mapping[int, float] = field(default_factory=dict)  # residual of a rigid motion, px, by frames apart
 
     @property
     def trajectory(self) -> Trajectory:
@@ -324,6 +326,7 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
     error = held_out_error(model, video.tracks) if video.tracks else None
+    moves = rigidity(model, video.tracks) if video.tracks else {}
     poses = inverse(world_to_camera)
     if video.picture is not None:
         video.picture.to_frame(model)
@@ -338,7 +341,15 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
         links,
         error,
         None if video.picture is None else max(video.picture.size),
+        moves,
     )
+    if moves and (last := max(moves)) > 1 and moves[last] > LIMIT * moves[min(moves)]:
+        log.warning(
+            "images %s to %s: what is seen moves: points are %.1f px from the best rigid motion over %d frames, "
+            "%.1f px over %d. Poses and surface are those of its mean",
+            *(images[registered[0]].name, images[registered[-1]].name),
+            *(moves[last], last, moves[min(moves)], min(moves)),
+        )
     if chosen.correlation is None or chosen.correlation > _LIT:
         log.warning(
             "images %s to %s: nearer points are hardly brighter (correlation of brightness with depth %s): the model "
