@@ -49,8 +49,9 @@ _TRIALS = 300, 3000
 _SAME_SCALE, _SAME_ROTATION, _SAME_PLACE = 0.25, 12.0, 0.35
 #: Fewest comparisons that agree, and fewest frames of either side in these.
 _FEWEST_AGREEING, _FEWEST_SIDE = 10, 3
-#: Largest factor by which held-out tracks are farther off in a joined model than in its parts, and pixels beyond that.
-_WORSE, _MORE = 1.05, 0.1
+#: Largest factor by which held-out tracks are farther off in a joined model than in its parts, and pixels beyond that;
+#: and largest share of the frames that lose their poses.
+_WORSE, _MORE, _MOST_LOST = 1.05, 0.1, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +325,8 @@ def _joined(
         pixels = video.keypoints[number - 1][:, :2].astype(np.float64)
         model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
     result = adjusted(model, video)
-    held = result.images == len(one.frames) + len(other.frames) and link_at(result.model, after).holds
+    kept = result.images >= (1.0 - _MOST_LOST) * (len(one.frames) + len(other.frames))
+    held = kept and link_at(result.model, after).holds
     if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
         return None
     return Part(result, {**one.joins, **other.joins, after: _again(sightings, before)})
