@@ -97,6 +97,12 @@ class Rays:
         """The first observation of each track."""
         return np.searchsorted(self.tracks, np.arange(len(self.ids)))
 
+    @cached_property
+    def spans(self) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+        """The smallest and the largest image ID that sees each track."""
+        first, last = (extreme.reduceat(self.images, self.starts) for extreme in (np.minimum, np.maximum))
+        return first, last
+
     def sums(self, values: Float[np.ndarray, "K ..."]) -> Float[np.ndarray, "N ..."]:
         """Sums over the observations of each track."""
         return np.asarray(np.add.reduceat(values, self.starts)) if len(self.ids) else values[:0]

@@ -113,10 +113,10 @@ def contradictions(model: pycolmap.Reconstruction, known: Sequence[Link] = ()) -
     ``known``; image i has ID i + 1.
     """
     rays = Rays.of_points(model)
-    first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
+    first, last = rays.spans
     found: list[Link] = []
     for after in (number - 1 for number in sorted(model.reg_image_ids())[:-1]):
-        common = np.flatnonzero((first <= after) & (last > after))
+        common = np.flatnonzero((first <= after + 1) & (last > after + 1))
         compared = np.isin(rays.tracks, common[:: 1 + len(common) // _COMPARED])
         link = replace(_measured(rays.only(compared, 2), after), points=len(common))
         if link.log_scale is None or abs(link.log_scale) < max(_OTHER_SIZE, _SURE * (link.uncertainty or 0.0)):
@@ -136,11 +136,11 @@ def link_at(model: pycolmap.Reconstruction, after: int) -> Link:
 
 
 def _link(rays: Rays, frames: Int64[np.ndarray, "M"], after: int, always_measured: bool = False) -> Link:
-    """The place after one of a model's frames, ascending; else measured only where it has to prove that it holds."""
-    first, last = (extreme.reduceat(rays.images - 1, rays.starts) for extreme in (np.minimum, np.maximum))
-    common, place = (first <= after) & (last > after), int(np.searchsorted(frames, after))
+    """The link after one of a model's frames, its scales compared where few points carry it, or always."""
+    first, last = rays.spans
+    common, place = (first <= after + 1) & (last > after + 1), int(np.searchsorted(frames, after))
     far = frames[max(0, place + 1 - _REACH)], frames[min(len(frames) - 1, place + _REACH)]
-    spanning = int(((first <= far[0]) & (last >= far[1])).sum())
+    spanning = int(((first <= far[0] + 1) & (last >= far[1] + 1)).sum())
     link = Link(after, int(common.sum()), None, None)
     if always_measured or link.points < _STRONG_LINK or spanning < _SPANNING:
         link = _measured(rays.only(common[rays.tracks], 2), after)

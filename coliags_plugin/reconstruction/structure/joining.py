@@ -179,7 +179,7 @@ class _Comparison:
         self.view = view
 
     def agreeing(self, one: Part, earlier: range, other: Part, later: range) -> list[_Sighting]:
-        """What the frames at the ends of two stretches see of each other's models, the most typical first.
+        """Comparisons of the frames at the ends of two stretches that give one similarity, the most typical first.
 
         Empty if too little of it agrees.
         """
@@ -256,7 +256,7 @@ def _between(pose: Float[np.ndarray, "3 4"], same: Float[np.ndarray, "3 4"], fac
 
 
 def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
-    """The largest set of sightings that agree with one of them, that one first, by where they place a later camera."""
+    """The largest set of sightings with nearly one similarity, its most typical first."""
     one = [sighting.similarity for sighting in sightings]
     scales = np.log([similarity.scale for similarity in one])
     rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in one]))
@@ -275,7 +275,7 @@ def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
 
 
 def _again(sightings: Sequence[_Sighting], before: int) -> Again:
-    """What is recorded of sightings that agree."""
+    """The record of a join: number of agreeing comparisons, and the spread of their scales."""
     scales = np.log([sighting.similarity.scale for sighting in sightings])
     return Again(before, len(sightings), round(float(scales.std()), 4))
 
@@ -333,7 +333,7 @@ def _joined(
 
 
 def _is_worse(joined: Hypothesis, parts: Sequence[Part], video: MatchedVideo) -> bool:
-    """Whether held-out tracks are farther off in a joined model than in its parts; also where they cannot tell."""
+    """Whether a joined model has a larger error of held-out tracks than its parts, or one that is unknown."""
     error = held_out_error(joined.model, video.tracks)
     before = [held_out_error(part.hypothesis.model, video.tracks) for part in parts]
     known = [one for one in before if one is not None]
