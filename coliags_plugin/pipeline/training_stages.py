@@ -22,8 +22,8 @@ _SAVE_SECONDS, _KEPT = 60.0, 2
 SURFACE = "the surface to turn in a browser"
 #: Training views that are evaluated, for comparison with those held out.
 _TRAINING_VIEWS = 16
-#: Frames of a sub-map from which on it gets all steps, and the least share of them (docs/reconstruct.md 5).
-_ALL_STEPS, _LEAST_SHARE = 100, 0.25
+#: Frames of a sub-map that get the steps of the settings; least share of them, and most (docs/reconstruct.md 5).
+_ALL_STEPS, _LEAST_SHARE, _MOST_SHARE = 100, 0.25, 2.0
 
 
 def method_for(context: StageContext) -> str:
@@ -33,11 +33,12 @@ def method_for(context: StageContext) -> str:
 
 
 def steps_for(context: StageContext) -> int:
-    """Training steps: all for the largest sub-map, of a smaller one in proportion to its frames."""
+    """Training steps: in proportion to the sub-map's frames, for the largest not below those of the settings."""
     steps, submap = context.settings.steps, context.submap
-    if submap.number == 0 or submap.frames is None:
+    if submap.frames is None:
         return steps
-    return max(1, round(steps * min(1.0, max(_LEAST_SHARE, submap.frames / _ALL_STEPS))))
+    least = 1.0 if submap.number == 0 else _LEAST_SHARE
+    return max(1, round(steps * min(_MOST_SHARE, max(least, submap.frames / _ALL_STEPS))))
 
 
 def train(context: StageContext) -> StageOutcome:

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.thorough, pytest.mark.skipif(CHROMIUM is None, reason=
 
 WIDTH, HEIGHT = 900, 420
 #: Where neither the panel nor a notice is, px.
-FREE = (slice(180, 400), slice(20, 460))
+FREE = (slice(220, 400), slice(20, 460))
 
 
 #: JavaScript: the checkbox of a label.
