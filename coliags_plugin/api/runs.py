@@ -286,19 +286,21 @@ class Run:
     ) -> MeasuredCoverage:
         """Measure what the recording shows of the wall and what it misses, and write it. Research use only.
 
+        Where no section of a lumen can be measured, ``coverage`` of the result is a ``PartialCoverage`` with the
+        reason.
+
         Args:
             output: Folder to make; None: ``coverage`` in the run folder.
             settings: What counts as seen, by name (docs/coverage.md 3), for instance ``{"far": 40.0}``.
-            mesh: The wall, PLY, OBJ or GLB, in mm in the world of the poses; None: ``mesh/mesh.ply`` in the run folder,
-                or else the fused depth of the run.
+            mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses; None: ``mesh/mesh.ply`` in the run
+                folder, or else the fused depth of the run.
             truth: True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with
                 one; None: that of the scene, where there is one.
             overwrite: Replace the folder where it exists.
 
         Raises:
-            InputError: See :meth:`load`; an option is unknown or invalid, the unit of length is unknown, the mesh
-                cannot be read, is not where the cameras look or is no tube around them, or the folder exists or cannot
-                be written.
+            InputError: See :meth:`load`; an option is unknown or invalid, the mesh cannot be read or is not where the
+                cameras look, or the folder exists or cannot be written.
         """
         from coliags_plugin.core.settings import validated
         from coliags_plugin.geometry.meshes.files import read_mesh

@@ -67,15 +67,15 @@ def measure_scene_coverage(
 
     Args:
         data: The scene's folder.
-        mesh: The wall, PLY, OBJ or GLB, in mm in the world of the poses.
+        mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses.
         output: Folder to make.
         settings: What counts as seen, by name (docs/coverage.md 3).
         truth: See :meth:`Run.coverage`.
         overwrite: Replace the folder where it exists.
 
     Raises:
-        InputError: An option is unknown or invalid; the scene, the mesh or the truth cannot be read, do not belong
-            together, or are not in mm; or the folder exists or cannot be written.
+        InputError: An option is unknown or invalid; the scene, the mesh or the truth cannot be read or do not belong
+            together; or the folder exists or cannot be written.
     """
     from coliags_plugin.core.settings import validated
     from coliags_plugin.geometry.meshes.files import read_mesh

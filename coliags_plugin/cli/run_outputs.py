@@ -85,8 +85,8 @@ class CoverageCommand:
     output: arguments.OptionalOutput = None
     """Folder to create; default RUN/coverage."""
     mesh: arguments.OptionalPath = None
-    """The wall, PLY, OBJ or GLB, in mm in the world of the poses; default: RUN/mesh/mesh.ply, or else the fused depth
-    of the run."""
+    """The wall, PLY, OBJ or GLB, in the world and unit of the poses; default: RUN/mesh/mesh.ply, or else the fused
+    depth of the run."""
     truth: arguments.OptionalPath = None
     """True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with one;
     default: that of the scene, where there is one."""
@@ -103,8 +103,6 @@ class CoverageCommand:
         from coliags_plugin.api.scenes import measure_scene_coverage
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.surface.coverage.page import summary
-        from coliags_plugin.surface.coverage.writing import coverage_values
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance region_diameter=10")
         is_run = (self.path / "config.yaml").is_file()
@@ -123,8 +121,8 @@ class CoverageCommand:
                 self.path, self.mesh, self.output, settings=settings, truth=self.truth, overwrite=self.overwrite
             )
         print_summary(
-            "\n".join(summary(measured.coverage, measured.evaluation)),
-            coverage_values(measured.coverage, measured.evaluation),
+            "\n".join(measured.summary),
+            measured.values,
             written=[measured.folder],
             then=[view_command(self.path, self.data)] if is_run else [],
             as_json=self.json,

@@ -36,7 +36,7 @@ from coliags_plugin.reporting.model import (
     ranked_cells,
     simple_table,
 )
-from coliags_plugin.reporting.numbers import duration
+from coliags_plugin.reporting.numbers import area_text, duration
 
 #: Held-out views shown of each sub-map, beside the worst.
 _VIEWS = 6
@@ -96,7 +96,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         Column("psnr_training", "PSNR of training views", "dB"),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),
-        *([Column("seen", "Seen", "%")] if any("seen" in one.figures for one in results) else []),
+        *([Column("seen", "Seen", words=True)] if any(_seen(one.figures) for one in results) else []),
         Column("steps", "Steps"),
         Column("time", "Time"),
     ]
@@ -108,7 +108,6 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
             figures["gap"] = figures["psnr_training"] - figures["psnr"]
         for key, values in measured.items():
             values.append(figures.get(key))
-        seen = figures.get("seen")
         rows.append(
             {
                 "submap": f"{one.submap.number}{'' if one.submap.number else ', the largest'}",
@@ -116,7 +115,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
                 "span": (spans or {}).get(one.submap.number),
                 "held_out": figures.get("held_out"),
                 "area": _area(figures),
-                "seen": None if seen is None else f"{100.0 * seen:.0f}",
+                "seen": _seen(figures),
                 "steps": figures.get("steps"),
                 "time": duration(sum(stage.seconds for stage in one.stages.values())),
             }
@@ -136,10 +135,14 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
 
 
 def _area(figures: Mapping[str, Any]) -> str | None:
-    if "area" not in figures:
-        return None
-    metric = figures.get("unit") == "mm"
-    return f"{figures['area'] / 100.0:.1f} cm²" if metric else f"{figures['area']:,.0f} square units"
+    return area_text(figures["area"], figures.get("unit") == "mm") if "area" in figures else None
+
+
+def _seen(figures: Mapping[str, Any]) -> str | None:
+    """Share of the wall that was seen, or the area where there is no share."""
+    if "seen" in figures:
+        return f"{100.0 * figures['seen']:.0f} %"
+    return area_text(figures["seen_area"], figures.get("unit") == "mm") if "seen_area" in figures else None
 
 
 def held_out_text(results: Sequence[SubmapResults]) -> str:

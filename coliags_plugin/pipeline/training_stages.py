@@ -10,6 +10,7 @@ from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWrita
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.reporting.numbers import area_text
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
@@ -118,7 +119,7 @@ def mesh(context: StageContext) -> StageOutcome:
     trained = load_trained(context.run, context.device, context.scene)
     made = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
     area = made.mesh.areas.sum()
-    shown = f"{area / 100.0:.1f} cm²" if trained.scene.is_metric else f"{area:,.0f} square units"
+    shown = area_text(area, trained.scene.is_metric)
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
     if find_spec("viser") is not None:
         from coliags_plugin.export.viewer.saving import save_surface
@@ -132,29 +133,21 @@ def mesh(context: StageContext) -> StageOutcome:
 def coverage(context: StageContext) -> StageOutcome:
     """Measure the share of the wall seen in the video; left out where it cannot be measured."""
     from coliags_plugin.geometry.meshes.files import read_mesh
-    from coliags_plugin.surface.coverage.page import summary
-    from coliags_plugin.surface.coverage.visibility import Level
     from coliags_plugin.surface.coverage.writing import measure_scene
 
-    scene = context.open_posed()
-    if not scene.is_metric:
-        return StageOutcome("left out, as the unit of length is unknown (--diameter gives one)")
-    folder = context.run / "coverage"
+    wall, folder = read_mesh(context.run / "mesh" / "mesh.ply"), context.run / "coverage"
     try:
-        made = measure_scene(
-            scene, read_mesh(context.run / "mesh" / "mesh.ply"), folder, context.settings.coverage, overwrite=True
-        )
+        made = measure_scene(context.open_posed(), wall, folder, context.settings.coverage, overwrite=True)
     except NotWritableError:
         raise
     except InputError as error:
         return StageOutcome(f"left out: {error}", warnings=[f"no coverage: {error}"])
     what = "what was seen and missed, for research use only"
-    measured = made.coverage
-    unseen = measured.area(measured.level == Level.UNSEEN) / measured.area()
+    values = made.values
     return StageOutcome(
-        "; ".join(" ".join(line.split()).rstrip(";") for line in summary(measured, made.evaluation)),
+        "; ".join(" ".join(line.split()).rstrip(";") for line in made.summary),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
-        figures={"seen": 1.0 - unseen},
+        figures={name: values[name] for name in ("seen", "seen_area") if values[name] is not None},
     )
 
 

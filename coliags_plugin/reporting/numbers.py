@@ -31,6 +31,11 @@ def file_size(size: float) -> str:
     return f"{size / 1e6:.0f} MB" if size < 1e9 else f"{size / 1e9:.1f} GB"
 
 
+def area_text(area: float, metric: bool) -> str:
+    """An area in mm^2 as ``20.5 cm²``, or one of unknown unit as ``2,050 square units``."""
+    return f"{area / 100.0:.1f} cm²" if metric else f"{area:,.0f} square units"
+
+
 def counted(number: int, noun: str) -> str:
     """A number with its noun: ``1 frame``, ``8 frames``."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"

@@ -36,6 +36,7 @@ def record_in(folder):
         "submap-1/train": done(steps=500),
         "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5),
         "submap-1/mesh": done({f"submap-1/{SURFACE_FILE}": SURFACE}, area=900.0, unit="units"),
+        "submap-1/coverage": done(seen_area=800.0),
         "submap-2/check": done(frames=5),
         "submap-2/depth": StageRecord({}, "failed", "no surface that 5 frames agree on. Check the poses."),
     }
@@ -52,14 +53,14 @@ def test_figures_of_sub_maps_and_their_means(tmp_path):
     assert [row["psnr_between"] for row in rows] == ["26.00", "", "", "26.00"]
     assert "psnr_pose_refined" not in rows[0]
     assert [row["area"] for row in rows] == ["42.0 cm²", "900 square units", "", ""]
-    assert [row["seen"] for row in rows] == ["62", "", "", ""]
+    assert [row["seen"] for row in rows] == ["62 %", "800 square units", "", ""]
     assert [row["steps"] for row in rows] == ["2000", "500", "", ""]
     assert rows[0]["span"] == "0 to 13"
     assert held_out_text(results) == "23.00 dB in the mean over 2 sub-maps (0: 24.00, 1: 22.00)"
     assert held_out_text(results[:1]) == "24.00 dB"
     assert held_out_text(results[2:]) == ""
     assert "depth failed: no surface that 5 frames agree on" in terminal_text([submap_table(results)])
-    alone = submap_table(results[1:2])
+    alone = submap_table(results[2:])
     assert not {"span", "seen"} & {column.key for column in alone.columns}
     assert len(alone.rows) == 1
 

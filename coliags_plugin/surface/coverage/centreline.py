@@ -19,6 +19,11 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
+
+class NoLumenError(InputError):
+    """There is no lumen around the cameras, or no section of one was seen."""
+
+
 #: Spacing of the centreline's points, mm.
 STEP = 1.0
 #: Steps of the search, mm, and how far it goes on without enough wall around it.
@@ -80,7 +85,7 @@ def find_centreline(mesh: TriangleMesh, cameras_to_world: Sequence[Float[np.ndar
     ahead = _followed(mesh, start, direction)
     behind = _followed(mesh, start, -direction)
     if len(ahead) + len(behind) < 5:
-        raise InputError(
+        raise NoLumenError(
             "there is not enough wall around the cameras to find the lumen's centreline",
             "the surface of a tube, around the camera's path",
             "Check that the mesh is the wall that the camera filmed, in the world of its poses",
@@ -118,7 +123,7 @@ def find_section(
     shown = uniform_filter1d(np.bincount(index, areas * seen).astype(float), _WINDOW, mode="constant")
     half = np.flatnonzero((shown >= _SEEN_SHARE * whole) & (whole > 0.0))
     if not len(half):
-        raise InputError(
+        raise NoLumenError(
             "nowhere along the lumen was half of the wall seen",
             "a recording that shows a section of a lumen",
             "Check that the mesh is the wall that the camera filmed, in the world of its poses",

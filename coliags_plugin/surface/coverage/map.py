@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.colormaps import side_by_side, stacked
 from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 from coliags_plugin.surface.coverage.centreline import STEP
-from coliags_plugin.surface.coverage.measure import WallCoverage
+from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage
+from coliags_plugin.surface.coverage.views import CoverageView
 from coliags_plugin.surface.coverage.visibility import GUESS_COLOR, GUESS_LABEL, Level
+from coliags_plugin.surface.meshing.pictures import HEIGHT, draw_mesh, outside_cameras
 
 _SOFT, _GRID, _NOTHING = (110, 110, 110), (225, 225, 225), (245, 245, 245)
 #: Edges of the axes rectangle, px: left, top, and what is right of and below it.
@@ -61,7 +68,26 @@ def _cells(coverage: WallCoverage) -> tuple[UInt8[np.ndarray, "M C 3"], Float[np
     return colors, arc
 
 
-def face_colors(coverage: WallCoverage) -> UInt8[np.ndarray, "F 3"]:
+def draw_partial(coverage: PartialCoverage, views: Sequence[CoverageView]) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw the reconstructed wall in the colours of the map, from outside and from three cameras, with a legend."""
+    poses = [views[index].camera_to_world for index in (0, len(views) // 2, -1)]
+    inside = [
+        Camera(HEIGHT / 2, HEIGHT / 2, HEIGHT / 2, HEIGHT / 2, HEIGHT, HEIGHT, torch.from_numpy(np.asarray(pose)))
+        for pose in poses
+    ]
+    colors = face_colors(coverage)
+    drawn = [
+        draw_mesh(coverage.mesh, camera, lambda _, triangles: colors[triangles])
+        for camera in (*outside_cameras(coverage.mesh, HEIGHT), *inside)
+    ]
+    labels = ("from outside", "from outside", "first frame", "in the middle", "last frame")
+    pictures = side_by_side(drawn, labels)
+    legend = np.full((_TOP, pictures.shape[1], 3), 255, np.uint8)
+    _legend(legend, coverage)
+    return stacked([legend, pictures])
+
+
+def face_colors(coverage: SeenWall) -> UInt8[np.ndarray, "F 3"]:
     """Colour of each triangle by its level. [F, 3]"""
     table = np.array([level.color for level in Level], np.uint8)
     colors = table[coverage.level]
@@ -69,10 +95,10 @@ def face_colors(coverage: WallCoverage) -> UInt8[np.ndarray, "F 3"]:
     return np.asarray(colors)
 
 
-def legend_entries(coverage: WallCoverage) -> list[tuple[str, tuple[int, int, int], Bool[np.ndarray, "F"]]]:
+def legend_entries(coverage: SeenWall) -> list[tuple[str, tuple[int, int, int], Bool[np.ndarray, "F"]]]:
     """Label, colour and triangles of each entry of a legend."""
     entries = [(level.label, level.color, (coverage.level == level) & ~coverage.guessed) for level in reversed(Level)]
-    return [*entries, (GUESS_LABEL, GUESS_COLOR, coverage.guessed)]
+    return [*entries, *([(GUESS_LABEL, GUESS_COLOR, coverage.guessed)] if coverage.guessed.any() else [])]
 
 
 def _axes(image: np.ndarray, limits: tuple[float, float], width: int) -> None:
@@ -91,7 +117,7 @@ def _axes(image: np.ndarray, limits: tuple[float, float], width: int) -> None:
     draw_text(image, "clock angle [deg]; 0: up, 90: right", (_LEFT - 60, bottom + 44))
 
 
-def _legend(image: np.ndarray, coverage: WallCoverage) -> None:
+def _legend(image: np.ndarray, coverage: SeenWall) -> None:
     total = coverage.area()
     x, y = _LEFT, 28
     for label, color, chosen in legend_entries(coverage):

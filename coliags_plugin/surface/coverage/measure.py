@@ -17,6 +17,7 @@ from coliags_plugin.surface.coverage.centreline import (
     STEP,
     Centreline,
     LumenSection,
+    NoLumenError,
     TubeGrid,
     find_centreline,
     find_section,
@@ -54,30 +55,49 @@ class MissedRegion:
 
 
 @dataclass(frozen=True, eq=False)
-class WallCoverage:
-    """What a recording shows of a lumen's wall, F triangles."""
+class SeenWall:
+    """What a recording shows of a wall, F triangles."""
 
     mesh: TriangleMesh  # the reconstructed wall and, behind it in the order of triangles, the guessed wall
     guessed: Bool[np.ndarray, "F"]  # triangles whose place is a guess, because nothing was reconstructed there
     views: FaceViews  # how the frames saw each triangle; guessed ones are unseen
     level: UInt8[np.ndarray, "F"]  # the values of :class:`Level`
+    names: list[str]  # of the frames
+    settings: CoverageSettings  # what counts as seen
+
+    @property
+    def inside(self) -> Bool[np.ndarray, "F"]:
+        """Triangles that are measured. [F]"""
+        return np.ones(len(self.mesh), bool)
+
+    def area(self, chosen: Bool[np.ndarray, "F"] | None = None) -> float:
+        """Area of some of the measured triangles, or of all, in square units of the mesh."""
+        return float(self.mesh.areas[self.inside if chosen is None else chosen & self.inside].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class PartialCoverage(SeenWall):
+    """What a recording shows of the reconstructed wall alone, where no section of a lumen can be measured."""
+
+    metric: bool  # whether lengths are mm; else their unit is unknown
+    reason: str  # why there is no section
+
+
+@dataclass(frozen=True, eq=False)
+class WallCoverage(SeenWall):
+    """What a recording shows of a section of a lumen, mm, and what it misses there."""
+
     line: Centreline  # of the lumen
     arc: Float[np.ndarray, "F"]  # place of each triangle along the centreline, mm
     clock: Float[np.ndarray, "F"]  # clock angle of each triangle, degrees
     section: LumenSection  # what part of the lumen is measured
     grid: TubeGrid  # the wall, guessed or not, around the centreline
     regions: list[MissedRegion]  # of the section, the largest first
-    names: list[str]  # of the frames
-    settings: CoverageSettings  # what counts as seen
 
     @property
     def inside(self) -> Bool[np.ndarray, "F"]:
         """Triangles of the section. [F]"""
         return self.section.holds(self.arc)
-
-    def area(self, chosen: Bool[np.ndarray, "F"] | None = None) -> float:
-        """Area of some triangles of the section, or of all, mm^2."""
-        return float(self.mesh.areas[self.inside if chosen is None else chosen & self.inside].sum())
 
 
 def measure_coverage(
@@ -85,15 +105,35 @@ def measure_coverage(
     views: Sequence[CoverageView],
     settings: CoverageSettings | None = None,
     progress: Progress | None = None,
-) -> WallCoverage:
+    metric: bool = True,
+) -> WallCoverage | PartialCoverage:
     """Measure what a recording shows of the wall of a lumen, in the world frame and mm, and what it misses.
 
     Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
-    can be called unseen; guessed wall always is. ``progress`` is called after every frame.
+    can be called unseen; guessed wall always is. Without a lumen, or in a unit that is not mm (``metric``), what was
+    seen of the mesh is measured alone, then without the limits in mm. ``progress`` is called after every frame.
     """
     settings = settings or CoverageSettings()
+    if not metric:
+        settings = settings.model_copy(update={"max_distance": np.inf, "far": np.inf})
     mesh = facing_cameras(mesh, views, settings)
     face_views = see_faces(mesh, views, settings, progress)
+    try:
+        if metric:
+            return _along_lumen(mesh, face_views, views, settings)
+        reason = "the unit of length is unknown"
+    except NoLumenError as error:
+        reason = error.seen
+    nothing, names = np.zeros(len(mesh), bool), [view.name for view in views]
+    return PartialCoverage(
+        mesh, nothing, face_views, classify(face_views, settings), names, settings, metric=metric, reason=reason
+    )
+
+
+def _along_lumen(
+    mesh: TriangleMesh, face_views: FaceViews, views: Sequence[CoverageView], settings: CoverageSettings
+) -> WallCoverage:
+    """Coverage of the section of a lumen that was seen, its wall completed by a guess."""
     line = find_centreline(mesh, [view.camera_to_world for view in views])
     guess = guessed_wall(wall_around(mesh, line))
     whole, guessed = _joined(mesh, guess)
@@ -113,7 +153,7 @@ def measure_coverage(
         for triangles in large_regions(missed, pairs, whole.areas, settings.region_area)
     ]
     names = [view.name for view in views]
-    return WallCoverage(whole, guessed, seen, level, line, arc, clock, section, grid, regions, names, settings)
+    return WallCoverage(whole, guessed, seen, level, names, settings, line, arc, clock, section, grid, regions)
 
 
 def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:

@@ -21,9 +21,11 @@ from coliags_plugin.reporting.model import (
     record,
     simple_table,
 )
+from coliags_plugin.reporting.numbers import area_text
 from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation
-from coliags_plugin.surface.coverage.map import draw_map, legend_entries
-from coliags_plugin.surface.coverage.measure import MissedRegion, WallCoverage
+from coliags_plugin.surface.coverage.map import legend_entries
+from coliags_plugin.surface.coverage.measure import MissedRegion, PartialCoverage, SeenWall, WallCoverage
+from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import CoverageView
 from coliags_plugin.surface.coverage.visibility import Level
 
@@ -36,10 +38,13 @@ _PICTURED, _WIDTH, _OPACITY = 12, 480, 0.55
 
 
 def coverage_page(
-    coverage: WallCoverage, views: Sequence[CoverageView], name: str, evaluation: CoverageEvaluation | None = None
+    coverage: WallCoverage,
+    picture: UInt8[np.ndarray, "H W 3"],
+    views: Sequence[CoverageView],
+    name: str,
+    evaluation: CoverageEvaluation | None = None,
 ) -> Page:
-    """The page of a measurement, with pictures of the frames it was measured from, named after the scene or run."""
-    settings = coverage.settings
+    """The page of a measurement, with its map and frames it was measured from, named after the scene or run."""
     map_note = (
         "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from top "
         "to bottom, as seen by a viewer who looks deeper into the lumen. Wall that turns away from the lumen, as the "
@@ -47,32 +52,69 @@ def coverage_page(
         "missed regions, lines the ends of the section."
     )
     method_note = (
-        f"Seen: {settings.glance_frames} frames or more show the surface from at most {settings.far:g} mm, in pixels "
-        f"of a grey value of {settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its normal. "
-        "At a glance: fewer frames do. Too dark or too far: frames show it, but none so near and bright. The section "
-        "reaches from the first to the last place along the lumen where half of the wall (over 10 mm) was seen; "
-        "beyond it, nothing is called missed. Where no wall was reconstructed, its place is guessed from the wall "
-        "around it."
+        f"{_levels_note(coverage.settings)} The section reaches from the first to the last place along the lumen where "
+        "half of the wall (over 10 mm) was seen; beyond it, nothing is called missed. Where no wall was reconstructed, "
+        "its place is guessed from the wall around it."
     )
-    unrolled = Image(EncodedImage.png(draw_map(coverage)), "unrolled map", wide=True)
+    unrolled = Image(EncodedImage.png(picture), "unrolled map", wide=True)
     sections = [
         Section("Map", [Paragraph(map_note), Figures([unrolled]), _level_table(coverage)]),
         Section("Missed regions", list(_missed_regions(coverage, views))),
         Section("Along the lumen", [_segment_table(coverage)]),
         Section("Against the truth", [] if evaluation is None else _against_truth(evaluation)),
-        Section("How it is measured", [Paragraph(method_note), record("Settings", settings.model_dump())]),
+        Section("How it is measured", [Paragraph(method_note), record("Settings", coverage.settings.model_dump())]),
     ]
     return Page(f"{name}: coverage", sections, _facts(coverage), note=RESEARCH_USE)
 
 
+def partial_page(coverage: PartialCoverage, picture: UInt8[np.ndarray, "H W 3"], name: str) -> Page:
+    """The page of a measurement without a section, with a picture of the wall."""
+    note = (
+        f"There is no map along the lumen, no length and no missed region: {coverage.reason}. What was seen of the "
+        "reconstructed wall is a result all the same; what was not reconstructed is not counted."
+    )
+    shown = Image(EncodedImage.png(picture), "reconstructed wall", wide=True)
+    sections = [
+        Section("Seen wall", [Paragraph(note, hint=False), Figures([shown]), _level_table(coverage, coverage.metric)]),
+        Section("How it is measured", [Paragraph(_levels_note(coverage.settings))]),
+    ]
+    seen = area_text(coverage.area(coverage.level != Level.UNSEEN), coverage.metric)
+    facts = [Fact("seen", seen), Fact("section", "none"), Fact("frames", str(len(coverage.names)))]
+    return Page(f"{name}: coverage", sections, facts, note=RESEARCH_USE)
+
+
+def _levels_note(settings: CoverageSettings) -> str:
+    """What the levels mean."""
+    near = f" from at most {settings.far:g} mm" if np.isfinite(settings.far) else ""
+    return (
+        f"Seen: {settings.glance_frames} frames or more show the surface{near}, in pixels of a grey value of "
+        f"{settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its normal. At a glance: fewer "
+        "frames do. Too dark or too far: frames show it, but none so near and bright."
+    )
+
+
+def partial_summary(coverage: PartialCoverage) -> list[str]:
+    """A few lines for a terminal."""
+    seen = coverage.area(coverage.level != Level.UNSEEN)
+    return [
+        f"{area_text(seen, coverage.metric)} of reconstructed wall seen, {len(coverage.names)} frames",
+        *_level_lines(coverage, coverage.metric),
+        f"no map along the lumen, no length and no missed regions: {coverage.reason}",
+        RESEARCH_USE,
+    ]
+
+
+def _level_lines(coverage: SeenWall, metric: bool = True) -> list[str]:
+    """Share and area of each level."""
+    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
+    total = coverage.area()
+    return [f"{100.0 * area / total:>5.1f} %  {label} ({area_text(area, metric)})" for label, area in areas.items()]
+
+
 def summary(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> list[str]:
     """A few lines for a terminal."""
-    total = coverage.area()
     missed = sum(region.area for region in coverage.regions)
-    lines = [f"section of {coverage.section.length:.0f} mm, {len(coverage.names)} frames"]
-    for label, _, chosen in legend_entries(coverage):
-        area = coverage.area(chosen)
-        lines.append(f"{100.0 * area / total:>5.1f} %  {label} ({area / 100.0:.1f} cm²)")
+    lines = [f"section of {coverage.section.length:.0f} mm, {len(coverage.names)} frames", *_level_lines(coverage)]
     limit = f"{coverage.settings.region_diameter:g} mm"
     lines.append(f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²")
     if evaluation is not None:
@@ -101,10 +143,10 @@ def _facts(coverage: WallCoverage) -> list[Fact]:
     ]
 
 
-def _level_table(coverage: WallCoverage) -> Table:
+def _level_table(coverage: SeenWall, metric: bool = True) -> Table:
     areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
-    rows = [[name, f"{area / 100.0:.1f}", f"{100.0 * area / coverage.area():.1f}"] for name, area in areas.items()]
-    return simple_table(["wall", "area, cm²", "share, %"], rows)
+    rows = [[name, area_text(area, metric), f"{100.0 * area / coverage.area():.1f}"] for name, area in areas.items()]
+    return simple_table(["wall", "area", "share, %"], rows)
 
 
 def _missed_regions(coverage: WallCoverage, views: Sequence[CoverageView]) -> Iterator[Block]:

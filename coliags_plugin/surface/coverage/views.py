@@ -108,13 +108,7 @@ def _pixel_angles(
 
 
 def recorded_views(scene: Scene) -> list[CoverageView]:
-    """Views of all frames of the video, held out or not, in its order; not of unknown unit, nor of one frame."""
-    if not scene.is_metric:
-        raise InputError(
-            f"the unit of length of scene '{scene.name}' is unknown, and coverage is in mm",
-            "a scene in mm",
-            "Scale its poses to mm, for instance by a known diameter of the lumen",
-        )
+    """Views of all frames of the video, held out or not, in its order; two frames or more."""
     if len(scene.video) < 2:
         raise InputError(f"scene '{scene.name}' has {len(scene.video)} frame", "two frames or more")
     return [_view(frame) for frame in scene.video]

@@ -95,7 +95,7 @@ def facing_cameras(
     cosines = np.concatenate([each.cosine for each in hits])
     if not len(cosines):
         raise InputError(
-            f"no viewing ray of {len(probes)} frames hits the mesh within {settings.max_distance:g} mm",
+            f"no viewing ray of {len(probes)} frames hits the mesh within max_distance, {settings.max_distance:g}",
             "a mesh in the world and unit of the poses",
             "Check that the mesh belongs to this scene",
         )

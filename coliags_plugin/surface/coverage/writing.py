@@ -23,9 +23,15 @@ from coliags_plugin.geometry.meshes.truth import find_true_surface, read_true_su
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation, evaluate_coverage
-from coliags_plugin.surface.coverage.map import draw_map, face_colors
-from coliags_plugin.surface.coverage.measure import WallCoverage, measure_coverage
-from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page
+from coliags_plugin.surface.coverage.map import draw_map, draw_partial, face_colors
+from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
+from coliags_plugin.surface.coverage.page import (
+    RESEARCH_USE,
+    coverage_page,
+    partial_page,
+    partial_summary,
+    summary,
+)
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import recorded_views
 from coliags_plugin.surface.coverage.visibility import Level
@@ -36,7 +42,9 @@ class MeasuredCoverage:
     """A measurement of coverage and the folder that it was written to."""
 
     folder: Path  # with ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``
-    coverage: WallCoverage = field(repr=False)
+    coverage: WallCoverage | PartialCoverage = field(repr=False)
+    values: dict[str, Any] = field(repr=False)  # the contents of ``coverage.json``
+    summary: list[str] = field(repr=False)  # a few lines for a terminal
     evaluation: CoverageEvaluation | None = field(repr=False, default=None)  # against the truth, where there is one
 
 
@@ -48,26 +56,38 @@ def measure_scene(
     truth: Path | None = None,
     overwrite: bool = False,
 ) -> MeasuredCoverage:
-    """Measure the coverage of a recording and write it; the mesh is the wall, mm, in the world of the scene.
+    """Measure the coverage of a recording and write it; the mesh is the wall in the world and unit of the scene.
 
-    ``truth`` is a true surface, in that world and mm, or the folder of a scene with one; None: that of the scene, where
-    there is one.
+    Where no section of a lumen can be measured, what was seen of the wall is written alone, and why. ``truth`` is a
+    true surface, in that world and mm, or the folder of a scene with one; None: that of the scene, where there is one.
     """
     check_free(output, overwrite)
     views = recorded_views(scene)
     source = truth or find_true_surface(Path(scene.provenance.get("path", "")))
     true = None if source is None else read_true_surface(source, any_frame=True)
     with progress_callback() as progress:
-        coverage = measure_coverage(mesh, views, settings, progress)
-    evaluation = None if true is None else evaluate_coverage(coverage, true, views)
+        coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)
+    evaluation = None
+    if isinstance(coverage, PartialCoverage):
+        values, lines = partial_values(coverage), partial_summary(coverage)
+        picture = draw_partial(coverage, views)
+        page = partial_page(coverage, picture, scene.name)
+    else:
+        evaluation = None if true is None else evaluate_coverage(coverage, true, views)
+        values, lines, picture = (
+            coverage_values(coverage, evaluation),
+            summary(coverage, evaluation),
+            draw_map(coverage),
+        )
+        page = coverage_page(coverage, picture, views, scene.name, evaluation)
     with atomic_folder(output, overwrite) as folder:
-        values = coverage_values(coverage, evaluation)
         write_json(folder / "coverage.json", values)
-        atomic_write(folder / "regions.csv", _regions_csv(values["regions"]))
-        write_png(folder / "map.png", draw_map(coverage))
+        if values["regions"] is not None:
+            atomic_write(folder / "regions.csv", _regions_csv(values["regions"]))
+        write_png(folder / "map.png", picture)
         write_mesh(folder / "coverage.ply", colored_mesh(coverage))
-        write_html(coverage_page(coverage, views, scene.name, evaluation), folder / "coverage.html")
-    return MeasuredCoverage(output, coverage, evaluation)
+        write_html(page, folder / "coverage.html")
+    return MeasuredCoverage(output, coverage, values, lines, evaluation)
 
 
 def open_recording(path: Path) -> Scene:
@@ -81,7 +101,7 @@ def check_free(folder: Path, overwrite: bool) -> None:
         raise InputError(f"{folder} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
 
 
-def colored_mesh(coverage: WallCoverage) -> TriangleMesh:
+def colored_mesh(coverage: SeenWall) -> TriangleMesh:
     """The wall, guessed parts included, in the colours of the map; triangles share no vertices, so that none mix."""
     mesh = coverage.mesh
     vertices = mesh.vertices[mesh.triangles].reshape(-1, 3)
@@ -90,28 +110,17 @@ def colored_mesh(coverage: WallCoverage) -> TriangleMesh:
 
 
 def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> dict[str, Any]:
-    """Everything that is measured, as JSON values."""
-    total = coverage.area()
-    views, seen = coverage.views, coverage.inside & coverage.views.seen
-    return {
-        "note": RESEARCH_USE,
+    """Everything that is measured of a section, as JSON values."""
+    return _seen_values(coverage) | {
         "unit": "mm",
-        "settings": coverage.settings.model_dump(),
-        "frames": len(coverage.names),
+        "seen": 1.0 - coverage.area(coverage.level == Level.UNSEEN) / coverage.area(),
+        "no_section": None,
         "section": {
             "start": round(coverage.section.start, 3),
             "end": round(coverage.section.end, 3),
             "rule": "from the first to the last place along the lumen where half of the wall of 10 mm was seen",
         },
-        "area": total,
-        "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
-        "guessed_share": coverage.area(coverage.guessed) / total,
-        "seen_surface": {
-            "median_distance": _median(coverage, views.distance, seen),
-            "median_incidence_degrees": _median(coverage, views.incidence, seen),
-            "median_pixels_per_mm": _median(coverage, views.pixels_per_mm, seen),
-            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
-        },
+        "guessed_share": coverage.area(coverage.guessed) / coverage.area(),
         "regions": [
             {
                 "number": number,
@@ -132,7 +141,43 @@ def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | Non
     }
 
 
-def _median(coverage: WallCoverage, values: Float[np.ndarray, "F"], chosen: Bool[np.ndarray, "F"]) -> float | None:
+def partial_values(coverage: PartialCoverage) -> dict[str, Any]:
+    """What was seen of the wall, as JSON values: null is what only a section has, and limits that were not applied."""
+    values = _seen_values(coverage)
+    if not coverage.metric:
+        values["seen_surface"]["median_pixels_per_mm"] = None
+    return values | {
+        "unit": "mm" if coverage.metric else "unknown",
+        "settings": {name: value if np.isfinite(value) else None for name, value in values["settings"].items()},
+        "seen": None,
+        "section": None,
+        "no_section": coverage.reason,
+        "guessed_share": None,
+        "regions": None,
+        "truth": None,
+    }
+
+
+def _seen_values(coverage: SeenWall) -> dict[str, Any]:
+    """Areas and how the seen surface was seen, as JSON values."""
+    views, seen, total = coverage.views, coverage.inside & coverage.views.seen, coverage.area()
+    return {
+        "note": RESEARCH_USE,
+        "settings": coverage.settings.model_dump(),
+        "frames": len(coverage.names),
+        "area": total,
+        "seen_area": coverage.area(coverage.level != Level.UNSEEN),
+        "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
+        "seen_surface": {
+            "median_distance": _median(coverage, views.distance, seen),
+            "median_incidence_degrees": _median(coverage, views.incidence, seen),
+            "median_pixels_per_mm": _median(coverage, views.pixels_per_mm, seen),
+            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
+        },
+    }
+
+
+def _median(coverage: SeenWall, values: Float[np.ndarray, "F"], chosen: Bool[np.ndarray, "F"]) -> float | None:
     """Median over chosen surface, weighted by area; None without any."""
     areas, values = coverage.mesh.areas[chosen], values[chosen]
     if not len(values):

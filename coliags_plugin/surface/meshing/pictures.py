@@ -20,8 +20,8 @@ from coliags_plugin.outputs.colormaps import (
     stacked,
 )
 
-#: Of each picture, px.
-_HEIGHT = 320
+#: Height of each picture, px.
+HEIGHT = 320
 _SURROUNDINGS = 255
 #: Share of the colour that a surface seen edge-on keeps.
 _AMBIENT = 0.45
@@ -40,8 +40,8 @@ def distance_colors(
 
 def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence[Camera]) -> UInt8[np.ndarray, "H W 3"]:
     """True surface, its unseen part grey, mesh and its colours, from cameras within and from two sides without."""
-    views = [("inside", camera.resized(round(camera.width * _HEIGHT / camera.height), _HEIGHT)) for camera in cameras]
-    width = max((camera.width for _, camera in views), default=_HEIGHT)
+    views = [("inside", camera.resized(round(camera.width * HEIGHT / camera.height), HEIGHT)) for camera in cameras]
+    width = max((camera.width for _, camera in views), default=HEIGHT)
     views += [("outside", camera) for camera in outside_cameras(truth.mesh.part(truth.seen), width)]
 
     def missed(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
 
     rows = [
         side_by_side(
-            [_drawn(truth.mesh, camera, missed), _drawn(mesh, camera, wrong), _drawn(mesh, camera, plain)],
+            [draw_mesh(truth.mesh, camera, missed), draw_mesh(mesh, camera, wrong), draw_mesh(mesh, camera, plain)],
             (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour"),
         )
         for number, (name, camera) in enumerate(views, start=1)
@@ -72,18 +72,18 @@ def outside_cameras(mesh: TriangleMesh, width: int) -> list[Camera]:
     center = mesh.centers.mean(axis=0)
     longest, middle, shortest = np.linalg.svd(mesh.centers[:: max(1, len(mesh) // 5000)] - center)[2]
     radius = float(np.linalg.norm(mesh.centers - center, axis=1).max())
-    focal = 0.48 * min(width, _HEIGHT) / np.tan(np.radians(10.0))  # the radius is seen at 10 degrees
+    focal = 0.48 * min(width, HEIGHT) / np.tan(np.radians(10.0))  # the radius is seen at 10 degrees
     cameras = []
     for forward in (shortest, middle):
         pose = torch.eye(4, dtype=torch.float64)
         down = np.cross(forward, longest)
         pose[:3, :3] = torch.from_numpy(np.stack([longest, down, forward], axis=1))
         pose[:3, 3] = torch.from_numpy(center - forward * radius / np.sin(np.radians(10.0)))
-        cameras.append(Camera(focal, focal, width / 2, _HEIGHT / 2, width, _HEIGHT, pose))
+        cameras.append(Camera(focal, focal, width / 2, HEIGHT / 2, width, HEIGHT, pose))
     return cameras
 
 
-def _drawn(
+def draw_mesh(
     mesh: TriangleMesh, camera: Camera, color: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A mesh as a camera sees it, lit from there, coloured by a function of the points hit and their triangles."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 
 import numpy as np
@@ -97,12 +98,34 @@ def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
     assert not out.exists()
 
 
-def test_a_mesh_of_another_world_and_a_scene_of_unknown_unit_are_refused(phantom, tmp_path):
+def test_a_mesh_of_another_world_is_refused(phantom, tmp_path):
     scene, mesh = open_recording(phantom), read_mesh(true_mesh(phantom))
     away = type(mesh)(mesh.vertices + np.float32(5000.0), mesh.triangles)
     with pytest.raises(InputError, match="no viewing ray"):
         measure_scene(scene, away, tmp_path / "out", CoverageSettings())
-    scene.provenance["unit"] = "unknown"
-    with pytest.raises(InputError, match="unit of length"):
-        measure_scene(scene, mesh, tmp_path / "out", CoverageSettings())
     assert not (tmp_path / "out").exists()
+
+
+def test_of_a_short_video_the_seen_wall_is_written_and_why_there_is_no_section(phantom, tmp_path, capsys):
+    # A patch of the wall before the first camera is no tube.
+    scene, whole = open_recording(phantom), read_mesh(true_mesh(phantom))
+    camera = recorded_views(scene)[0]
+    local = (whole.centers - camera.center) @ camera.camera_to_world[:3, :3]
+    wall, out = tmp_path / "wall.ply", tmp_path / "out"
+    write_mesh(wall, whole.part((local[:, 0] > 5.0) & (local[:, 2] > 5.0) & (local[:, 2] < 25.0)))
+    assert run("coverage", phantom, "--mesh", wall, "--output", out, "--set", "rays=8000") == 0
+    assert "no map along the lumen" in capsys.readouterr().out
+    found = json.loads((out / "coverage.json").read_text())
+    assert found["unit"] == "mm" and 0.0 < found["seen_area"] <= found["area"] and sum(found["shares"].values())
+    assert found["no_section"] and found["section"] is found["regions"] is found["seen"] is None
+    page = (out / "coverage.html").read_text()
+    assert html.escape(found["no_section"]) in page.replace("&#39;", "&#x27;") and RESEARCH_USE in page
+    assert {file.name for file in out.iterdir()} == {"coverage.html", "coverage.json", "coverage.ply", "map.png"}
+
+
+def test_a_scene_of_unknown_unit_has_its_areas_in_square_units(phantom, tmp_path):
+    scene = open_recording(phantom)
+    scene.provenance["unit"] = "unknown"
+    made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "out", CoverageSettings(rays=8000))
+    assert made.values["unit"] == "unknown" and made.values["settings"]["far"] is None
+    assert "square units" in made.summary[0] and "unit of length is unknown" in made.values["no_section"]

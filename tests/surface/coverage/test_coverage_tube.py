@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.centreline import find_centreline, find_section, guessed_wall, wall_around
-from coliags_plugin.surface.coverage.map import draw_map
-from coliags_plugin.surface.coverage.measure import measure_coverage
+from coliags_plugin.surface.coverage.centreline import (
+    NoLumenError,
+    find_centreline,
+    find_section,
+    guessed_wall,
+    wall_around,
+)
+from coliags_plugin.surface.coverage.map import draw_map, draw_partial
+from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.visibility import Level
 from tests.surface.coverage.tubes import grid_mesh, pinhole, plane, tube, view_at
@@ -138,10 +145,26 @@ def test_a_section_ends_where_less_than_half_was_seen_but_not_at_a_gap_within_it
     quarter = seen | ((arc >= 70.0) & (share == 0))
     assert find_section(arc, areas, quarter).end < 75.0
     assert section.holds(np.array([19.0, 45.0, 72.0])).tolist() == [False, True, False]
-    with pytest.raises(InputError, match="half of the wall"):
+    with pytest.raises(NoLumenError, match="half of the wall"):
         find_section(arc, areas, np.zeros(400, bool))
 
 
-def test_a_mesh_that_is_no_tube_is_refused():
-    with pytest.raises(InputError, match="centreline"):
-        measure_coverage(plane(30.0, 30.0), [view_at((0, 0, 0), lens=pinhole())], FEW_RAYS)
+def test_of_a_wall_without_a_lumen_the_seen_area_remains():
+    # The image of a camera 30 mm before a plane is 48 mm by 36 mm.
+    coverage = measure_coverage(plane(30.0, 30.0), [view_at((0, 0, 0), grey=100)] * 2, FEW_RAYS)
+    assert isinstance(coverage, PartialCoverage) and "centreline" in coverage.reason and coverage.metric
+    assert coverage.area(coverage.level == Level.GLANCE) == pytest.approx(48.0 * 36.0, rel=0.02)
+    assert coverage.area() == pytest.approx(60.0**2)
+    picture = draw_partial(coverage, [view_at((0, 0, 0))] * 2)
+    assert (picture == Level.UNSEEN.color).all(axis=-1).any()
+
+
+def test_a_tube_of_unknown_unit_is_seen_at_any_distance():
+    mesh, views = tube(), path(0.0, 1.0, 2.0, grey=100)
+    scale = 1000.0
+    far = [replace(view, camera_to_world=view.camera_to_world * np.array([1.0, 1.0, 1.0, scale])) for view in views]
+    large = measure_coverage(TriangleMesh(scale * mesh.vertices, mesh.triangles), far, FEW_RAYS, metric=False)
+    assert isinstance(large, PartialCoverage) and "unit" in large.reason and not large.metric
+    small = measure_coverage(mesh, views, FEW_RAYS, metric=False)
+    assert large.area() == pytest.approx(scale**2 * small.area())
+    np.testing.assert_array_equal(large.level, small.level)
