@@ -19,15 +19,13 @@ from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
 EXTENSION = "KHR_gaussian_splatting"
 #: glTF's number of a primitive of points.
 _POINTS = 0
-#: Half a turn about x (x, y, z, w), from camera-like axes (y down, z forward) to glTF's (y up).
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     """Write Gaussians as one primitive of points, float32, with the comment in ``asset.extras``.
 
-    Attributes keep the world frame and unit of the cloud. The node turns them by half a turn about x, so that y is up
-    as glTF has it. Readers without the extension see plain points in the colours of ``COLOR_0``.
+    Attributes keep the world frame and unit of the cloud, and no node turns them, as in GLB files of meshes. Readers
+    without the extension see plain points in the colours of ``COLOR_0``.
     """
     attributes = _attributes(cloud)
     primitive = {
@@ -39,7 +37,7 @@ def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": UPRIGHT}],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
     }
     arrays = [GlbArray(values, bounds=name == "POSITION") for name, values in attributes.items()]

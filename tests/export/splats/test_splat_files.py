@@ -176,15 +176,6 @@ def test_glb_follows_the_extension(tmp_path):
     np.testing.assert_allclose(bounds["max"], cloud.means.max(axis=0))
 
 
-def test_another_library_reads_the_points_of_the_glb(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    cloud = random_cloud(9)
-    scene = trimesh.load(written(tmp_path, cloud, "glb"))
-    np.testing.assert_allclose(scene.bounds[0], (cloud.means * [1, -1, -1]).min(axis=0), rtol=1e-5)
-    (points,) = scene.geometry.values()
-    np.testing.assert_allclose(points.vertices, cloud.means, rtol=1e-6)
-
-
 def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog):
     cloud = random_cloud(6)
     cloud.means[1, 2], cloud.quats_wxyz[4] = np.nan, 0.0
