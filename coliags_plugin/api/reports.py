@@ -77,5 +77,5 @@ def _scene_section(of: Run | str | Path) -> Section:
     from coliags_plugin.reporting.model import Section, Template
 
     run = of if isinstance(of, Run) else Run(of)
-    values = {"page": scene_page(run.load()), "name": f"{run.method} on {run.scene_name}, seed {run.seed}"}
+    values = {"page": scene_page(run.load()).html, "name": f"{run.method} on {run.scene_name}, seed {run.seed}"}
     return Section("Scene", [Template("scene.html", values)], screen_only=True)

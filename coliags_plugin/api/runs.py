@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.export.baking.exporting import Exported
+    from coliags_plugin.export.viewer.saving import ScenePage
     from coliags_plugin.export.viewer.serving import Viewer
     from coliags_plugin.results.record import Result
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
@@ -250,30 +251,36 @@ class Run:
     def export(
         self,
         output: str | Path | None = None,
-        form: str = "ply",
-        *,
+        *formats: str,
         light: str = "mean",
+        seconds: float = 180.0,
         measure: bool = True,
         overwrite: bool = False,
-    ) -> Exported:
-        """Write the run's Gaussians to a file, and a record of what it is and loses to ``FILE.json``.
+    ) -> list[Exported]:
+        """Write the run's Gaussians to files, and a record of what each is and loses to ``FILE.json``.
 
         Args:
-            output: The file; None: ``export/SCENE.FORMAT`` in the run folder.
-            form: ``ply``, ``spz``, ``splat`` or ``glb``.
-            light: ``mean`` or ``flattened``: what is baked into colours that depend on the lamp (docs/export.md 2).
-            measure: Compare the file with the run on the held-out views, for the record.
-            overwrite: Replace a file that is there.
+            output: The file; of several formats, its suffix becomes that of each. None: ``export/SCENE.FORMAT`` in the
+                run folder.
+            formats: Of ``ply``, ``spz``, ``splat`` and ``glb``; none: ``ply``.
+            light: ``recorded``, ``mean`` or ``flattened``, of colours that depend on the lamp (docs/export.md 2).
+            seconds: Time for fitting baked Gaussians to what the run renders, at most, where baking loses much.
+            measure: Compare each file with the run on the held-out views, for the record.
+            overwrite: Replace files that are there.
 
         Raises:
             InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
-                light, or the file exists or cannot be written.
+                light, or a file exists or cannot be written.
         """
         from coliags_plugin.export.baking.exporting import export_run
 
-        trained = self.load()
-        file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
-        return export_run(trained, file, form, light, measure, overwrite)
+        chosen = formats or ("ply",)
+        if output is None:
+            outputs = {form: self.path / "export" / f"{self.scene_name}.{form}" for form in chosen}
+        else:
+            file = Path(output)
+            outputs = {form: file.with_suffix(f".{form}") if len(chosen) > 1 else file for form in chosen}
+        return export_run(self.load(), outputs, light, measure, overwrite, seconds)
 
     def coverage(
         self,
@@ -335,19 +342,27 @@ class Run:
 
         return Viewer(self.load(), host, port)
 
-    def save_view(self, output: str | Path) -> Path:
-        """Write the scene as a page of at most 5 MB that opens in a browser offline (docs/viewer.md 3).
+    def save_view(
+        self, output: str | Path, *, size: int = 5_000_000, light: str = "recorded", seconds: float = 180.0
+    ) -> ScenePage:
+        """Write the scene as a page that opens in a browser offline (docs/viewer.md 3).
 
         Args:
             output: The file; an existing one is replaced.
+            size: Of the page, bytes, at most.
+            light: ``recorded``, ``mean`` or ``flattened``, of colours that depend on the lamp (docs/export.md 2).
+            seconds: Time for fitting its Gaussians to what the run renders, at most.
+
+        Returns:
+            The page, and what it is and loses.
 
         Raises:
-            InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, or the file cannot be
-                written.
+            InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, there is no such light,
+                the page would hold no Gaussian, or the file cannot be written.
         """
         from coliags_plugin.export.viewer.saving import save_page
 
-        return save_page(self.load(), Path(output))
+        return save_page(self.load(), Path(output), size, light, seconds)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

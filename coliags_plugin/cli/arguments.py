@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -114,3 +115,16 @@ def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
     refuse_overlap(output, source)
     if not overwrite and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+
+
+#: Bytes of a unit.
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+
+
+def bytes_of(text: str, option: str) -> int:
+    """A size such as ``20MB`` in bytes; units are powers of 1000."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
+    unit = found and found[2].lower()
+    if found is None or unit not in _UNITS:
+        raise InputError(f"{option} {text}", "a size in bytes, kB, MB or GB, for instance 20MB")
+    return int(float(found[1]) * _UNITS[unit])

@@ -185,14 +185,18 @@ class ExportCommand:
     path: arguments.RunFolder
     """Run folder of a splatting method."""
     output: arguments.OptionalOutput = None
-    """File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json."""
-    light: Literal["mean", "flattened"] = "mean"
-    """Light that is baked into the colours of methods whose colours depend on the lamp: that of the mean training
-    camera, or the same distance and angle everywhere."""
+    """File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json. Of several formats, each has its own
+    suffix."""
+    light: Literal["recorded", "mean", "flattened"] = "mean"
+    """Light that is baked into the colours of methods whose colours depend on the lamp: on average that of the training
+    cameras, as in the video; that of the mean one; or the same distance and angle everywhere."""
+    seconds: float = 180.0
+    """Time for fitting baked Gaussians to what the run renders, at most, where baking loses much."""
     measure: bool = True
-    """Compare the file with the run on the held-out views, for the record."""
-    format: Literal["ply", "spz", "splat", "glb"] = "ply"
-    """PLY as 3DGS writes it, SPZ, .splat, or glTF with KHR_gaussian_splatting. Lengths stay those of the scene (mm)."""
+    """Compare each file with the run on the held-out views, for the record and the terminal."""
+    format: tuple[Literal["ply", "spz", "splat", "glb"], ...] = ("ply",)
+    """Formats, all of one baking: PLY as 3DGS writes it, SPZ, .splat, glTF with KHR_gaussian_splatting. Lengths stay
+    those of the scene (mm)."""
     data: arguments.MovedData = None
     device: arguments.Device = "auto"
     overwrite: arguments.Overwrite = False
@@ -204,9 +208,20 @@ class ExportCommand:
 
         run = load_run(self.path, data=self.data, device=self.device)
         exported = run.export(
-            self.output, self.format, light=self.light, measure=self.measure, overwrite=self.overwrite
+            self.output,
+            *self.format,
+            light=self.light,
+            seconds=self.seconds,
+            measure=self.measure,
+            overwrite=self.overwrite,
         )
-        print_summary(facts=exported.record, written=[exported.file, exported.record_file], as_json=self.json)
+        records = [one.record for one in exported]
+        print_summary(
+            "\n".join(one.text for one in exported),
+            facts=records[0] if len(records) == 1 else {"files": records},
+            written=[path for one in exported for path in (one.file, one.record_file)],
+            as_json=self.json,
+        )
 
 
 @dataclass(frozen=True)
@@ -215,7 +230,13 @@ class ViewCommand:
 
     path: arguments.RunFolder
     output: arguments.OptionalOutput = None
-    """Write the scene to this file instead, as a self-contained HTML page of at most 5 MB, which opens offline."""
+    """Write the scene to this file instead, as a self-contained HTML page, which opens offline."""
+    size: str = "5MB"
+    """Of the page, at most, for instance 20MB."""
+    light: Literal["recorded", "mean", "flattened"] = "recorded"
+    """Of the page, as in `coliags export`."""
+    seconds: float = 180.0
+    """Time for fitting the page's Gaussians to what the run renders, at most."""
     host: str = "127.0.0.1"
     """Name or address to listen on; 0.0.0.0: all of this machine, for anyone who can reach it. From another machine,
     better: ssh -L 8080:localhost:8080 THIS_MACHINE, and open http://localhost:8080 there."""
@@ -231,9 +252,11 @@ class ViewCommand:
         """Serve the run until Ctrl-C, or write the page."""
         from coliags_plugin.api.runs import load_run
 
+        size = arguments.bytes_of(self.size, "--size")
         run = load_run(self.path, data=self.data, device=self.device)
         if self.output is not None:
-            print_summary(written=[run.save_view(self.output)], as_json=self.json)
+            page = run.save_view(self.output, size=size, light=self.light, seconds=self.seconds)
+            print_summary(page.text, page.facts, written=[self.output], as_json=self.json)
             return
         try:
             with run.view(host=self.host, port=self.port) as viewer:

@@ -21,13 +21,18 @@ from coliags_plugin.renderers.splatting import SplattingRenderer
 _CAMERAS = 16
 
 
-def mean_camera(cameras: Sequence[Camera]) -> Camera:
-    """The first camera at the mean position and the mean rotation of all, the one nearest to their mean matrix."""
+def mean_camera(cameras: Sequence[Camera], weights: Sequence[float] | None = None) -> Camera:
+    """The first camera at the mean position and the mean rotation of all, the one nearest to their mean matrix.
+
+    Means are weighted by ``weights``, which add up to 1; without, all count alike.
+    """
     poses = torch.stack([camera.camera_to_world.double() for camera in cameras])
-    left, _, right = torch.linalg.svd(poses[:, :3, :3].mean(0))
+    shares = poses.new_full((len(poses),), 1.0 / len(poses)) if weights is None else poses.new_tensor(weights)
+    mean = torch.einsum("n,nij->ij", shares, poses)
+    left, _, right = torch.linalg.svd(mean[:3, :3])
     rotation = left @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(left @ right))], dtype=left.dtype)) @ right
     pose = torch.eye(4, dtype=poses.dtype)
-    pose[:3, :3], pose[:3, 3] = rotation, poses[:, :3, 3].mean(0)
+    pose[:3, :3], pose[:3, 3] = rotation, mean[:3, 3]
     return replace(cameras[0], camera_to_world=pose)
 
 
@@ -46,22 +51,24 @@ def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
     return FlattenedLight(float(torch.cat(distances).median()), float(torch.cat(cosines).median()))
 
 
-#: Ways to hold the light, by the names that users give them.
-LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight]] = {
+#: Lights for Gaussians of all views, by the names that users give them; none is held where the lamp moves on with
+#: every camera, as in the video.
+LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight | None]] = {
+    "recorded": lambda *_: None,
     "mean": lambda _, cameras: LightOfCamera(mean_camera(cameras)),
     "flattened": flattened_light,
 }
 
 
-def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight:
+def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight | None:
     """The light of a name in :data:`LIGHTS`, for a model of Gaussians and its training cameras."""
     if name not in LIGHTS:
         raise InputError(f"no light '{name}'", f"one of {', '.join(LIGHTS)}", did_you_mean(name, LIGHTS))
     return LIGHTS[name](model, cameras)
 
 
-def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[str]) -> RenderOutput:
-    """What the field and the renderer of a model show of a view under a held light; view modules are left out."""
+def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Sequence[str]) -> RenderOutput:
+    """What field and renderer of a model show of a view under a held light, if any; view modules are left out."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     return renderer.draw(gaussians_under(field, camera, light), camera, wants)
 
@@ -103,4 +110,4 @@ def flatten(trained: TrainedRun) -> TrainedRun:
     splatting_of(trained.model)
     gaussians_of(trained.model)
     cameras = [frame.camera for frame in trained.scene.train]
-    return replace(trained, held=held_light("flattened", trained.model, cameras))
+    return replace(trained, held=flattened_light(trained.model, cameras))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,8 +19,9 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.refinement import adjusted_camera, needs_refinement, refine
+from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field
+from coliags_plugin.export.splats.files import THICKNESS_SHARE
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
 from coliags_plugin.lighting.lamps import HeldLight
@@ -89,6 +91,13 @@ class GaussianAverages:
             raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
         return visible
 
+    def heaviest(self, most: int, share: float = 1.0) -> Int[Tensor, "N"]:
+        """Those of the visible slots with the largest weights, ascending: so many that they hold a share of all. [N]"""
+        visible = self.visible()
+        weights, order = self._weights[visible].double().sort(descending=True, stable=True)
+        below = int((weights.cumsum(0) < share * weights.sum()).sum()) + 1
+        return visible[order[: min(most, below)]].sort().values
+
     def gaussians(self, kept: Int[Tensor, "N"]) -> Gaussians:
         """The averages of some slots, of no view in particular."""
         weights = self._weights[kept][:, None]
@@ -102,6 +111,11 @@ class GaussianAverages:
             visible_sources=kept,
         )
 
+    def _with_thickness(self, log_scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:
+        """Logarithms of scales of surfels with a third one, as files have it; of Gaussians unchanged."""
+        third = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)
+        return torch.cat([log_scales, third], dim=1)[:, :3]
+
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)
         return self._opacities / shown.clamp_min(_NONE)
@@ -113,7 +127,7 @@ class GaussianAverages:
         mean = self.gaussians(kept)
         with torch.no_grad():
             made.means.copy_(mean.means)
-            made.scales.copy_(self._log_scales[kept] / self._weights[kept][:, None])
+            made.scales.copy_(self._with_thickness(self._log_scales[kept] / self._weights[kept][:, None]))
             made.quats.copy_(mean.quats_wxyz)
             made.opacities.copy_(torch.logit(mean.opacities.clamp(1e-4, 1.0 - 1e-4)))
             made.sh0.copy_(harmonics[:, :1])
@@ -123,12 +137,12 @@ class GaussianAverages:
 
 
 @torch.no_grad()
-def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldLight | None = None) -> Gaussians:
+def mean_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Gaussians:
     """The Gaussians of a field for no view in particular: averages over views, weighted by their opacities there.
 
-    Without a light to hold, the lamp of each camera lights them, so that colours are of the average light.
+    The lamp of each camera lights them, so that colours are of the average light.
     """
-    views = [gaussians_under(field, camera, light) for camera in cameras]
+    views = [field.gaussians(camera) for camera in cameras]
     slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
     per_element, scales = field.slots_per_element, views[0].scales.shape[1]
     averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
@@ -139,25 +153,53 @@ def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldL
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
 _VIEWS, _COLOR_VIEWS = 120, 30
+#: Time for fitting Gaussians to what the run renders, seconds, unless another is given.
+SECONDS = 180.0
+#: Share of all blending weights that the Gaussians hold which are fitted to what the run renders.
+_FITTED_SHARE = 0.95
 
 
-def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, Any]]:
-    """One cloud of Gaussians for all views, under a held light, and facts for its record.
+def bake(
+    trained: TrainedRun,
+    light: HeldLight | None,
+    seconds: float = SECONDS,
+    most: int | None = None,
+    degree: int = MAX_DEGREE,
+) -> tuple[SplatCloud, dict[str, Any]]:
+    """One cloud of Gaussians for all views, under a held light, if any, and facts for its record.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
-    that are others in every view, they are refined on the training views
-    (:mod:`~coliags_plugin.export.baking.refinement`).
+    that are others in every view, or where only ``most`` of them may be kept, those with the largest blending weights
+    are fitted to what the run renders, for so many seconds at most
+    (:mod:`~coliags_plugin.export.baking.distillation`).
     """
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
-    field = _averaged(trained, views, light)
-    steps = refine(field, trained, light) if needs_refinement(field, trained, light) else 0
-    return cloud_of_field(field), {"views": len(views), "refinement_steps": steps}
+    averages, seen = _averaged(trained, views, light)
+    kept = averages.kept()
+    visible, steps = len(kept), 0
+
+    def field() -> ExplicitGaussians:
+        return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, degree))
+
+    if most is not None:
+        kept = averages.heaviest(most)
+    made = field()
+    if needs_distillation(made, trained, light):
+        if most is None:
+            kept = averages.heaviest(visible, _FITTED_SHARE)
+            made = field()
+        steps = distil(made, trained, light, seconds)
+    facts = {"views": len(views), "visible": visible, "steps": steps, "seconds": seconds}
+    return cloud_of_field(made), facts
 
 
-def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> ExplicitGaussians:
+def _averaged(
+    trained: TrainedRun, views: list[Frame], light: HeldLight | None
+) -> tuple[GaussianAverages, list[SeenColors]]:
+    """Gaussians of a run averaged over views, and their colours in some of these."""
     field, renderer = gaussians_of(trained.model), splatting_of(trained.model)
-    averages = GaussianAverages(field.element_count, field.slots_per_element, 3, trained.device)
+    averages: GaussianAverages | None = None
     seen: list[SeenColors] = []
     every = -(-len(views) // _COLOR_VIEWS)
     with ProgressReport("bake: average over views", len(views)) as progress:
@@ -166,12 +208,16 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
             with torch.no_grad():
                 gaussians = gaussians_under(field, camera, light)
             weights = blending_weights(renderer, gaussians, camera)
+            if averages is None:
+                sizes = field.element_count, field.slots_per_element, gaussians.scales.shape[1]
+                averages = GaussianAverages(*sizes, trained.device)
             averages.add(gaussians, weights)
             if index % every == 0:
                 seen.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)
-    kept = averages.kept()
-    return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, MAX_DEGREE))
+    if averages is None:
+        raise InputError("no training view", "a run with at least one")
+    return averages, seen
 
 
 #: Added to the normal equations of coefficients above degree 0, whose weights add up to 1: a Gaussian seen along one

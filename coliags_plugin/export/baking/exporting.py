@@ -22,12 +22,13 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.baking import bake
+from coliags_plugin.export.baking.baking import SECONDS, bake
+from coliags_plugin.export.baking.distillation import model_of_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, write_splats
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.lighting.lamps import HeldLight
-from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.reporting.numbers import counted
 
 log = logging.getLogger(__name__)
 
@@ -43,21 +44,35 @@ class Exported:
     record_file: Path
     record: Mapping[str, Any]
 
+    @property
+    def text(self) -> str:
+        """What was written and what it loses, for a person."""
+        record = self.record
+        text = f"{self.file.name}: {record['gaussians']:,} Gaussians, {record['file']['bytes'] / 1e6:.1f} MB"
+        return "; ".join([text, *cost_lines(record["cost"] or {})])
+
 
 def export_run(
-    trained: TrainedRun, output: Path, form: str, light: str, measure: bool = True, overwrite: bool = False
-) -> Exported:
-    """Write the Gaussians of a run to a file, and ``FILE.json`` beside it.
+    trained: TrainedRun,
+    outputs: Mapping[str, Path],
+    light: str,
+    measure: bool = True,
+    overwrite: bool = False,
+    seconds: float = SECONDS,
+) -> list[Exported]:
+    """Write the Gaussians of a run to files by their formats, and ``FILE.json`` beside each.
 
     Explicit fields are written as they are. Fields that decode Gaussians for each view, or light them, are baked
-    (:func:`~coliags_plugin.export.baking.baking.bake`) under a light that is held, given by its name; it has no effect
-    where colours know no lamp. With ``measure``, the file is compared with the run on the held-out views.
+    (:func:`~coliags_plugin.export.baking.baking.bake`) once, under a light that is held, given by its name; it has no
+    effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out views.
     """
-    check_format(form)
-    record_file = output.with_name(f"{output.name}.json")
-    for target in (output, record_file):
-        if target.exists() and not overwrite:
-            raise InputError(f"{target} already exists", "a new file", "Choose another --output, or pass --overwrite")
+    for form, output in outputs.items():
+        check_format(form)
+        for target in (output, _record_file(output)):
+            if target.exists() and not overwrite:
+                raise InputError(
+                    f"{target} already exists", "a new file", "Choose another --output, or pass --overwrite"
+                )
     field = _gaussian_field(trained)
     held: HeldLight | None = None
     baking: dict[str, Any] | None = None
@@ -66,9 +81,30 @@ def export_run(
     else:
         baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
         held = baked_in if knows_lamp(field) else None
-        cloud, facts = bake(trained, baked_in)
-        baking = {"light": held and {"name": light, **held.described}, **facts}
+        cloud, facts = bake(trained, baked_in, seconds)
+        baking = {"light": light_facts(light, field, baked_in), **facts}
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
+    return [_written(trained, cloud, form, output, baking, held, measure) for form, output in outputs.items()]
+
+
+def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
+    """A light for a record; None where the colours of a field know no lamp."""
+    return {"name": name, **(light.described if light else {})} if knows_lamp(field) else None
+
+
+def _record_file(output: Path) -> Path:
+    return output.with_name(f"{output.name}.json")
+
+
+def _written(
+    trained: TrainedRun,
+    cloud: SplatCloud,
+    form: str,
+    output: Path,
+    baking: Mapping[str, Any] | None,
+    held: HeldLight | None,
+    measure: bool,
+) -> Exported:
     unit = trained.scene.length_unit
     comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"
     write_splats(output, cloud, form, comment)
@@ -101,8 +137,8 @@ def export_run(
         "cost": export_cost(trained, kept, held) if measure else None,
         "software": software(),
     }
-    write_json(record_file, record)
-    return Exported(output, record_file, record)
+    write_json(_record_file(output), record)
+    return Exported(output, _record_file(output), record)
 
 
 def _gaussian_field(trained: TrainedRun) -> GaussianField:
@@ -151,8 +187,7 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
         and ``psnr_recorded`` (of the cloud against the frames as recorded).
     """
     scorer = Scorer(trained.config.protocol, _METRICS)
-    renderer = choose_renderer(trained.config.renderer, "gaussians3d", trained.device).renderer
-    baked = Model(field_of_cloud(cloud).to(trained.device), renderer, {}, trained.model.near_plane).eval()
+    baked = model_of_gaussians(field_of_cloud(cloud), trained)
     frames = [(name, frame) for name, of_set in trained.scene.test_sets.items() for frame in of_set]
     rows: dict[str, list[dict[str, dict[str, float]]]] = defaultdict(list)
     with ProgressReport("compare with the run", len(frames)) as progress:
@@ -162,6 +197,16 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
     return {name: _summary(of_set) for name, of_set in rows.items()}
 
 
+def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What Gaussians lose, for every test set whose PSNR is known, in plain text."""
+    return [
+        f"{of_set['export']['psnr']:.2f} dB in that light on {counted(of_set['frames'], 'held-out frame')} ({name}), "
+        f"the run {of_set['run']['psnr']:.2f} dB"
+        for name, of_set in cost.items()
+        if "psnr" in of_set["export"]
+    ]
+
+
 @torch.no_grad()
 def _scores(
     trained: TrainedRun, scorer: Scorer, baked: Model, frame: Frame, light: HeldLight | None
@@ -169,9 +214,7 @@ def _scores(
     """Values by metric, of ``run``, ``export``, ``between`` and ``recorded``."""
     run = scorer.protocol.compare(scorer.render(trained.model, frame), frame)
     export = scorer.protocol.compare(scorer.render(baked, frame), frame)
-    held = run
-    if light is not None:
-        held = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
+    held = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
     at_light = held.rgb + (run.true_rgb - run.rgb)
 
     def values(comparison: Comparison, true_rgb: torch.Tensor) -> dict[str, float]:

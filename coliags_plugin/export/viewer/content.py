@@ -6,25 +6,24 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
 
 from coliags_plugin.contracts import GaussianField, knows_lamp
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.held_light import flattened_light, gaussians_of
+from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.engine.rendering import RGB_ERROR_LIMIT, depth_picture, render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import mean_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.viewer.splats import ViewDecoder, merged_to, shown, wire_unit
+from coliags_plugin.export.viewer.splats import ViewDecoder, most_visible, shown, wire_unit
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.outputs.colormaps import (
@@ -107,10 +106,8 @@ class FramePictures:
 VIEWS = 16
 #: Gaussians beside a view, at most: they are seen only until the next decoding.
 MOST_BESIDE = 40_000
-#: Share of the Gaussians that are near enough to need no smaller cells when they are merged.
-_NEAR_SHARE = 0.2
 
-_NOTHING = SplatCloud(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
+NOTHING = SplatCloud(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
 
 
 @dataclass(frozen=True)
@@ -133,13 +130,12 @@ class ViewerContent:
     def of(cls, trained: TrainedRun) -> ViewerContent:
         """Bake the Gaussians of a run, where its method has any."""
         gaussian_field = trained.model.field
-        baked, decoder = _NOTHING, None
+        baked, decoder = NOTHING, None
         if isinstance(gaussian_field, GaussianField):
             logger.info("decoding the Gaussians of %s", trained.method)
             cameras = [frame.camera.to(trained.device) for frame in trained.scene.train]
             baked = shown(mean_gaussians(gaussian_field, spread(cameras)))
-            beside = merged_to(baked, MOST_BESIDE, distances(baked, cameras))
-            decoder = ViewDecoder(gaussian_field, beside, trained.device)
+            decoder = ViewDecoder(gaussian_field, most_visible(baked, MOST_BESIDE), trained.device)
         else:
             logger.warning(
                 "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
@@ -153,15 +149,12 @@ class ViewerContent:
         vertices = torch.as_tensor(mesh.vertices, dtype=torch.float64)
         seen = [int(frame.camera.to("cpu", torch.float64).sees(vertices)[1].sum()) for frame in trained.scene.train]
         best, video = int(np.argmax(seen)), trained.scene.video
-        return cls(trained, video, _NOTHING, None, FramePictures(trained), wire_unit(_NOTHING), best)
+        return cls(trained, video, NOTHING, None, FramePictures(trained), wire_unit(NOTHING), best)
 
-    def relit_evenly(self) -> ViewerContent:
-        """The same, its Gaussians baked under the flattened light, where their colours know a lamp."""
-        if not self.knows_lamp:
-            return self
-        field = gaussians_of(self.trained.model)
-        cameras = [frame.camera.to(self.trained.device) for frame in self.trained.scene.train]
-        return replace(self, baked=shown(mean_gaussians(field, spread(cameras), self.flattened)))
+    @classmethod
+    def of_cloud(cls, trained: TrainedRun, cloud: SplatCloud, first: int = 0) -> ViewerContent:
+        """Content of some Gaussians of a run; the view starts at a training frame."""
+        return cls(trained, trained.scene.video, cloud, None, FramePictures(trained), wire_unit(cloud), first)
 
     @property
     def knows_lamp(self) -> bool:
@@ -201,22 +194,10 @@ class ViewerContent:
         """The same light everywhere: median distance and angle of what training cameras see; renders some views."""
         return flattened_light(self.trained.model, [frame.camera for frame in self.trained.scene.train])
 
-    @cached_property
-    def distances(self) -> Float[np.ndarray, "N"]:
-        """See :func:`distances`, of the baked Gaussians. [N]"""
-        return distances(self.baked, [frame.camera for frame in self.trained.scene.train])
-
     @property
     def near_plane(self) -> float:
         """z-depth from which on the browser draws, scene units: what renderers use, or a share of the distance."""
         return min(self.first_camera.near_plane, 0.02 * self.look_distance)
-
-
-def distances(splats: SplatCloud, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
-    """Distance of each splat to the nearest camera, scene units, the nearest fifth counted alike. [N]"""
-    centers = np.stack([as_array(camera.center).astype(np.float64) for camera in cameras])
-    nearest = np.asarray(cKDTree(centers).query(splats.means)[0])
-    return np.maximum(nearest, np.quantile(nearest, _NEAR_SHARE)) if len(nearest) else nearest
 
 
 def spread(cameras: Sequence[Camera]) -> list[Camera]:

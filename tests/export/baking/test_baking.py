@@ -13,6 +13,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.engine.held_light import mean_camera
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
+from coliags_plugin.export.baking.distillation import beside
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
@@ -87,6 +88,15 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
     torch.testing.assert_close(field.means, both.means)
 
 
+def test_the_heaviest_gaussians_are_kept():
+    averages = GaussianAverages(6, 1, 3, torch.device("cpu"))
+    averages.add(some_gaussians(6), torch.tensor([3.0, 10.0, 0.0, 1.0, 5.0, 1.0]))
+    assert averages.heaviest(3).tolist() == [0, 1, 4]
+    assert averages.heaviest(9).tolist() == [0, 1, 3, 4, 5]  # one fills no pixel
+    assert averages.heaviest(9, 0.75).tolist() == [1, 4]  # 15 of 20 pixels
+    assert averages.heaviest(1, 0.75).tolist() == [1]
+
+
 def test_nothing_visible_is_an_error():
     averages = GaussianAverages(3, 1, 3, torch.device("cpu"))
     averages.add(some_gaussians(3), torch.zeros(3))
@@ -99,6 +109,20 @@ def test_the_mean_camera_is_between_the_cameras():
     torch.testing.assert_close(mean.center, torch.tensor([2.0, 1.0, 1.0], dtype=torch.float64))
     expected = camera_at(0, 0, 0, yaw=0.1).camera_to_world[:3, :3]
     torch.testing.assert_close(mean.camera_to_world[:3, :3], expected)
+    third = mean_camera([camera_at(0.0, 0.0, 0.0), camera_at(4.0, 0.0, 8.0)], (0.75, 0.25))
+    torch.testing.assert_close(third.center, torch.tensor([1.0, 0.0, 2.0], dtype=torch.float64))
+
+
+def test_cameras_beside_a_path_are_near_it():
+    generator = torch.Generator().manual_seed(0)
+    path = [camera_at(float(x), 0.0, 0.0) for x in range(9)]
+    places = torch.stack([beside(path, generator).center for _ in range(300)])
+    assert 0.25 < float(places[:, 1:].std()) < 0.35  # the steps are 1 mm
+    assert float(places[:, 0].min()) > -1.5 and float(places[:, 0].max()) < 9.5
+    assert len(places[:, 0].round().unique()) >= 9
+    alone = beside(path[:1], generator)
+    torch.testing.assert_close(alone.center, path[0].center)
+    assert alone.camera_to_world.dtype == path[0].camera_to_world.dtype
 
 
 def test_held_lights():

@@ -15,7 +15,7 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.contracts import gaussians_under, knows_lamp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.held_light import flattened_light
-from coliags_plugin.export.baking import refinement
+from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.splats.cloud import field_of_cloud
 from coliags_plugin.export.splats.files import read_splats, write_splats
@@ -48,13 +48,13 @@ def runs(scene, tmp_path_factory):
 
 @pytest.fixture
 def few_steps(monkeypatch):
-    monkeypatch.setattr(refinement, "STEPS", 3)
-    monkeypatch.setattr(refinement, "_MUCH", 0.0)
+    monkeypatch.setattr(distillation, "STEPS", 3)
+    monkeypatch.setattr(distillation, "_MUCH", 0.0)
 
 
 def test_an_imported_export_renders_what_the_run_renders(runs, scene, tmp_path):
     trained = runs("3dgs")
-    exported = trained.export(tmp_path / "wall.ply")
+    (exported,) = trained.export(tmp_path / "wall.ply")
     again = cp.import_splats(exported.file, scene, tmp_path / "imported")
     assert again.method == "3dgs" and again.step == 0
     name = trained.frame_names()[0]
@@ -75,9 +75,11 @@ def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
     trained = runs("coliags", settings=ANCHORS)
     file = tmp_path / "wall.spz"
     assert run("export", trained.path, "--format", "spz", "--output", file, "--light", "flattened") == 0
-    assert str(file) in capsys.readouterr().out
+    printed = capsys.readouterr().out
     record = json.loads((tmp_path / "wall.spz.json").read_text())
-    assert record["baking"]["light"]["name"] == "flattened" and record["baking"]["refinement_steps"] == 3
+    assert str(file) in printed
+    assert f"{record['cost']['test']['export']['psnr']:.2f} dB in that light" in printed
+    assert record["baking"]["light"]["name"] == "flattened" and record["baking"]["steps"] == 3
     assert 0.9 < record["baking"]["light"]["cosine"] <= 1.0
     cost = record["cost"]["test"]
     assert cost["cost"]["psnr"] == pytest.approx(cost["run"]["psnr"] - cost["export"]["psnr"])
@@ -88,7 +90,15 @@ def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
     assert imported.render(imported.frame_names()[0]).rgb.std() > 5
 
 
-def test_refinement_comes_nearer_to_the_frames(runs, monkeypatch):
+def test_several_formats_are_of_one_baking(runs, tmp_path, few_steps):
+    exported = runs("coliags", settings=ANCHORS).export(tmp_path / "wall.any", "ply", "splat", measure=False)
+    assert [one.file.name for one in exported] == ["wall.ply", "wall.splat"]
+    first, second = (read_splats(one.file) for one in exported)
+    assert len(first) == len(second) and "dB" not in exported[0].text
+    np.testing.assert_array_equal(np.sort(first.means, axis=0), np.sort(second.means, axis=0))
+
+
+def test_distillation_comes_nearer_to_the_frames(runs, monkeypatch):
     """The run was hardly trained, and is no better than its averages; frames in its own light are the frames."""
     trained = runs("coliags", settings=ANCHORS).load()
     frame = trained.scene.train[0]
@@ -101,19 +111,20 @@ def test_refinement_comes_nearer_to_the_frames(runs, monkeypatch):
             shown = trained.model.renderer.draw(baked.gaussians(camera), camera, ("rgb", "alpha")).rgb
         return float((shown - frame.rgb).square().mean())
 
-    assert not refinement.needs_refinement(baked, trained, light)
+    assert not distillation.needs_distillation(baked, trained, light)
     before = error()
-    monkeypatch.setattr(refinement, "STEPS", 40)
-    assert refinement.refine(baked, trained, light) == 40
+    assert distillation.distil(baked, trained, light, seconds=0.0) == 0
+    monkeypatch.setattr(distillation, "STEPS", 40)
+    assert distillation.distil(baked, trained, light, seconds=600.0) == 40
     assert error() < 0.9 * before
     with torch.no_grad():
         baked.sh0 += 1.0
-    assert refinement.needs_refinement(baked, trained, light)
+    assert distillation.needs_distillation(baked, trained, light)
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):
     trained = runs("2dgs")
-    cost = trained.export(tmp_path / "wall.ply").record["cost"]["test"]
+    cost = trained.export(tmp_path / "wall.ply")[0].record["cost"]["test"]
     assert cost["psnr_between"] > 25
     thinnest = read_splats(tmp_path / "wall.ply").scales.min(axis=1)
     assert thinnest.min() > 0

@@ -10,54 +10,70 @@ import pytest
 import torch
 
 import coliags_plugin as cp
+from coliags_plugin.cli.arguments import bytes_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.commands import refused, run
 
 pytest.importorskip("viser")
 
+from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.content import ViewerContent
-from coliags_plugin.export.viewer.saving import LARGEST_PAGE, fitting_page, save_page, save_surface, scene_page
+from coliags_plugin.export.viewer.saving import save_surface, scene_page
 
 
-@pytest.fixture(scope="module")
-def content(anchors):
-    return ViewerContent.of(anchors.load())
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    monkeypatch.setattr(distillation, "STEPS", 3)
 
 
 def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, capsys):
-    assert run("view", anchors.path, "--output", tmp_path / "out" / "scene.html") == 0
     page = tmp_path / "out" / "scene.html"
-    assert capsys.readouterr().out.strip() == f"written: {page}"
+    assert run("view", anchors.path, "--output", page, "--size", "4.5MB") == 0
     text = page.read_text(encoding="utf-8")
-    assert len(text.encode()) < LARGEST_PAGE
-    assert "<title>coliags on wall</title>" in text and "step 2; flattened light" in text
-    assert "__VISER_EMBED_DATA__" in text and "merged" not in text
+    assert len(text.encode()) < 4_500_000
+    told, written = capsys.readouterr().out.strip().splitlines()
+    assert written == f"written: {page}" and f"{told}</div>" in text
+    assert re.search(
+        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", told
+    )
+    assert "<title>coliags on wall</title>" in text
+    assert "__VISER_EMBED_DATA__" in text
     assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
     assert set(re.findall(r"https?://[\w./-]+", text)) <= {"http://www.w3.org/2000/svg"}
 
 
-def empty_size(content):
-    """Of a page without Gaussians, bytes."""
+def test_a_small_page_has_the_most_visible_gaussians(anchors):
+    trained = anchors.load()
+    whole = scene_page(trained)
+    assert whole.facts["gaussians"] == whole.facts["baking"]["visible"]
     with pytest.raises(InputError) as error:
-        fitting_page(content, 1000)
-    return int(re.search(r"more than (\d+) bytes", str(error.value))[1])
+        scene_page(trained, 1000)
+    empty = int(re.search(r"more than (\d+) bytes", str(error.value))[1])
+    largest = empty + 14 * whole.facts["gaussians"]  # room for about half of them
+    small = scene_page(trained, largest)
+    assert len(small.html.encode()) <= largest
+    assert 0.4 < small.facts["gaussians"] / whole.facts["gaussians"] < 0.6
+    assert small.facts["cost"]["test"]["export"]["psnr"] > 10
 
 
-def test_too_many_gaussians_are_merged(content):
-    whole, page = fitting_page(content, LARGEST_PAGE)
-    assert len(whole) == len(content.baked)
-    empty, full = empty_size(content), len(page.encode())
-    largest = empty + int(0.7 * (full - empty))
-    fewer, smaller = fitting_page(content, largest)
-    assert len(smaller.encode()) <= largest
-    assert 0.4 * len(whole) < len(fewer) < len(whole)
-    assert f"{len(whole):,} Gaussians merged into {len(fewer):,}" in smaller
+@pytest.mark.parametrize(
+    ("text", "size"), [("20MB", 20_000_000), ("1.5 mb", 1_500_000), ("800kB", 800_000), ("5000", 5000), ("7b", 7)]
+)
+def test_sizes(text, size):
+    assert bytes_of(text, "--size") == size
+
+
+@pytest.mark.parametrize("text", ["", "MB", "-5MB", "5 MiB", "five"])
+def test_what_is_no_size(text):
+    with pytest.raises(InputError, match="a size in bytes, kB, MB or GB"):
+        bytes_of(text, "--size")
 
 
 def test_what_cannot_be_saved(anchors, tmp_path, capsys):
-    with pytest.raises(InputError, match="a page of 1000 bytes"):
-        save_page(anchors.load(), tmp_path / "a.html", largest=1000)
+    assert "a page of 1000 bytes" in refused(
+        capsys, "view", anchors.path, "--output", tmp_path / "a.html", "--size", "1kB"
+    )
     assert "is a folder" in refused(capsys, "view", anchors.path, "--output", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -80,8 +96,8 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
 
 
 def test_a_page_of_a_method_without_a_lamp_speaks_of_no_light(run_of):
-    text = scene_page(run_of("3dgs").load())
-    assert "step 2</div>" in text and "flattened" not in text
+    text = scene_page(run_of("3dgs").load()).text
+    assert "Gaussians; " in text and "recorded light" not in text
 
 
 def test_a_surface_is_seen_first_from_where_most_of_it_is_in_view(anchors, tmp_path):

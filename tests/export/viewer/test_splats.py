@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.export.viewer.splats import on_wire, shown, wire_unit
+from coliags_plugin.export.viewer.splats import CENTRE_STEP, most_visible, off_wire, on_wire, rounded, shown, wire_unit
 from tests.export.splats.clouds import covariances
 from tests.export.viewer.made import some_gaussians
 
@@ -42,6 +42,27 @@ def test_half_precision_holds_scenes_of_every_unit_of_length(exponent):
     expected = covariances(shown(gaussians)) * factor**2
     np.testing.assert_allclose(halves, expected, atol=5e-3 * np.abs(expected).max())
     np.testing.assert_allclose(sent["centers"] * unit, scaled.means, rtol=1e-6)
+
+
+def test_what_is_rounded_for_a_page_is_nearly_the_same():
+    splats = shown(some_gaussians(200))
+    unit = wire_unit(splats)
+    page = off_wire(rounded(on_wire(splats, unit)), unit)
+    np.testing.assert_allclose(page.means, splats.means, atol=0.51 * CENTRE_STEP * unit)
+    largest = np.abs(splats.covariances).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(page.covariances / largest, splats.covariances / largest, atol=2.0**-5)
+    np.testing.assert_allclose(page.opacities, splats.opacities, atol=0.51 / 255)
+    np.testing.assert_allclose(page.colors, splats.colors, atol=0.51 / 255)
+
+
+def test_the_most_visible_are_the_opaque_and_large_ones():
+    gaussians = some_gaussians(4)
+    gaussians.scales[:] = torch.tensor([[1.0, 2.0, 0.1], [1.0, 1.0, 0.9], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]])
+    gaussians.opacities[:] = torch.tensor([0.5, 0.9, 0.1, 0.8])  # they cover 1, 0.9, 0.6 and 0.8
+    splats = shown(gaussians)
+    np.testing.assert_array_equal(most_visible(splats, 2).means, splats.means[:2])
+    np.testing.assert_array_equal(most_visible(splats, 3).means, splats.means[[0, 1, 3]])
+    assert len(most_visible(splats, 9)) == 4
 
 
 def test_millimetres_stay_near_millimetres():

@@ -1,0 +1,187 @@
+"""Gaussians for all views, fitted to what a run renders along and around its cameras' path in a held light."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from coliags_plugin.contracts import log_linear
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import NotFiniteError
+from coliags_plugin.core.masked import masked_mean
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import mean_camera, render_held, splatting_of
+from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.randomness import generators
+from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
+from coliags_plugin.lighting.lamps import HeldLight
+from coliags_plugin.renderers.choice import choose_renderer
+
+#: Steps, one view each, that are taken where the time allows.
+STEPS = 3000
+#: Adam's rates by parameter group at the first step; centres' in pixels on the surface. At the last step they are
+#: _LAST of that.
+_RATES = {"means": 0.06, "scales": 0.03, "quats": 0.015, "opacities": 0.15, "sh0": 0.015, "shN": 0.00075}
+_LAST = 0.06
+#: Weights of squared colour errors, and of depth errors in pixels on the surface, beside absolute colour errors.
+_SQUARED, _DEPTH = 200.0, 0.004
+#: Share of the steps on views beside the training views.
+_BESIDE = 0.2
+#: Of such a view: standard deviation of its place, median distances between neighbouring cameras, and of its rotation,
+#: radians.
+_SHIFT, _TURN = 0.3, 0.03
+#: Training views, at most, that Gaussians are compared on; and how much larger their squared error may be: 0.2 dB.
+_COMPARED, _MUCH = 8, 1.047
+#: Memory for targets of training views.
+_TARGET_BYTES = 1 << 30
+_WANTS = ("rgb", "alpha", "depth_accumulated")
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A view in the held light."""
+
+    camera: Camera
+    rgb: Float[Tensor, "H W 3"]
+    depth: Float[Tensor, "H W"]  # accumulated depth that the run renders
+    mask: Bool[Tensor, "H W"] | None = None
+
+
+def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float) -> int:
+    """Fit Gaussians, in place, to what a run shows in a held light, for so long at most; returns the steps taken.
+
+    Most of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
+    the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
+    renders beside them: between neighbouring cameras, moved and turned a little.
+    """
+    renderer = splatting_of(model_of_gaussians(field, trained))
+    unit = trained.scene.pixel_footprint
+    unit = unit if unit > 0 else 1.0  # without points it is NaN
+    rates = {**_RATES, "means": _RATES["means"] * unit}
+    groups = [{"params": [getattr(field, name)], "name": name} for name in rates]
+    adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    frames = _some_frames(trained.scene.train)
+    cameras = [adjusted_camera(trained, frame) for frame in trained.scene.train]
+    targets: dict[int, _Target] = {}
+    order: list[int] = []
+    chance = generators(trained.seed)["frame_order"]
+    start, step = time.monotonic(), 0
+    with ProgressReport("fit to what the run renders", STEPS) as progress:
+        while (done := max(step / STEPS, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
+            step += 1
+            if float(torch.rand((), generator=chance)) < _BESIDE:
+                camera = beside(cameras, chance)
+                held = _held(trained, camera, light)
+                target = _Target(camera, held[0], held[1])
+            else:
+                order = order or torch.randperm(len(frames), generator=chance).tolist()
+                index = order.pop()
+                if index not in targets:
+                    targets[index] = _target(trained, frames[index], light)
+                target = targets[index]
+            output = renderer.draw(field.gaussians(target.camera), target.camera, _WANTS)
+            errors = output.rgb - target.rgb
+            colors = masked_mean(errors.abs() + _SQUARED * errors.square(), target.mask)
+            depths = (output["depth_accumulated"] - target.depth).abs().mean() / unit
+            loss = colors + _DEPTH * depths
+            if not torch.isfinite(loss):
+                raise NotFiniteError(f"baking, step {step}: the loss is {float(loss)}")
+            adam.zero_grad(set_to_none=True)
+            torch.autograd.backward(loss)
+            for group in adam.param_groups:
+                group["lr"] = log_linear(rates[group["name"]], _LAST * rates[group["name"]], done)
+            adam.step()
+            progress.update(max(step, int(done * STEPS)), f"loss {float(loss.detach()):.4f}")
+    return step
+
+
+def beside(cameras: Sequence[Camera], generator: torch.Generator) -> Camera:
+    """A random camera between two neighbours of a path, moved and turned a little; of a single camera, beside it."""
+    index = int(torch.randint(max(1, len(cameras) - 1), (), generator=generator))
+    pair = cameras[index : index + 2]
+    share = float(torch.rand((), generator=generator))
+    steps = [float((a.center - b.center).norm()) for a, b in pairwise(cameras)]
+    length = sorted(steps)[len(steps) // 2] if steps else 0.0
+    between = mean_camera(pair, (1.0 - share, share)[: len(pair)])
+    turn, shift = (size * torch.randn(3, generator=generator) for size in (_TURN, _SHIFT * length))
+    like = cameras[0].camera_to_world
+    moved = between.moved(turn, shift, 0.0)
+    return replace(moved, camera_to_world=moved.camera_to_world.to(like))
+
+
+def _some_frames(frames: list[Frame]) -> list[Frame]:
+    """Evenly spaced frames, so many that their targets fit into memory."""
+    height, width = frames[0].camera.height, frames[0].camera.width
+    count = max(1, _TARGET_BYTES // (16 * height * width))
+    return frames[:: -(-len(frames) // count)]
+
+
+def needs_distillation(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> bool:
+    """Whether Gaussians miss training frames in a light by more than the run does."""
+    errors = _errors(field, trained, light, trained.scene.train[:: -(-len(trained.scene.train) // _COMPARED)])
+    own, baked = errors.mean(0).tolist()
+    return bool(baked > _MUCH * own)
+
+
+def best_frame(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> int:
+    """Index of a training frame, of some, that Gaussians show best in comparison with the run."""
+    every = -(-len(trained.scene.train) // (2 * _COMPARED))
+    own, baked = _errors(field, trained, light, trained.scene.train[::every]).unbind(1)
+    return every * int((baked / own.clamp_min(1e-12)).argmin())
+
+
+@torch.no_grad()
+def _errors(
+    field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, frames: Sequence[Frame]
+) -> Float[Tensor, "F 2"]:
+    """Mean squared errors of the run and of Gaussians on training frames brought to a light. [F, 2]"""
+    renderer = splatting_of(model_of_gaussians(field, trained))
+    rows = []
+    for frame in frames:
+        target = _target(trained, frame, light)
+        held, _ = _held(trained, target.camera, light)
+        shown = renderer.draw(field.gaussians(target.camera), target.camera, ("rgb", "alpha")).rgb
+        rows.append(torch.stack([masked_mean((rgb - target.rgb).square(), target.mask) for rgb in (held, shown)]))
+    return torch.stack(rows)
+
+
+@torch.no_grad()
+def _target(trained: TrainedRun, frame: Frame, light: HeldLight | None) -> _Target:
+    placed = frame.to(trained.device)
+    camera = adjusted_camera(trained, frame)
+    rgb, depth = _held(trained, camera, light)
+    missed = placed.rgb - render_view(trained, placed, ("rgb", "alpha")).rgb
+    return _Target(camera, rgb + missed, depth, placed.mask)
+
+
+@torch.no_grad()
+def _held(
+    trained: TrainedRun, camera: Camera, light: HeldLight | None
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Colours and accumulated depth that a run renders in the held light."""
+    output = render_held(trained.model, camera, light, _WANTS)
+    return output.rgb, output["depth_accumulated"]
+
+
+def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:
+    """Gaussians for all views, of a run of whatever splatting method, with a renderer of Gaussians."""
+    renderer = choose_renderer(trained.config.renderer, "gaussians3d", trained.device).renderer
+    return Model(field, renderer, {}, trained.model.near_plane).to(trained.device).eval()
+
+
+@torch.no_grad()
+def adjusted_camera(trained: TrainedRun, frame: Frame) -> Camera:
+    """Camera of a training frame, as the run's view modules adjust it, float32 on the run's device."""
+    camera = trained.model.placed(frame.camera.to(trained.device))
+    for module in trained.model.view_modules.values():
+        camera = module.adjust_camera(camera, frame.view(trained=True))
+    return camera.to(dtype=torch.float32)
