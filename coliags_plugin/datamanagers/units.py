@@ -12,15 +12,15 @@ from coliags_plugin.geometry.poses.formats import shortened
 
 Unit = Literal["mm", "unknown"]
 
-#: The file that states the unit, in the scene's folder; without it the unit is the millimetre.
+#: The file that states the unit, in the scene's folder; without it the unit is that of the dataset's format.
 UNIT_FILE = "unit.txt"
 
 
-def read_unit(folder: Path) -> Unit:
-    """The unit of the poses and depth of the scene in a folder."""
+def read_unit(folder: Path, otherwise: Unit = "mm") -> Unit:
+    """The unit of the poses and depth of the scene in a folder; ``otherwise``: that of a folder that states none."""
     path = folder / UNIT_FILE
     if not path.is_file():
-        return "mm"
+        return otherwise
     word = read_text(path, "the unit of length").strip()
     if word not in get_args(Unit):
         raise InputError(f"{path}: '{shortened(word)}'", " or ".join(get_args(Unit)), "Correct or remove the file")

@@ -17,6 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
 from coliags_plugin.datamanagers.colmap.reader import ColmapDataManager, ColmapSettings
 from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 from tests.datamanagers.colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_model, write_colmap
 from tests.datamanagers.wall_scenes import look, off_wall, poses
@@ -126,6 +127,12 @@ def test_scale_makes_millimetres(tmp_path):
     torch.testing.assert_close(raw.train[2].sparse_depth.depth * 25.0, frame.sparse_depth.depth)
     torch.testing.assert_close(raw.train[2].sparse_depth.pixels, frame.sparse_depth.pixels)
     assert metric.provenance["scale"] == 25.0
+
+
+def test_the_unit_is_unknown_until_it_is_stated(folder):
+    assert not load(folder).is_metric
+    write_unit(folder, "mm")
+    assert load(folder).is_metric
 
 
 def test_cameras_of_different_sizes_each_have_their_view(tmp_path):

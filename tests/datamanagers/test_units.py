@@ -10,8 +10,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.units import printed_unit, read_unit, write_unit
 
 
-def test_a_scene_is_in_millimetres_where_nothing_is_stated(tmp_path: Path) -> None:
+def test_the_unit_is_that_of_the_format_where_nothing_is_stated(tmp_path: Path) -> None:
     assert read_unit(tmp_path) == "mm"
+    assert read_unit(tmp_path, otherwise="unknown") == "unknown"
 
 
 @pytest.mark.parametrize("unit", ["mm", "unknown"])

@@ -65,7 +65,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     yield model.Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
     yield model.Fact("pose convention", _convention(data.get("pose_convention")))
     unit = data.get("unit", "mm")
-    yield model.Fact("unit of length", str(unit))
+    yield model.Fact("unit of length", "mm" if unit == "mm" else "unknown (unit.txt with mm states it)")
     if depth := check.depth:
         values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
         unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"

@@ -65,6 +65,9 @@ def read_atlas(scene: Path) -> AtlasRecord | None:
 
 
 def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:
-    """Unit of length of one of a scene's models: from its atlas if that lists the model, else from ``unit.txt``."""
+    """Unit of length of one of a scene's models: from its atlas if that lists the model, else from ``unit.txt``.
+
+    COLMAP's own models are of an arbitrary scale: unknown where neither states it.
+    """
     units = {} if atlas is None else {scene / stretch.model: stretch.unit for stretch in atlas.submaps}
-    return units.get(model) or read_unit(scene)
+    return units.get(model) or read_unit(scene, otherwise="unknown")

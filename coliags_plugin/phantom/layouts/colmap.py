@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.geometry.poses.rigid import inverse
@@ -18,7 +19,7 @@ _SEEN_IN_ONE_OF = 3
 
 
 class ColmapLayout(Layout):
-    """images/ and a binary model of one PINHOLE camera in sparse/0, its points with the images they are seen in."""
+    """images/, unit.txt and a binary model of one PINHOLE camera in sparse/0, its points with their images."""
 
     has_points = True
 
@@ -43,6 +44,7 @@ class ColmapLayout(Layout):
             observations.append(SeenPoints(lens.project(local), indices))
         add_points(model, observations, points.positions[kept], points.colors[kept])
         write_model(folder, model)
+        write_unit(folder, "mm")
 
 
 def _name(index: int) -> str:
