@@ -64,12 +64,12 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"
     yield model.Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
     yield model.Fact("pose convention", _convention(data.get("pose_convention")))
-    unit = data.get("unit", "mm")
-    yield model.Fact("unit of length", "mm" if unit == "mm" else "unknown (unit.txt with mm states it)")
+    unit = scene.length_unit
+    yield model.Fact("unit of length", unit if scene.is_metric else "unknown (unit.txt with mm states it)")
     if depth := check.depth:
         values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
         unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"
-        yield model.Fact("depth", f"{values}{' mm' if unit == 'mm' else ''}; {unknown}")
+        yield model.Fact("depth", f"{values} {unit}; {unknown}")
     else:
         yield model.Fact("depth", "none")
     if path := check.path:
@@ -102,7 +102,8 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
             f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; medians "
             "over all pixels. If the given poses are not the best row, they are suspect."
         )
-        head = ["depth error, %", "depth error, mm", "colour error, grey levels", "projects into the image, %"]
+        lengths = f"depth error, {check.scene.length_unit}"
+        head = ["depth error, %", lengths, "colour error, grey levels", "projects into the image, %"]
         rows = [
             [
                 name,

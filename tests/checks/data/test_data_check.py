@@ -120,7 +120,9 @@ def test_everything_in_metres(scene):
     assert "depth looks like metres" in findings
     assert "different units" not in findings
     unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
-    assert [finding.what for finding in check_scene(unknown).findings] == ["depth is beside the near plane"]
+    check = check_scene(unknown)
+    assert [finding.what for finding in check.findings] == ["depth is beside the near plane"]
+    assert "depth error, units" in (text := page_text(check_page(check))) and " mm;" not in text
 
 
 def test_depth_of_other_frames(frames):
