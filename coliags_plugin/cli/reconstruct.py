@@ -39,7 +39,7 @@ class ReconstructCommand:
     method: arguments.OptionalText = None
     """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
     steps: arguments.OptionalInt = None
-    """Training steps of the largest sub-map; default 2000. Smaller ones get fewer (docs/reconstruct.md 1)."""
+    """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
     set: arguments.Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""

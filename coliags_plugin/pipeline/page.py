@@ -12,8 +12,8 @@ from urllib.parse import quote
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
-from coliags_plugin.pipeline.submaps import Submap
-from coliags_plugin.pipeline.training_stages import SURFACE
+from coliags_plugin.pipeline.submaps import LARGEST, Submap
+from coliags_plugin.pipeline.training_stages import PICTURES, SCENE
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.model import (
     Block,
@@ -40,6 +40,8 @@ from coliags_plugin.reporting.numbers import area_text, duration
 
 #: Held-out views shown of each sub-map, beside the worst.
 _VIEWS = 6
+#: Pictures of a frame, in order.
+_KINDS = ("recorded.png", "depth.png", "flattened light.png")
 #: Rows of the table of stretches above which it is folded.
 _LONG = 12
 #: What else is told of the held-out PSNR.
@@ -184,20 +186,21 @@ def _remarks(record: Record) -> Iterator[Block]:
 
 
 def write_index(record: Record, posed: Path, title: str) -> None:
-    """Write ``index.html`` for a reconstruction from the scene ``posed``; its pictures are beside it."""
+    """Write ``index.html`` for a reconstruction from the scene ``posed``: one file that opens offline."""
     results = results_of(record)
     atlas = read_atlas(posed)
     spans = {} if atlas is None else _spans(atlas)
     sections = [
+        Section("Scene", list(_scenes(record.folder, results))),
         Section("Video", list(_video(record, atlas, posed))),
-        Section("Sub-maps", [submap_table(results, spans), *_remarks(record)]),
-        Section("Surfaces", _surfaces(results)),
+        Section("Depth and light", list(_pictures(record.folder, results))),
         *_views(record.folder, results),
+        Section("Sub-maps", [submap_table(results, spans), *_remarks(record)]),
         Section("Files", list(_files(record, results))),
         Section("Stages", [_stage_table(record)]),
     ]
     page = Page(title, sections, list(_facts(record, results, atlas)), "For research use only.", remarks(record))
-    write_html(page, record.folder / PAGE_FILE, limit=0)
+    write_html(page, record.folder / PAGE_FILE)
 
 
 def _facts(record: Record, results: Sequence[SubmapResults], atlas: AtlasRecord | None) -> Iterator[Fact]:
@@ -261,21 +264,37 @@ def _stretches(atlas: AtlasRecord, reconstructed: set[int]) -> Iterator[Sequence
         yield [str(first) if first == last else f"{first} to {last}", len(frames), key[0], why]
 
 
-def _surfaces(results: Sequence[SubmapResults]) -> list[Block]:
-    shown = [
-        (one.submap.title, quote(path))
-        for one in results
-        if "mesh" in one.stages
-        for path, what in one.stages["mesh"].files.items()
-        if what == SURFACE
+def _scenes(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
+    """The pages to fly through, within this one."""
+    found = [
+        (title, quote(path), (folder / path).read_text(encoding="utf-8"))
+        for title, path in _made(folder, results, SCENE)
     ]
-    if not shown:
-        return [Paragraph("The surfaces are among the files. To turn them here: pip install 'coliags_plugin[viewer]'.")]
-    text = (
-        "Seen first from the frame that has most of it in view. Drag to turn, drag with the right button to move, "
-        "scroll to come nearer; the button at the top right shows the cameras."
-    )
-    return [Paragraph(text), Template("surfaces.html", {"surfaces": shown})]
+    if found:
+        yield Template("scenes.html", {"scenes": found})
+
+
+def _pictures(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
+    """Frames, their depth and the wall in flattened light, side by side."""
+    for title, path in _made(folder, results, PICTURES):
+        rows = [
+            Figures(
+                [Image(EncodedImage.png(read_rgb(file)), file.stem) for kind in _KINDS for file in frame.glob(kind)]
+            )
+            for frame in sorted((folder / path).iterdir())
+        ]
+        yield Folded(title, [row for row in rows if row.figures], is_open=title == LARGEST.title)
+
+
+def _made(folder: Path, results: Sequence[SubmapResults], what: str) -> list[tuple[str, str]]:
+    """Title of each sub-map, and path of what its page shows."""
+    return [
+        (one.submap.title, path)
+        for one in results
+        if "scene" in one.stages
+        for path, kind in one.stages["scene"].files.items()
+        if kind == what and (folder / path).exists()
+    ]
 
 
 def _views(folder: Path, results: Sequence[SubmapResults]) -> list[Section]:

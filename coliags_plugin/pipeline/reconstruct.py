@@ -105,6 +105,7 @@ def _submap_stages(context: StageContext, source: Mapping[str, Any]) -> list[Sta
     add(training_stages.evaluate, "evaluate", {}, "run/eval")
     add(training_stages.mesh, "mesh", {"mesh": settings.mesh.model_dump()}, "run/mesh")
     add(training_stages.coverage, "coverage", {"coverage": settings.coverage.model_dump()}, "run/coverage")
+    add(training_stages.show, "scene", {}, "run/scene.html", "run/pictures")
     add(training_stages.report, "report", {}, "report.html")
     return stages
 

@@ -76,8 +76,8 @@ class ReconstructionSettings(Settings):
     steps: int = Field(
         default=2000,
         ge=1,
-        description="Training steps of the largest model; a further model of fewer than 100 frames gets less in "
-        "proportion, but at least a quarter.",
+        description="Training steps of 100 frames; a model of other size gets more or fewer in proportion, at most "
+        "twice as many, at least a quarter, the largest model at least these.",
     )
     mesh: MeshSettings = MeshSettings()
     """Fusion of the rendered depth into a mesh."""

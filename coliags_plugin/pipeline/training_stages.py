@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from coliags_plugin.config.method_config import method_name
@@ -13,14 +12,20 @@ from coliags_plugin.pipeline.stages import StageOutcome
 from coliags_plugin.reporting.numbers import area_text
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.results.record import Result
 
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
-#: What a file is that shows the surface in a browser.
-SURFACE = "the surface to turn in a browser"
+#: What the results are that the page shows: of scenes, and of frames beside depth and flattened light.
+SCENE, PICTURES = "the scene to fly through: Gaussians, surface, coverage", "frames, depth, flattened light"
+#: Largest page of a scene, bytes, and time for fitting its Gaussians, seconds: of the largest sub-map and of others.
+_PAGES = {True: (10_000_000, 90.0), False: (4_000_000, 30.0)}
+#: Frames that are shown with their depth.
+_PICTURED = 4
 #: Training views that are evaluated, for comparison with those held out.
 _TRAINING_VIEWS = 16
 #: Frames of a sub-map that get the steps of the settings; least share of them, and most (docs/reconstruct.md 5).
@@ -121,11 +126,6 @@ def mesh(context: StageContext) -> StageOutcome:
     area = made.mesh.areas.sum()
     shown = area_text(area, trained.scene.is_metric)
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
-    if find_spec("viser") is not None:
-        from coliags_plugin.export.viewer.saving import save_surface
-
-        save_surface(trained, made.mesh, context.run / "mesh" / "surface.html")
-        files["run/mesh/surface.html"] = SURFACE
     figures = {"triangles": len(made.mesh), "area": float(area), "unit": trained.scene.length_unit}
     return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
 
@@ -149,6 +149,36 @@ def coverage(context: StageContext) -> StageOutcome:
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
         figures={name: values[name] for name in ("seen", "seen_area") if values[name] is not None},
     )
+
+
+def show(context: StageContext) -> StageOutcome:
+    """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
+    from coliags_plugin.engine.trained import load_trained
+    from coliags_plugin.export.viewer.saving import save_page
+
+    trained = load_trained(context.run, context.device, context.scene)
+    _write_pictures(trained, context.run / "pictures")
+    size, seconds = _PAGES[context.submap.number == 0]
+    page = save_page(trained, context.run / "scene.html", size, "recorded", seconds)
+    return StageOutcome(page.text, {"run/scene.html": SCENE, "run/pictures": PICTURES})
+
+
+def _write_pictures(trained: TrainedRun, folder: Path) -> None:
+    """Some frames of the video, as recorded, their depth, and in flattened light where colours know the lamp."""
+    from coliags_plugin.comparison.report.view_pixels import evenly
+    from coliags_plugin.contracts import knows_lamp
+    from coliags_plugin.engine.held_light import flatten
+    from coliags_plugin.export.viewer.content import FramePictures
+    from coliags_plugin.outputs.image_files import write_png
+
+    pictures = FramePictures(trained)
+    flat = FramePictures(flatten(trained)) if knows_lamp(trained.model.field) else None
+    for index in evenly(len(trained.scene.video), _PICTURED):
+        frame = trained.scene.video[index]
+        write_png(folder / frame.name / "recorded.png", frame.image)
+        write_png(folder / frame.name / "depth.png", pictures.of(frame, "depth").image)
+        if flat is not None:
+            write_png(folder / frame.name / "flattened light.png", flat.of(frame, "render").image)
 
 
 def report(context: StageContext) -> StageOutcome:

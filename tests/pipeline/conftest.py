@@ -17,7 +17,8 @@ from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from tests.pipeline.films import film
 from tests.textured_tube import tube_frames
 
-CAPTURE, TRAINING = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
+CAPTURE = ("make_poses", "check_data", "estimate_depth")
+TRAINING = ("train", "evaluate", "mesh", "coverage", "show", "report")
 
 
 #: Frames of the models, along the video; the last is too small.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table, write_index
 from coliags_plugin.pipeline.stages import Record, StageRecord
-from coliags_plugin.pipeline.training_stages import SURFACE
+from coliags_plugin.pipeline.training_stages import PICTURES, SCENE
 from coliags_plugin.reporting.terminal import terminal_text
 from tests.browser import Browser, find_chromium
 
-SURFACE_FILE = "run/mesh/surface.html"
+SCENE_FILE, FOLDER = "run/scene.html", "run/pictures"
 
 
 def done(files=(), warnings=(), **figures):
@@ -30,12 +31,14 @@ def record_in(folder):
         "check": done({"check.html": "check"}, ["suspect: the camera jumps. Check it"], frames=14),
         "train": done(steps=2000),
         "evaluate": done(psnr=24.0, ssim=0.85, held_out=2, psnr_training=27.5, psnr_between=26.0),
-        "mesh": done({SURFACE_FILE: SURFACE}, area=4200.0, unit="mm"),
+        "mesh": done(area=4200.0, unit="mm"),
+        "scene": done({SCENE_FILE: SCENE, FOLDER: PICTURES}),
         "coverage": done(seen=0.625),
         "submap-1/check": done({"submap-1/check.html": "check"}, frames=12),
         "submap-1/train": done(steps=500),
         "submap-1/evaluate": done(psnr=22.0, ssim=0.8, held_out=2, psnr_training=23.5),
-        "submap-1/mesh": done({f"submap-1/{SURFACE_FILE}": SURFACE}, area=900.0, unit="units"),
+        "submap-1/mesh": done(area=900.0, unit="units"),
+        "submap-1/scene": done({f"submap-1/{SCENE_FILE}": SCENE}),
         "submap-1/coverage": done(seen_area=800.0),
         "submap-2/check": done(frames=5),
         "submap-2/depth": StageRecord({}, "failed", "no surface that 5 frames agree on. Check the poses."),
@@ -76,6 +79,13 @@ def test_what_failed_and_what_is_suspect_is_said_with_what_to_do(tmp_path):
 
 @pytest.fixture
 def page(atlas, tmp_path):
+    out = tmp_path / "out"
+    for number, folder in enumerate((out, out / "submap-1")):
+        (folder / SCENE_FILE).parent.mkdir(parents=True)
+        (folder / SCENE_FILE).write_text(f"<title>scene {number}</title>")
+    for kind in ("recorded", "depth", "flattened light"):
+        write_png(out / FOLDER / "a1" / f"{kind}.png", np.full((4, 4, 3), len(kind), np.uint8))
+
     def written(record=None):
         write_index(record or record_in(tmp_path / "out"), atlas, "Reconstruction of film.mp4")
         return (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
@@ -93,24 +103,25 @@ def test_the_page_tells_which_frames_have_a_pose_and_why_others_have_none(page, 
     assert "2 reconstructed of 3 (1 failed)" in text
     assert "apart from what follows: 7 points are seen from both sides" in text
     assert "blurred" in text
-    assert "index_files/" in text  # the ribbon is beside the page
+    assert "data:image/png" in text and "index_files/" not in text  # all in one file
 
 
-def test_the_page_shows_one_surface_of_all(page):
+def test_the_page_holds_all_scenes_and_pictures(page):
     text = page()
-    assert f'<option value="{SURFACE_FILE}">sub-map 0</option>' in text
-    assert f'<option value="submap-1/{SURFACE_FILE}">sub-map 1</option>' in text
-    assert text.count("<iframe") == 1
+    assert text.count("<iframe") == 2 and text.count('data-page="&lt;title&gt;') == 2
+    assert text.index("sub-map 0</option>") < text.index("sub-map 1</option>")
+    for kind in ("recorded", "depth", "flattened light"):
+        assert text.count(f'<div class="name">{kind}</div>') == 1
     assert "the camera jumps" in text
-    assert "data:image" not in text
+    assert text.index("<h2>Scene") < text.index("<h2>Depth and light") < text.index("<h2>Sub-maps")
 
 
-def test_the_page_does_without_atlas_and_surfaces(page, atlas, tmp_path):
+def test_the_page_does_without_atlas_and_scenes(page, atlas, tmp_path):
     shutil.rmtree(atlas)
     record = record_in(tmp_path / "out")
     record.stages = {"check": done({"check.html": "check"}, frames=14), "train": done()}
     text = page(record)
-    assert "pip install" in text
+    assert "<iframe" not in text
     assert "Frames with a pose" not in text
     assert "sub-map 1" not in text
 
@@ -118,19 +129,17 @@ def test_the_page_does_without_atlas_and_surfaces(page, atlas, tmp_path):
 @pytest.mark.thorough
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1400, 390])
-def test_another_surface_is_chosen_in_a_browser(page, tmp_path, width):
+def test_another_scene_is_chosen_in_a_browser(page, tmp_path, width):
     page()
-    for folder in ("", "submap-1"):
-        file = tmp_path / "out" / folder / SURFACE_FILE
-        file.parent.mkdir(parents=True)
-        file.write_text(f"<title>{folder}</title>")
     with Browser(str(find_chromium())) as browser:
         browser.open(tmp_path / "out" / "index.html", width, phone=width < 500)
-        assert browser.run("document.querySelector('iframe').src").endswith(f"out/{SURFACE_FILE}")
+        shown = "[...document.querySelectorAll('iframe')].map(f => f.hidden ? '' : f.contentDocument.title)"
+        assert browser.run(shown) == ["scene 0", ""]
         browser.run(
             "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
-            "(document.querySelector('.surfaces select'))"
+            "(document.querySelector('.scenes select'))"
         )
-        assert browser.run("document.querySelector('iframe').src").endswith(f"out/submap-1/{SURFACE_FILE}")
+        time.sleep(0.5)
+        assert browser.run(shown) == ["", "scene 1"]
         assert browser.run("document.documentElement.scrollWidth <= innerWidth")
         assert browser.errors() == []

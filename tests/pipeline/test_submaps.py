@@ -83,7 +83,7 @@ def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_
     assert done == [*SUBMAP, "submap-1/check_data", "submap-1/estimate_depth", "submap-1/train", "submap-1/evaluate"]
     done.clear()
     record = cp.reconstruct(atlas, tmp_path / "out")
-    assert done == ["submap-1/mesh", "submap-1/coverage", "submap-1/report"]
+    assert done == ["submap-1/mesh", "submap-1/coverage", "submap-1/show", "submap-1/report"]
     assert record.stages["submap-1/mesh"].files == {"submap-1/mesh": "a file"}
     assert record.stages["train"].options["steps"] == 2000
     assert record.stages["submap-1/train"].options["steps"] == 500

@@ -180,8 +180,9 @@ def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:
 
 @torch.no_grad()
 def adjusted_camera(trained: TrainedRun, frame: Frame) -> Camera:
-    """Camera of a training frame, as the run's view modules adjust it, float32 on the run's device."""
+    """Camera of a frame, as the run's view modules adjust it, float32 on the run's device."""
     camera = trained.model.placed(frame.camera.to(trained.device))
+    view = frame.view(trained=frame.name in trained.training_frames)
     for module in trained.model.view_modules.values():
-        camera = module.adjust_camera(camera, frame.view(trained=True))
+        camera = module.adjust_camera(camera, view)
     return camera.to(dtype=torch.float32)

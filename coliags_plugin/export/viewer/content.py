@@ -24,7 +24,6 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import mean_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.splats import ViewDecoder, most_visible, shown, wire_unit
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
@@ -142,14 +141,6 @@ class ViewerContent:
                 trained.method,
             )
         return cls(trained, trained.scene.video, baked, decoder, FramePictures(trained), wire_unit(baked))
-
-    @classmethod
-    def of_mesh(cls, trained: TrainedRun, mesh: TriangleMesh) -> ViewerContent:
-        """Content without Gaussians, to show frames and a mesh; the view starts where most of the mesh is in view."""
-        vertices = torch.as_tensor(mesh.vertices, dtype=torch.float64)
-        seen = [int(frame.camera.to("cpu", torch.float64).sees(vertices)[1].sum()) for frame in trained.scene.train]
-        best, video = int(np.argmax(seen)), trained.scene.video
-        return cls(trained, video, NOTHING, None, FramePictures(trained), wire_unit(NOTHING), best)
 
     @classmethod
     def of_cloud(cls, trained: TrainedRun, cloud: SplatCloud, first: int = 0) -> ViewerContent:

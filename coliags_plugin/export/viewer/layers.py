@@ -83,11 +83,6 @@ def add_mesh(scene: Any, name: str, mesh: TriangleMesh) -> Any:
     return scene.add_glb(node, encode_mesh(mesh), cast_shadow=False, receive_shadow=False)
 
 
-def add_own_colours_light(scene: Any) -> None:
-    """Light meshes from everywhere, such that they have the colours of their vertices."""
-    scene.add_light_ambient("/lights/everywhere", intensity=np.pi)
-
-
 def add_headlight(scene: Any, position: tuple[float, float, float]) -> Any:
     """Add a light for meshes that is to move with the camera, alike at all distances, and dim light from everywhere."""
     scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from coliags_plugin.contracts import GaussianField, gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors
-from coliags_plugin.geometry.poses.rigid import wxyz_from_rotations
+from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.lighting.lamps import HeldLight
 
 #: How much wider than the view, on every side, Gaussians are decoded, so that a small turn shows no gap.
@@ -23,8 +22,6 @@ MARGIN = 1.25
 BYTES_PER_SPLAT = 32
 #: Largest entry of a covariance: the largest of half precision is 65504.
 _LARGEST_COVARIANCE = 6.0e4
-#: Distance between centres that a page tells apart, in multiples of the unit.
-CENTRE_STEP = 2.0**-6
 #: Median standard deviation of the splats in the units that covariances are sent in.
 _MEDIAN_SIGMA = 0.125
 
@@ -61,30 +58,6 @@ def on_wire(splats: SplatCloud, unit: float) -> dict[str, Any]:
         "rgbs": np.rint(255.0 * splats.colors).astype(np.uint8),
         "opacities": splats.opacities[:, None],
     }
-
-
-def rounded(wire: dict[str, Any]) -> dict[str, Any]:
-    """What :func:`on_wire` gives, rounded so that it compresses: a splat takes 25 bytes of a page in place of 35.
-
-    Centres are multiples of :data:`CENTRE_STEP`, covariances in half precision have 5 bits behind the leading one.
-    """
-    halves = wire["covariances"].astype(np.float16).view(np.uint16).astype(np.int32)
-    halves = np.minimum((halves & 0x7FFF) + 16, 0x7BFF) & 0x7FE0 | halves & 0x8000
-    centers = (np.rint(wire["centers"] / CENTRE_STEP) * CENTRE_STEP).astype(np.float32)
-    return {**wire, "centers": centers, "covariances": halves.astype(np.uint16).view(np.float16).astype(np.float32)}
-
-
-def off_wire(wire: dict[str, Any], unit: float) -> SplatCloud:
-    """Splats that a browser draws of what :func:`on_wire` gives."""
-    variances, axes = np.linalg.eigh(wire["covariances"].astype(np.float64))
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    return SplatCloud(
-        means=unit * wire["centers"],
-        quats_wxyz=wxyz_from_rotations(axes).astype(np.float32),
-        scales=(unit * np.sqrt(variances.clip(0.0))).astype(np.float32),
-        opacities=(np.rint(255.0 * wire["opacities"][:, 0]) / 255.0).astype(np.float32),
-        harmonics=harmonics_of_colors(wire["rgbs"].astype(np.float32) / 255.0),
-    )
 
 
 class ViewDecoder:

@@ -197,11 +197,16 @@
     details.addEventListener("toggle", () => (frame.srcdoc ||= frame.dataset.page));
   }
 
-  // ---- One of several surfaces.
+  // ---- One of several scenes.
 
-  function surfaces(box) {
-    const select = box.querySelector("select");
-    if (select) select.addEventListener("change", () => (box.querySelector("iframe").src = select.value));
+  function scenes(box) {
+    const select = box.querySelector("select"), frames = [...box.querySelectorAll("iframe")];
+    function show(index) {
+      frames.forEach((frame, own) => (frame.hidden = own !== index));
+      frames[index].srcdoc ||= frames[index].dataset.page;
+    }
+    if (select) select.addEventListener("change", () => show(select.selectedIndex));
+    show(0);
   }
 
   const tables = all("table.results");
@@ -214,5 +219,5 @@
   all(".sorter").forEach(viewSorter);
   all(".compare").forEach(comparator);
   all("details.scene").forEach(scene);
-  all(".surfaces").forEach(surfaces);
+  all(".scenes").forEach(scenes);
 })();

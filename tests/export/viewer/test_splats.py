@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.export.viewer.splats import CENTRE_STEP, most_visible, off_wire, on_wire, rounded, shown, wire_unit
+from coliags_plugin.export.viewer.splats import most_visible, on_wire, shown, wire_unit
 from tests.export.splats.clouds import covariances
 from tests.export.viewer.made import some_gaussians
 
@@ -42,17 +42,6 @@ def test_half_precision_holds_scenes_of_every_unit_of_length(exponent):
     expected = covariances(shown(gaussians)) * factor**2
     np.testing.assert_allclose(halves, expected, atol=5e-3 * np.abs(expected).max())
     np.testing.assert_allclose(sent["centers"] * unit, scaled.means, rtol=1e-6)
-
-
-def test_what_is_rounded_for_a_page_is_nearly_the_same():
-    splats = shown(some_gaussians(200))
-    unit = wire_unit(splats)
-    page = off_wire(rounded(on_wire(splats, unit)), unit)
-    np.testing.assert_allclose(page.means, splats.means, atol=0.51 * CENTRE_STEP * unit)
-    largest = np.abs(splats.covariances).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(page.covariances / largest, splats.covariances / largest, atol=2.0**-5)
-    np.testing.assert_allclose(page.opacities, splats.opacities, atol=0.51 / 255)
-    np.testing.assert_allclose(page.colors, splats.colors, atol=0.51 / 255)
 
 
 def test_the_most_visible_are_the_opaque_and_large_ones():

@@ -1,0 +1,175 @@
+"""The page of a scene: what is packed into it, and what a browser draws of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from base64 import b64decode
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.rotations import rotation_of_vector
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
+from coliags_plugin.export.splats.packed import read_splat_spz
+from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
+from tests.export.viewer.made import some_gaussians
+
+CHROMIUM = find_chromium()
+CUBE = TriangleMesh(
+    np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (8, 10)], np.float32),
+    np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 4, 2], [2, 4, 6]]),
+    np.arange(24, dtype=np.uint8).reshape(8, 3) * 10,
+)
+
+
+def frame(index, turn=(0.0, 0.0, 0.0), center=(0.0, 0.0, -20.0)):
+    pose = torch.eye(4)
+    pose[:3, :3] = rotation_of_vector(torch.tensor(turn))
+    pose[:3, 3] = torch.tensor(center)
+    camera = Camera(120.0, 118.0, 66.0, 50.0, 128, 96, pose)
+    image = torch.full((96, 128, 3), 40 * index, dtype=torch.uint8)
+    return Frame(name=f"f{index}", index=index, camera=camera, image=image)
+
+
+FRAMES = [frame(0), frame(1, (0.3, -0.2, 0.1), (4.0, 2.0, -18.0)), frame(2, (-0.2, 0.4, 0.5), (-6.0, 1.0, -16.0))]
+
+
+def cloud_of(count, degree, seed=0):
+    cloud = SplatCloud.of(some_gaussians(count, seed=seed))
+    generator = np.random.default_rng(seed)
+    higher = generator.uniform(-0.4, 0.4, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
+    return replace(cloud, harmonics=np.concatenate([cloud.harmonics, higher], axis=1))
+
+
+def page_of(*layers):
+    path = CameraPath(FRAMES, [one.camera for one in FRAMES], frozenset({"f0", "f2"}), 1, 20.0)
+    return page_html("a <scene>", layers, path, 0.3, 0.2)
+
+
+def data_of(text):
+    return json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
+
+
+def test_a_page_holds_the_path_the_pictures_and_nothing_from_elsewhere():
+    text = page_of(Layer("Gaussians", "ten </script>", cloud_of(10, 0)))
+    data = data_of(text)
+    assert "<title>a &lt;scene&gt;</title>" in text and text.count("</script>") == 2
+    assert [(one["name"], one["held_out"]) for one in data["frames"]] == [("f0", False), ("f1", True), ("f2", False)]
+    assert data["start"] == 1 and data["camera"]["fy"] == 118.0
+    np.testing.assert_allclose(data["frames"][1]["center"], [4.0, 2.0, -18.0])
+    jpeg = np.frombuffer(b64decode(data["frames"][2]["picture"].partition(",")[2]), np.uint8)
+    np.testing.assert_allclose(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), 80, atol=1)
+    assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//|https?://""", text)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
+def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
+    cloud = cloud_of(50, 2)
+    cloud = replace(cloud, means=cloud.means * np.float32(size), scales=cloud.scales * np.float32(size))
+    (layer,) = data_of(page_of(Layer("Gaussians", "", cloud)))["layers"]
+    (tmp_path / "a.spz").write_bytes(b64decode(layer["data"]))
+    read = read_splat_spz(tmp_path / "a.spz")
+    np.testing.assert_allclose(read.means * layer["unit"], cloud.means, atol=2e-5 * 10 * size)
+    np.testing.assert_allclose(read.scales * layer["unit"], cloud.scales, rtol=0.033)
+
+
+def test_a_mesh_is_quantised_in_its_box():
+    (layer,) = data_of(page_of(Layer("surface", "", CUBE)))["layers"]
+    data = zlib.decompress(b64decode(layer["data"]))
+    corners = np.frombuffer(data[: 8 * 6], "<u2").reshape(8, 3) / 65535.0 * layer["span"] + layer["low"]
+    np.testing.assert_allclose(corners, CUBE.vertices, atol=1e-4)
+    np.testing.assert_array_equal(np.frombuffer(data[8 * 9 :], "<u4").reshape(-1, 3), CUBE.triangles)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser(CHROMIUM, SOFTWARE_WEBGL) as one:
+        yield one
+
+
+def drawn(browser, path):
+    """What the canvas shows, and the lens it is drawn with, once Gaussians are sorted."""
+    browser.run(
+        "new Promise(done => { const wait = () => byId('canvas').dataset.drawn === 'true' ? done()"
+        " : setTimeout(wait, 50); wait(); })"
+    )
+    browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    browser.screenshot(path)
+    left, top, wide, high = browser.run(
+        "(b => [b.left, b.top, b.width, b.height])(byId('canvas').getBoundingClientRect())"
+    )
+    return read_rgb(path)[round(top) : round(top + high), round(left) : round(left + wide)]
+
+
+def as_canvas(camera, shape):
+    """The camera in a canvas that holds its whole image."""
+    height, width = shape[:2]
+    scale = min(width / camera.width, height / camera.height)
+    return scale, replace(
+        camera,
+        fx=scale * camera.fx,
+        fy=scale * camera.fy,
+        cx=0.5 * width + scale * (camera.cx - 0.5 * camera.width),
+        cy=0.5 * height + scale * (camera.cy - 0.5 * camera.height),
+        width=width,
+        height=height,
+    )
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree):
+    cloud = cloud_of(400, degree, seed=degree)
+    page = tmp_path / "page.html"
+    page.write_text(page_of(Layer("Gaussians", "", cloud)), encoding="utf-8")
+    browser.open(page, 700, 400)
+    for index in (1, 2):
+        if index != 1:
+            browser.run(f"(s => (s.value = {index}, s.dispatchEvent(new Event('input'))))(byId('frame'))")
+        seen = drawn(browser, tmp_path / "seen.png")
+        scale, camera = as_canvas(FRAMES[index].camera, seen.shape)
+        renderer = TorchRenderer(TorchRendererSettings(eps2d=0.3 * max(1.0, scale**2)))
+        true = renderer.draw(field_of_cloud(cloud).gaussians(camera), camera, ("rgb", "alpha")).rgb.detach()
+        error = seen / 255.0 - true.clamp(0.0, 1.0).numpy()
+        assert -10.0 * np.log10(np.mean(error**2)) > 34.0
+    assert browser.run("byId('name').textContent") == "f2"
+    assert [one for one in browser.errors() if "ReadPixels" not in one] == []
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width", [900, 390])
+def test_layers_path_and_looking_around(browser, tmp_path, width):
+    page = tmp_path / "page.html"
+    flat = replace(CUBE, colors=np.full((8, 3), (250, 10, 30), np.uint8))
+    layers = Layer("Gaussians", "many", cloud_of(50, 0)), Layer("surface", "6 triangles", flat)
+    page.write_text(page_of(*layers), encoding="utf-8")
+    browser.open(page, width, 600, phone=width < 500)
+    drawn(browser, tmp_path / "seen.png")
+    browser.run("document.querySelectorAll('input[name=layer]')[1].click()")
+    browser.run("(s => (s.value = 0, s.dispatchEvent(new Event('input'))))(byId('frame'))")
+    seen = drawn(browser, tmp_path / "seen.png") if width >= 500 else None
+    assert browser.run("byId('about').textContent") == "6 triangles"
+    if seen is not None:
+        _, camera = as_canvas(FRAMES[0].camera, seen.shape)
+        pixels, _ = camera.project(torch.tensor([[1.0, 1.0, 8.0]]))
+        column, row = pixels[0].int().tolist()
+        np.testing.assert_allclose(seen[row, column], (250, 10, 30), atol=2)
+    browser.run("byId('play').click()")
+    browser.run("new Promise(done => setTimeout(done, 1500))")
+    assert browser.run("[byId('frame').value, byId('play').textContent]") == ["2", "Play"]
+    browser.drag("#canvas", 0.5, 0.6, touch=width < 500)
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    assert [one for one in browser.errors() if "ReadPixels" not in one] == []
