@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -57,9 +58,11 @@ class DepthEstimateCommand:
             scene = open_scene(self.scene, self.format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
-            summary = estimate_scene(scene, self.output, request, self.overwrite, progress)
+            estimated = estimate_scene(scene, self.output, request, self.overwrite, progress)
+        for warning in estimated.warnings:
+            logging.getLogger(__name__).warning(warning)
         train = train_command(self.output, ESTIMATED_DEPTH_METHOD, training_options(scene))
-        print_summary(str(summary), written=[self.output], then=[train], as_json=self.json)
+        print_summary(estimated.summary, written=[self.output], then=[train], as_json=self.json)
 
 
 @dataclass(frozen=True)

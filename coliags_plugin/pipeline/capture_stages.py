@@ -91,7 +91,8 @@ def estimate_depth(context: StageContext) -> StageOutcome:
     from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
 
     request = DepthRequest(context.settings.depth)
-    summary = estimate_scene(
+    estimated = estimate_scene(
         context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
     )
-    return StageOutcome(summary, {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"})
+    made = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
+    return StageOutcome(estimated.summary, made, estimated.warnings)

@@ -61,10 +61,13 @@ class Estimation:
             for number, sweep in enumerate(self.settings.sweeps):
                 self._pass(number, sweep)
 
-    def result(self, index: int) -> tuple[Map, Map]:
-        """A frame's z-depth, scene units, and the probability that it is off by less than 5 %, 0 by a prior alone."""
+    def result(self, index: int) -> tuple[Map, Map, str]:
+        """A frame's z-depth, scene units, and the probability that it is off by less than 5 %, 0 by a prior alone.
+
+        Last, why that is 0 throughout; empty of other frames.
+        """
         arrays = self.work.load(self.last, index)
-        return arrays["depth"], arrays["confidence"]
+        return arrays["depth"], arrays["confidence"], str(arrays["distrust"])
 
     def _pass(self, number: int, sweep: SweepSettings) -> None:
         neighbours = self._neighbours(number, sweep)
@@ -88,9 +91,6 @@ class Estimation:
                 "a camera that moves: rotation alone gives no depth",
                 "Use a longer stretch, check the poses, or lower the baselines of depth.sweeps",
             )
-        if lonely:
-            fewer = f"fewer than {FEWEST_NEIGHBOURS} neighbours: their depth has confidence 0"
-            log.warning("%d of %d frames have %s", lonely, len(neighbours), fewer)
         return neighbours
 
     def _sweep(self, number: int, sweep: SweepSettings, neighbours: Sequence[Sequence[int]]) -> None:
@@ -136,9 +136,14 @@ class Estimation:
             log_depth = np.clip(complete(known, support, belief, prior, guide.intensity), low, high)
             confidence = depth_confidence(log_depth, support, result.spread, rim)
             matched = float(own.weight[guide.usable].mean()) if guide.usable.any() else 0.0
-            if len(neighbours[index]) < FEWEST_NEIGHBOURS or matched < LEAST_MATCHED:
+            distrust = ""
+            if len(neighbours[index]) < FEWEST_NEIGHBOURS:
+                distrust = f"fewer than {FEWEST_NEIGHBOURS} other frames at a distance that gives depth"
+            elif matched < LEAST_MATCHED:
+                distrust = f"mean weight of their own matches below {LEAST_MATCHED:g}"
+            if distrust:
                 confidence[:] = 0.0
-            return {"depth": np.exp(log_depth), "confidence": confidence}
+            return {"depth": np.exp(log_depth), "confidence": confidence, "distrust": np.array(distrust)}
 
         self._stage(f"fused-{number}", fused, f"fuse {number + 1}")
 

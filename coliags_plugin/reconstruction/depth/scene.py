@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -33,7 +34,7 @@ _KNOWN = 0.5
 #: Shares of the known pixels between whose depths the summary's range is, and the number of logarithmic bins of depth.
 _SHARES, _BINS = (0.01, 0.99), 2000
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 3
+_VERSION = 4
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 
@@ -48,10 +49,17 @@ class DepthRequest:
     jobs: int | None = None  # number of threads; None: one for each core
 
 
+class EstimatedDepth(NamedTuple):
+    """What is said of estimated depth."""
+
+    summary: str
+    warnings: list[str]  # for each reason, which frames have confidence 0 throughout
+
+
 def estimate_scene(
     scene: Scene, out: Path, request: DepthRequest, overwrite: bool = False, progress: Progress | None = None
-) -> str:
-    """Estimate the depth of a posed scene's video, write it as a scene in nerfstudio's layout, and return a summary.
+) -> EstimatedDepth:
+    """Estimate the depth of a posed scene's video, and write it as a scene in nerfstudio's layout.
 
     Training and test frames take part; test sets of their own do not. Work files stay beside ``out`` until all is
     written, and the same request resumes from them.
@@ -77,8 +85,8 @@ def estimate_scene(
         estimation = Estimation(frames, prior, depth_range, request.settings, work, jobs, progress)
         estimation.run()
         with atomic_folder(out, overwrite) as folder:
-            summary = _write(scene, frames, estimation, folder, progress)
-    return summary
+            estimated = _write(scene, frames, estimation, folder, progress)
+    return estimated
 
 
 def training_options(scene: Scene) -> list[str]:
@@ -102,18 +110,21 @@ def _range(frames: Sequence[Frame], request: DepthRequest, work: WorkFolder, pro
 
 def _write(
     scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
-) -> str:
-    """Write all frames, the points and the unit; the summary."""
+) -> EstimatedDepth:
+    """Write all frames, the points and the unit."""
     writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
     trained = {frame.name for frame in scene.train}
     k = frames[0].camera
     footprint = float(np.median(estimation.medians)) / float(np.sqrt(k.fx * k.fy))
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
     pixels = 0
+    distrusted: dict[str, list[str]] = {}
     log_range = np.log([estimation.range.near, estimation.range.far])
     counts = np.zeros(_BINS, np.int64)
     for index, stored in enumerate(with_progress(frames, "write", progress)):
-        frame, (depth, confidence) = stored.to("cpu"), estimation.result(index)
+        frame, (depth, confidence, distrust) = stored.to("cpu"), estimation.result(index)
+        if distrust:
+            distrusted.setdefault(distrust, []).append(frame.name)
         image, mask = image_and_mask(frame)
         if mask is not None:
             confidence = np.where(mask, confidence, np.float32(0.0))
@@ -139,7 +150,14 @@ def _write(
     bins = np.searchsorted(np.cumsum(counts), np.multiply(known, _SHARES))
     near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)
     share = f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
-    return f"{len(frames)} frames, {share}, 98 % of these at depths of {near:.4g} to {far:.4g}; {len(positions)} points"
+    summary = (
+        f"{len(frames)} frames, {share}, 98 % of these at depths of {near:.4g} to {far:.4g}; {len(positions)} points"
+    )
+    warnings = [
+        f"{len(names)} of {len(frames)} frames have depth of confidence 0, {reason}: {', '.join(names)}"
+        for reason, names in distrusted.items()
+    ]
+    return EstimatedDepth(summary, warnings)
 
 
 #: Least confidence of a pixel, and least number of frames that see a point's voxel.

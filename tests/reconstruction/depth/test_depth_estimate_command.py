@@ -248,7 +248,7 @@ def noisy(frames, level, seed=0):
 
 
 @pytest.mark.parametrize("level", [2, 90])
-def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, level):
+def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, caplog, level):
     frames = wall_frames(sideways(COUNT))
     nothing = write_wall(tmp_path / "nothing", noisy(frames, level))
     assert "the depth range is unknown" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS)
@@ -257,6 +257,8 @@ def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, level
     some = write_wall(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]])
     assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *told) == 0
     found = frames_of(tmp_path / "b")
+    reason = f"mean weight of their own matches below 0.1: {found[4].name}"
+    assert f"1 of 9 frames have depth of confidence 0, {reason}" in caplog.messages
     assert confidence_of(tmp_path / "b", found[4].name).max() == 0.0
     assert np.isfinite(found[4].depth.numpy()).all()
     assert (confidence_of(tmp_path / "b", found[2].name) > 0.8).mean() > 0.5
