@@ -156,7 +156,7 @@ _VIEWS, _COLOR_VIEWS = 120, 30
 #: Time for fitting Gaussians to what the run renders, seconds, unless another is given.
 SECONDS = 180.0
 #: Share of all blending weights that the Gaussians hold which are fitted to what the run renders.
-_FITTED_SHARE = 0.95
+_FITTED_SHARE = 0.8
 
 
 def bake(
