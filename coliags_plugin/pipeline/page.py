@@ -276,14 +276,13 @@ def _scenes(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
 
 def _pictures(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
     """Frames, their depth and the wall in flattened light, side by side."""
+    scales = {one.submap.title: one.figures.get("depth_scale") for one in results}
     for title, path in _made(folder, results, PICTURES):
-        rows = [
-            Figures(
-                [Image(EncodedImage.png(read_rgb(file)), file.stem) for kind in _KINDS for file in frame.glob(kind)]
-            )
-            for frame in sorted((folder / path).iterdir())
-        ]
-        yield Folded(title, [row for row in rows if row.figures], is_open=title == LARGEST.title)
+        rows: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if (scale := scales[title]) else []
+        for frame in sorted((folder / path).iterdir()):
+            files = [file for kind in _KINDS for file in frame.glob(kind)]
+            rows.append(Figures([Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files], frame.name))
+        yield Folded(title, rows, is_open=title == LARGEST.title)
 
 
 def _made(folder: Path, results: Sequence[SubmapResults], what: str) -> list[tuple[str, str]]:

@@ -157,14 +157,18 @@ def show(context: StageContext) -> StageOutcome:
     from coliags_plugin.export.viewer.saving import save_page
 
     trained = load_trained(context.run, context.device, context.scene)
-    _write_pictures(trained, context.run / "pictures")
+    depth_scale = _write_pictures(trained, context.run / "pictures")
     size, seconds = _PAGES[context.submap.number == 0]
     page = save_page(trained, context.run / "scene.html", size, "recorded", seconds)
-    return StageOutcome(page.text, {"run/scene.html": SCENE, "run/pictures": PICTURES})
+    files = {"run/scene.html": SCENE, "run/pictures": PICTURES}
+    return StageOutcome(page.text, files, figures={"depth_scale": depth_scale})
 
 
-def _write_pictures(trained: TrainedRun, folder: Path) -> None:
-    """Some frames of the video, as recorded, their depth, and in flattened light where colours know the lamp."""
+def _write_pictures(trained: TrainedRun, folder: Path) -> str:
+    """Write some frames of the video, as recorded, their depth, and in flattened light where colours know the lamp.
+
+    Returns what the colours of depth mean.
+    """
     from coliags_plugin.comparison.report.view_pixels import evenly
     from coliags_plugin.contracts import knows_lamp
     from coliags_plugin.engine.held_light import flatten
@@ -173,12 +177,17 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> None:
 
     pictures = FramePictures(trained)
     flat = FramePictures(flatten(trained)) if knows_lamp(trained.model.field) else None
+    scale = ""
     for index in evenly(len(trained.scene.video), _PICTURED):
         frame = trained.scene.video[index]
         write_png(folder / frame.name / "recorded.png", frame.image)
-        write_png(folder / frame.name / "depth.png", pictures.of(frame, "depth").image)
+        if "depth" in pictures.kinds:
+            depth = pictures.of(frame, "depth")
+            write_png(folder / frame.name / "depth.png", depth.image)
+            scale = depth.caption
         if flat is not None:
             write_png(folder / frame.name / "flattened light.png", flat.of(frame, "render").image)
+    return scale
 
 
 def report(context: StageContext) -> StageOutcome:
