@@ -340,7 +340,7 @@ function poseAt(index) {
 /** Index of the frame whose pose is nearest: distances in shares of the look distance, turns in radians. */
 function nearestFrame({ center, axes }) {
   const cost = (frame) =>
-    Math.hypot(...sum(center, frame.center, -1)) / scene.distance + Math.acos(Math.min(1, dot(column(axes, 2), column(frame.axes, 2))));
+    Math.hypot(...sum(center, frame.center, -1)) / scene.distance + Math.acos(Math.max(-1, Math.min(1, dot(column(axes, 2), column(frame.axes, 2)))));
   const costs = scene.frames.map(cost);
   return costs.indexOf(Math.min(...costs));
 }
@@ -409,7 +409,8 @@ async function start() {
     if (!isPlaying) return;
     requestAnimationFrame((now) => {
       const last = scene.frames.length - 1;
-      if (isPlaying) goTo(Math.min(last, place + (scene.rate * Math.min(now - since, 200)) / 1000));
+      const passed = Math.max(0, Math.min(now - since, 200));  // a frame may have begun before the click
+      if (isPlaying) goTo(Math.min(last, place + (scene.rate * passed) / 1000));
       if (place >= last) pause();
       advance(now);
     });
