@@ -257,7 +257,7 @@ class Run:
         measure: bool = True,
         overwrite: bool = False,
     ) -> list[Exported]:
-        """Write the run's Gaussians to files, and a record of what each is and loses to ``FILE.json``.
+        """Write the run's Gaussians to files, and a JSON record of each to ``FILE.json`` beside it.
 
         Args:
             output: The file; of several formats, its suffix becomes that of each. None: ``export/SCENE.FORMAT`` in the
@@ -357,8 +357,8 @@ class Run:
             The page, and what it is and loses.
 
         Raises:
-            InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, there is no such light,
-                the page would hold no Gaussian, or the file cannot be written.
+            InputError: See :meth:`load`; the method has no Gaussians and the run no mesh, there is no such light, the
+                page would hold no Gaussian, or the file cannot be written.
         """
         from coliags_plugin.export.viewer.saving import save_page
 

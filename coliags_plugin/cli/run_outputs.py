@@ -188,10 +188,10 @@ class ExportCommand:
     """File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json. Of several formats, each has its own
     suffix."""
     light: Literal["recorded", "mean", "flattened"] = "mean"
-    """Light that is baked into the colours of methods whose colours depend on the lamp: on average that of the training
-    cameras, as in the video; that of the mean one; or the same distance and angle everywhere."""
+    """Light baked into colours that depend on the lamp. recorded: the lamp of each training camera, averaged; mean: a
+    lamp at the mean training camera; flattened: the same distance and angle everywhere."""
     seconds: float = 180.0
-    """Time for fitting baked Gaussians to what the run renders, at most, where baking loses much."""
+    """Time limit, seconds, of the fit of baked Gaussians to the run's renderings, done where baking loses much."""
     measure: bool = True
     """Compare each file with the run on the held-out views, for the record and the terminal."""
     format: tuple[Literal["ply", "spz", "splat", "glb"], ...] = ("ply",)
@@ -226,7 +226,7 @@ class ExportCommand:
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show a run in a browser: Gaussians, cameras, meshes, recorded and rendered pictures. Needs the extra `viewer`."""
+    """Show a run in a browser, which needs the extra `viewer`, or write it as a page: Gaussians, meshes, frames."""
 
     path: arguments.RunFolder
     output: arguments.OptionalOutput = None
@@ -236,7 +236,7 @@ class ViewCommand:
     light: Literal["recorded", "mean", "flattened"] = "recorded"
     """Of the page, as in `coliags export`."""
     seconds: float = 180.0
-    """Time for fitting the page's Gaussians to what the run renders, at most."""
+    """Time limit, seconds, of the fit of the page's Gaussians to the run's renderings."""
     host: str = "127.0.0.1"
     """Name or address to listen on; 0.0.0.0: all of this machine, for anyone who can reach it. From another machine,
     better: ssh -L 8080:localhost:8080 THIS_MACHINE, and open http://localhost:8080 there."""

@@ -68,7 +68,7 @@ def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight 
 
 
 def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Sequence[str]) -> RenderOutput:
-    """What field and renderer of a model show of a view under a held light, if any; view modules are left out."""
+    """Render a view of a model under a held light, or else the camera's own lamp, without view modules."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     return renderer.draw(gaussians_under(field, camera, light), camera, wants)
 

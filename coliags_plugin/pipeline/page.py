@@ -141,7 +141,7 @@ def _area(figures: Mapping[str, Any]) -> str | None:
 
 
 def _seen(figures: Mapping[str, Any]) -> str | None:
-    """Share of the wall that was seen, or the area where there is no share."""
+    """Share of the wall seen, in per cent, or the seen area where the whole wall is unknown."""
     if "seen" in figures:
         return f"{100.0 * figures['seen']:.0f} %"
     return area_text(figures["seen_area"], figures.get("unit") == "mm") if "seen_area" in figures else None
@@ -286,7 +286,7 @@ def _pictures(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]
 
 
 def _made(folder: Path, results: Sequence[SubmapResults], what: str) -> list[tuple[str, str]]:
-    """Title of each sub-map, and path of what its page shows."""
+    """Titles of sub-maps, and paths of their files of one kind."""
     return [
         (one.submap.title, path)
         for one in results

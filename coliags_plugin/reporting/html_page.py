@@ -75,7 +75,7 @@ def _filled(pictures: dict[str, EncodedImage], file: str, **values: object) -> M
     def filled(block: Template) -> Markup:
         return _filled(pictures, block.file, **block.values)
 
-    return Markup(_environment().get_template(file).render(address=address, filled=filled, **values))
+    return Markup(environment(_ASSETS).get_template(file).render(address=address, filled=filled, **values))
 
 
 def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | None = None, limit: int = 0) -> str:
@@ -107,14 +107,13 @@ def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | 
 
 
 @cache
-def _environment() -> Environment:
-    loader = FileSystemLoader(_ASSETS)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+def environment(assets: Path) -> Environment:
+    """The Jinja environment of the templates in a folder."""
+    loader = FileSystemLoader(assets)
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     functions = (columns_of, drawn, enumerate, sentence, style_classes, unit_text)
-    environment.globals |= {"dash": DASH, **{function.__name__: function for function in functions}}
-    return environment
+    made.globals |= {"dash": DASH, **{function.__name__: function for function in functions}}
+    return made
 
 
 def columns_of(count: int) -> int:

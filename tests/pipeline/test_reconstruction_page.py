@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -133,13 +132,20 @@ def test_another_scene_is_chosen_in_a_browser(page, tmp_path, width):
     page()
     with Browser(str(find_chromium())) as browser:
         browser.open(tmp_path / "out" / "index.html", width, phone=width < 500)
-        shown = "[...document.querySelectorAll('iframe')].map(f => f.hidden ? '' : f.contentDocument.title)"
-        assert browser.run(shown) == ["scene 0", ""]
+
+        def titles():
+            """Of the frames, '' of hidden ones, once the shown one is loaded."""
+            return browser.run(
+                "new Promise(done => { const look = () => { const frames = [...document.querySelectorAll('iframe')]"
+                ".map(f => f.hidden ? '' : f.contentDocument.title); frames.some(Boolean) ? done(frames)"
+                " : setTimeout(look, 20); }; look(); })"
+            )
+
+        assert titles() == ["scene 0", ""]
         browser.run(
             "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
             "(document.querySelector('.scenes select'))"
         )
-        time.sleep(0.5)
-        assert browser.run(shown) == ["", "scene 1"]
+        assert titles() == ["", "scene 1"]
         assert browser.run("document.documentElement.scrollWidth <= innerWidth")
         assert browser.errors() == []

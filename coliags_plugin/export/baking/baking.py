@@ -111,11 +111,6 @@ class GaussianAverages:
             visible_sources=kept,
         )
 
-    def _with_thickness(self, log_scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:
-        """Logarithms of scales of surfels with a third one, as files have it; of Gaussians unchanged."""
-        third = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)
-        return torch.cat([log_scales, third], dim=1)[:, :3]
-
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)
         return self._opacities / shown.clamp_min(_NONE)
@@ -127,7 +122,9 @@ class GaussianAverages:
         mean = self.gaussians(kept)
         with torch.no_grad():
             made.means.copy_(mean.means)
-            made.scales.copy_(self._with_thickness(self._log_scales[kept] / self._weights[kept][:, None]))
+            log_scales = self._log_scales[kept] / self._weights[kept][:, None]
+            thickness = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)  # of surfels, as in files
+            made.scales.copy_(torch.cat([log_scales, thickness], dim=1)[:, :3])
             made.quats.copy_(mean.quats_wxyz)
             made.opacities.copy_(torch.logit(mean.opacities.clamp(1e-4, 1.0 - 1e-4)))
             made.sh0.copy_(harmonics[:, :1])

@@ -1,4 +1,4 @@
-"""Gaussians for all views, fitted to what a run renders along and around its cameras' path in a held light."""
+"""Distillation of a run into explicit Gaussians: a fit to its renderings along and around the camera path."""
 
 from __future__ import annotations
 
@@ -57,11 +57,12 @@ class _Target:
 
 
 def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float) -> int:
-    """Fit Gaussians, in place, to what a run shows in a held light, for so long at most; returns the steps taken.
+    """Fit explicit Gaussians, in place, to renderings of a run in a held light; returns the number of steps.
 
     Most of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
     the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
-    renders beside them: between neighbouring cameras, moved and turned a little.
+    renders beside them: between neighbouring cameras, moved and turned a little. It ends after so many seconds, or
+    :data:`STEPS`.
     """
     renderer = splatting_of(model_of_gaussians(field, trained))
     unit = trained.scene.pixel_footprint
@@ -173,7 +174,7 @@ def _held(
 
 
 def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:
-    """Gaussians for all views, of a run of whatever splatting method, with a renderer of Gaussians."""
+    """A model of explicit Gaussians, with a renderer of the run's config for 3D Gaussians and no view modules."""
     renderer = choose_renderer(trained.config.renderer, "gaussians3d", trained.device).renderer
     return Model(field, renderer, {}, trained.model.near_plane).to(trained.device).eval()
 

@@ -46,7 +46,7 @@ class Exported:
 
     @property
     def text(self) -> str:
-        """What was written and what it loses, for a person."""
+        """Number of Gaussians, file size, and PSNR beside the run's, in one line of text."""
         record = self.record
         text = f"{self.file.name}: {record['gaussians']:,} Gaussians, {record['file']['bytes'] / 1e6:.1f} MB"
         return "; ".join([text, *cost_lines(record["cost"] or {})])
@@ -88,7 +88,7 @@ def export_run(
 
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
-    """A light for a record; None where the colours of a field know no lamp."""
+    """Name and parameters of a light as JSON values; None where a field's colours do not depend on a lamp."""
     return {"name": name, **(light.described if light else {})} if knows_lamp(field) else None
 
 
@@ -198,7 +198,7 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
 
 
 def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What Gaussians lose, for every test set whose PSNR is known, in plain text."""
+    """PSNR of exported Gaussians and of their run, one text for each test set that has it."""
     return [
         f"{of_set['export']['psnr']:.2f} dB in that light on {counted(of_set['frames'], 'held-out frame')} ({name}), "
         f"the run {of_set['run']['psnr']:.2f} dB"

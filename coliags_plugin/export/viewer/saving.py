@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ from coliags_plugin.export.baking.distillation import adjusted_camera, best_fram
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.viewer.content import NOTHING, ViewerContent, mesh_files
-from coliags_plugin.export.viewer.page import CameraPath, Layer, as_packed, page_html
+from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.export.viewer.splats import most_visible
 from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
 from coliags_plugin.reporting.html_page import refuse_folder
 from coliags_plugin.reporting.numbers import counted
@@ -38,11 +39,11 @@ _SHADE_OF_SURFACE, _SHADE_OF_MAP = 0.5, 0.7
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A scene as a page, and what it is and loses."""
+    """An HTML page of a scene, with its figures."""
 
     html: str
-    text: str  # the same in a line
-    facts: Mapping[str, Any]
+    text: str  # the figures in one line
+    facts: Mapping[str, Any]  # the figures
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int, light: str, seconds: float) -> ScenePage:
@@ -63,13 +64,7 @@ def scene_page(
     with the run on its held-out frames. The view starts at the training frame that they show best in comparison with
     the run. Of a method without Gaussians, the page shows the meshes.
     """
-    meshes = [
-        Layer("surface", counted(len(mesh), "triangle"), mesh, _SHADE_OF_SURFACE)
-        if name == "mesh"
-        else Layer(name, f"{counted(len(mesh), 'triangle')}, for research use only", mesh, _SHADE_OF_MAP)
-        for name, file in mesh_files(trained.run.path).items()
-        for mesh in [read_mesh(file)]
-    ]
+    meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
     if isinstance(trained.model.field, GaussianField):
         return _page_of_gaussians(trained, trained.model.field, meshes, largest, light, seconds)
     if not meshes:
@@ -78,41 +73,55 @@ def scene_page(
             "a method of Gaussians, or a mesh",
             "Run `coliags mesh` first, or write pictures with `coliags render`",
         )
-    html = _html(trained, meshes)
+    html = _Page(trained).html(meshes)
     if len(html.encode()) > largest:
         raise InputError(f"a page of {largest} bytes", f"at least {len(html.encode())} bytes, what its meshes take")
     text = f"{trained.method} on {trained.scene.name}, step {trained.step}; no Gaussians"
     return ScenePage(html, text, {"gaussians": 0})
 
 
+def _mesh_layer(name: str, mesh: TriangleMesh) -> Layer:
+    about = counted(len(mesh), "triangle")
+    if name == "mesh":
+        return Layer.of_mesh("surface", about, mesh, _SHADE_OF_SURFACE)
+    return Layer.of_mesh(name, f"{about}, for research use only", mesh, _SHADE_OF_MAP)
+
+
 def _page_of_gaussians(
     trained: TrainedRun, field: GaussianField, meshes: list[Layer], largest: int, light: str, seconds: float
 ) -> ScenePage:
-    held = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-    empty = len(_html(trained, meshes).encode()) + _LINE_BYTES
+    page, held = _Page(trained), held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
+    empty = len(page.html(meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
     splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0)
     first = best_frame(field_of_cloud(splats), trained, held)
-
-    def html(text: str) -> str:
-        return _html(trained, [Layer("Gaussians", text, splats), *meshes], splats, first)
-
-    while (size := len(html("").encode()) + _LINE_BYTES) > largest:
-        splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / (size - empty)))
-    cost = export_cost(trained, as_packed(splats), held if knows_lamp(field) else None)
+    layer, drawn = Layer.of_cloud("Gaussians", splats)
+    while empty + (size := len(layer.packed["data"])) > largest:
+        splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / size))
+        layer, drawn = Layer.of_cloud("Gaussians", splats)
+    cost = export_cost(trained, drawn, held if knows_lamp(field) else None)
     told = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
     if knows_lamp(field):
         told.append(f"{light} light")
     text = "; ".join([*told, *cost_lines(cost)])
     facts = {"gaussians": len(splats), "baking": {"light": light_facts(light, field, held), **baking}, "cost": cost}
-    return ScenePage(html(text), f"{trained.method} on {trained.scene.name}, {text}", facts)
+    html = page.html([replace(layer, about=text), *meshes], splats, first)
+    return ScenePage(html, f"{trained.method} on {trained.scene.name}, {text}", facts)
 
 
-def _html(trained: TrainedRun, layers: list[Layer], splats: SplatCloud = NOTHING, first: int = 0) -> str:
-    content, renderer = ViewerContent.of_cloud(trained, splats, first), trained.model.renderer
-    cameras = [adjusted_camera(trained, frame) for frame in content.frames]
-    start = content.frames.index(trained.scene.train[first])
-    path = CameraPath(content.frames, cameras, trained.training_frames, start, content.look_distance)
-    blur = renderer.settings.eps2d if isinstance(renderer, SplattingRenderer) else 0.0
-    return page_html(content.title, layers, path, blur, content.near_plane)
+class _Page:
+    """The page of a run for any layers; frames are packed once."""
+
+    def __init__(self, trained: TrainedRun) -> None:
+        self._trained, frames = trained, trained.scene.video
+        cameras = [adjusted_camera(trained, frame) for frame in frames]
+        self._path = CameraPath(frames, cameras, trained.training_frames)
+
+    def html(self, layers: list[Layer], splats: SplatCloud = NOTHING, first: int = 0) -> str:
+        """The page; ``splats`` tell how far the wall is, and it opens at a training frame."""
+        trained, renderer = self._trained, self._trained.model.renderer
+        content = ViewerContent.of_cloud(trained, splats, first)
+        start = content.frames.index(trained.scene.train[first])
+        blur = renderer.settings.eps2d if isinstance(renderer, SplattingRenderer) else 0.0
+        return page_html(content.title, layers, self._path, start, content.look_distance, blur, content.near_plane)

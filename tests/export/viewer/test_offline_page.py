@@ -53,8 +53,13 @@ def cloud_of(count, degree, seed=0):
 
 
 def page_of(*layers):
-    path = CameraPath(FRAMES, [one.camera for one in FRAMES], frozenset({"f0", "f2"}), 1, 20.0)
-    return page_html("a <scene>", layers, path, 0.3, 0.2)
+    path = CameraPath(FRAMES, [one.camera for one in FRAMES], frozenset({"f0", "f2"}))
+    return page_html("a <scene>", layers, path, 1, 20.0, 0.3, 0.2)
+
+
+def gaussians(cloud, about=""):
+    layer, _ = Layer.of_cloud("Gaussians", cloud)
+    return replace(layer, about=about)
 
 
 def data_of(text):
@@ -62,7 +67,7 @@ def data_of(text):
 
 
 def test_a_page_holds_the_path_the_pictures_and_nothing_from_elsewhere():
-    text = page_of(Layer("Gaussians", "ten </script>", cloud_of(10, 0)))
+    text = page_of(gaussians(cloud_of(10, 0), "ten </script>"))
     data = data_of(text)
     assert "<title>a &lt;scene&gt;</title>" in text and text.count("</script>") == 2
     assert [(one["name"], one["held_out"]) for one in data["frames"]] == [("f0", False), ("f1", True), ("f2", False)]
@@ -77,15 +82,18 @@ def test_a_page_holds_the_path_the_pictures_and_nothing_from_elsewhere():
 def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
     cloud = cloud_of(50, 2)
     cloud = replace(cloud, means=cloud.means * np.float32(size), scales=cloud.scales * np.float32(size))
-    (layer,) = data_of(page_of(Layer("Gaussians", "", cloud)))["layers"]
+    (layer,) = data_of(page_of(gaussians(cloud)))["layers"]
     (tmp_path / "a.spz").write_bytes(b64decode(layer["data"]))
     read = read_splat_spz(tmp_path / "a.spz")
+    _, drawn = Layer.of_cloud("Gaussians", cloud)
+    np.testing.assert_allclose(drawn.means, read.means * layer["unit"], rtol=1e-6)
+    np.testing.assert_allclose(drawn.scales, read.scales * layer["unit"], rtol=1e-6)
     np.testing.assert_allclose(read.means * layer["unit"], cloud.means, atol=2e-5 * 10 * size)
     np.testing.assert_allclose(read.scales * layer["unit"], cloud.scales, rtol=0.033)
 
 
 def test_a_mesh_is_quantised_in_its_box():
-    (layer,) = data_of(page_of(Layer("surface", "", CUBE)))["layers"]
+    (layer,) = data_of(page_of(Layer.of_mesh("surface", "", CUBE, 0.5)))["layers"]
     data = zlib.decompress(b64decode(layer["data"]))
     corners = np.frombuffer(data[: 8 * 6], "<u2").reshape(8, 3) / 65535.0 * layer["span"] + layer["low"]
     np.testing.assert_allclose(corners, CUBE.vertices, atol=1e-4)
@@ -133,7 +141,7 @@ def as_canvas(camera, shape):
 def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree):
     cloud = cloud_of(400, degree, seed=degree)
     page = tmp_path / "page.html"
-    page.write_text(page_of(Layer("Gaussians", "", cloud)), encoding="utf-8")
+    page.write_text(page_of(gaussians(cloud)), encoding="utf-8")
     browser.open(page, 700, 400)
     for index in (1, 2):
         if index != 1:
@@ -154,7 +162,7 @@ def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree):
 def test_layers_path_and_looking_around(browser, tmp_path, width):
     page = tmp_path / "page.html"
     flat = replace(CUBE, colors=np.full((8, 3), (250, 10, 30), np.uint8))
-    layers = Layer("Gaussians", "many", cloud_of(50, 0)), Layer("surface", "6 triangles", flat)
+    layers = gaussians(cloud_of(50, 0), "many"), Layer.of_mesh("surface", "6 triangles", flat, 0.0)
     page.write_text(page_of(*layers), encoding="utf-8")
     browser.open(page, width, 600, phone=width < 500)
     drawn(browser, tmp_path / "seen.png")
@@ -168,7 +176,10 @@ def test_layers_path_and_looking_around(browser, tmp_path, width):
         column, row = pixels[0].int().tolist()
         np.testing.assert_allclose(seen[row, column], (250, 10, 30), atol=2)
     browser.run("byId('play').click()")
-    browser.run("new Promise(done => setTimeout(done, 1500))")
+    browser.run(
+        "new Promise(done => { const look = () => byId('play').textContent === 'Play' ? done()"
+        " : setTimeout(look, 50); look(); })"
+    )
     assert browser.run("[byId('frame').value, byId('play').textContent]") == ["2", "Play"]
     browser.drag("#canvas", 0.5, 0.6, touch=width < 500)
     assert browser.run("document.documentElement.scrollWidth <= innerWidth")
