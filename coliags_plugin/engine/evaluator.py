@@ -64,7 +64,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     sets = {name: frames for name, frames in scene.test_sets.items() if frames}
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name, against_truth=truth is not None)
-    evaluated = {name: EvaluatedSet() for name in sets}
+    evaluated = {name: EvaluatedSet(scene.length_unit) for name in sets}
     meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():

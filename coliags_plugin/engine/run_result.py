@@ -44,13 +44,13 @@ _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fin
 
 
 class EvaluatedSet:
-    """Scores, error profiles and hashes of one test set."""
+    """Scores, error profiles and hashes of one test set of a scene, whose unit of length is printed as ``unit``."""
 
-    def __init__(self) -> None:
+    def __init__(self, unit: str) -> None:
         self._rows: dict[str, dict[str, float]] = {}
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
-        self._profiles = ErrorProfiles()
+        self._profiles = ErrorProfiles(unit)
         self._optional: tuple[str, ...] = ()
         self._pixels = self._transparent = 0
 

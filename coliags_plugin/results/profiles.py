@@ -12,7 +12,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.results.record import ProfileRecord
 
-#: Distance from the camera's centre along the pixel's ray, mm.
+#: Distance from the camera's centre along the pixel's ray, scene units (mm).
 DISTANCE_EDGES = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0, 150.0, 200.0, 300.0)
 #: Angle of the pixel's ray to the optical axis, degrees.
 ANGLE_EDGES = tuple(float(angle) for angle in range(0, 95, 5))
@@ -22,11 +22,11 @@ class ErrorProfiles:
     """Sums of squared errors over the pixels of many frames whose true depth is known, in bins with fixed edges.
 
     A pixel counts if the frame's own true depth is finite and the protocol compares both its colour and its depth. Its
-    distance is that of the true surface; pixels beyond the last edge are left out.
+    distance is that of the true surface, in ``unit``; pixels beyond the last edge are left out.
     """
 
-    def __init__(self) -> None:
-        self._distance = _Bins("mm", DISTANCE_EDGES)
+    def __init__(self, unit: str = "mm") -> None:
+        self._distance = _Bins(unit, DISTANCE_EDGES)
         self._angle = _Bins("degrees", ANGLE_EDGES)
         self._frames = 0
 

@@ -71,11 +71,11 @@ class ProfileRecord(_Part):
     Errors of a bin are None where it has no pixels, or where a rendered one is not finite.
     """
 
-    unit: str  # of the edges: mm or degrees
+    unit: str  # of the edges: mm, units (an unknown one) or degrees
     edges: tuple[float, ...]  # of the bins, ascending. [B + 1]
     pixels: tuple[int, ...]  # with known depth in each bin. [B]
     rgb_mse: tuple[float | None, ...]  # mean squared colour error of those pixels, colours in [0, 1]. [B]
-    depth_mse: tuple[float | None, ...]  # mean squared depth error of those pixels, mm^2. [B]
+    depth_mse: tuple[float | None, ...]  # mean squared depth error of those pixels, scene units. [B]
 
     @model_validator(mode="after")
     def _one_number_per_bin(self) -> Self:

@@ -31,8 +31,8 @@ def view(camera, depth, rgb_error=0.1, depth_error=2.0, mask=None, depth_valid=N
     return compared, frame
 
 
-def profiles(*views):
-    found = ErrorProfiles()
+def profiles(*views, unit="mm"):
+    found = ErrorProfiles(unit)
     for compared, frame in views:
         found.add(compared, frame)
     return found.records()
@@ -49,6 +49,7 @@ def test_a_pixel_on_the_axis_lies_at_its_depth_and_at_angle_zero():
     found = profiles(view(camera, torch.tensor([[12.0]]), rgb_error=0.1, depth_error=3.0))
     distance, angle = found["distance"], found["angle"]
     assert distance.edges == DISTANCE_EDGES and distance.unit == "mm"
+    assert profiles(view(camera, torch.tensor([[12.0]])), unit="units")["distance"].unit == "units"
     assert distance.pixels.index(1) == DISTANCE_EDGES.index(10.0) and sum(distance.pixels) == 1
     assert distance.rgb_mse[2] == pytest.approx(0.01, rel=1e-5) and distance.depth_mse[2] == 9.0
     assert angle.pixels[0] == 1 and angle.depth_mse[0] == 9.0 and angle.unit == "degrees"

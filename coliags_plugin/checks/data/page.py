@@ -25,14 +25,14 @@ _SHOWN = 3
 
 def check_page(check: SceneCheck) -> model.Page:
     """Everything that the checks found; in the terminal without pictures, trajectory and origin of the data."""
-    name, pairs = check.scene.name, check.pairs
+    name, unit, pairs = check.scene.name, check.scene.length_unit, check.pairs
     shown = pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
     sections = [
         model.Section("Suspect", _bullets(check.findings)),
         model.Section("Undecided", _bullets(check.undecided)),
         model.Section("Agreement", _agreement(check)),
-        model.Section("Reprojected frames", [_pair_images(*pair) for pair in shown], screen_only=True),
-        model.Section("Trajectory", [_trajectory(check.scene.video)], screen_only=True),
+        model.Section("Reprojected frames", [_pair_images(*pair, unit) for pair in shown], screen_only=True),
+        model.Section("Trajectory", [_trajectory(check.scene.video, unit)], screen_only=True),
         model.Section("Data", [model.record("Origin of the data", check.scene.provenance)], screen_only=True),
     ]
     return model.Page(f"{name}: data check", sections, list(_facts(check)), heading=f"{name}: {verdict(check)}")
@@ -74,7 +74,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
         yield model.Fact("depth", "none")
     if path := check.path:
         steps = f"steps {path.mean_step:.3g} (largest {path.largest_step:.3g} to {path.largest_step_at})"
-        yield model.Fact("trajectory", f"{path.length:.4g} long, {steps}, turns {path.turn:.3g} degrees in all")
+        yield model.Fact("trajectory", f"{path.length:.4g} {unit} long, {steps}, turns {path.turn:.3g} degrees in all")
     images = check.images
     frames = f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}"
     shares = f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked"
@@ -108,7 +108,7 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
             [
                 name,
                 _percent(e.depth_error),
-                short_number(e.depth_error_mm),
+                short_number(e.depth_difference),
                 short_number(e.color_error),
                 _percent(e.share),
             ]
@@ -131,7 +131,7 @@ def _percent(share: float | None) -> str | None:
     return short_number(share, 100.0)
 
 
-def _pair_images(source: Frame, target: Frame) -> model.Figures:
+def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
     """Both images; the source warped into the target view and its difference; and the target's depth."""
     images: list[tuple[np.ndarray | torch.Tensor, str]] = [(source.image, source.name), (target.image, target.name)]
     if source.depth is not None and target.depth is not None:
@@ -152,7 +152,7 @@ def _pair_images(source: Frame, target: Frame) -> model.Figures:
         if len(known):
             low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
             limits = (low, max(high, low * 1.001))
-            images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} scene units"))
+            images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} {unit}"))
     return model.Figures(
         [model.Image(model.EncodedImage.png(rgb), caption) for rgb, caption in images],
         f"{source.name} and {target.name}",
@@ -167,16 +167,16 @@ def _checkered(shown: torch.Tensor) -> torch.Tensor:
     return ((rows + columns) % 2 == 0) & shown
 
 
-def _trajectory(video: Sequence[Frame]) -> model.Figures:
+def _trajectory(video: Sequence[Frame], unit: str) -> model.Figures:
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
     x, y, z = (values.tolist() for values in centers.T)
     frames = [float(frame.index) for frame in video]
     along = [Series("x", 0, frames, x), Series("y", 1, frames, y), Series("z", 2, frames, z)]
-    position, depth = "position, scene units", "z, scene units"
+    position, depth = f"position, {unit}", f"z, {unit}"
     return model.Figures(
         [
             model.Chart(along, "frame", position, "Camera centre along the video", legend=True),
-            model.Chart([Series("path", 3, z, x)], depth, "x, scene units", "From above"),
-            model.Chart([Series("path", 3, z, y)], depth, "y, scene units", "From the side"),
+            model.Chart([Series("path", 3, z, x)], depth, f"x, {unit}", "From above"),
+            model.Chart([Series("path", 3, z, y)], depth, f"y, {unit}", "From the side"),
         ]
     )

@@ -30,7 +30,7 @@ class ReprojectedPixels:
 
     share: float  # share of the pixels that project into the target image, in front of its camera
     depth_errors: Float[Tensor, "K"]  # |z - z_target| / z_target, of those that hit known depth. [K]
-    depth_errors_mm: Float[Tensor, "K"]  # |z - z_target|, scene units. [K]
+    depth_differences: Float[Tensor, "K"]  # |z - z_target|, scene units. [K]
     color_errors: Float[Tensor, "K"]  # mean absolute difference of the channels, grey levels, brightness matched. [K]
 
 
@@ -77,7 +77,7 @@ class Agreement:
     """Agreement of frames under one pose hypothesis: medians over the pixels of all pairs."""
 
     depth_error: float | None  # relative error of z-depth; None where no pixel hits known depth
-    depth_error_mm: float | None  # the same in scene units
+    depth_difference: float | None  # the same in scene units
     color_error: float | None  # grey levels
     share: float  # share of pixels that project into the target image
 
@@ -87,7 +87,7 @@ def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, ev
     reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
     return Agreement(
         _median([result.depth_errors for result in reprojected]),
-        _median([result.depth_errors_mm for result in reprojected]),
+        _median([result.depth_differences for result in reprojected]),
         _median([result.color_errors for result in reprojected]),
         float(np.mean([result.share for result in reprojected])) if reprojected else 0.0,
     )

@@ -20,7 +20,6 @@ from coliags_plugin.reporting.model import Block, Chart, FactList, Figures, Fold
 from coliags_plugin.results.light import LIGHT_FILE, light_charts, light_facts
 from coliags_plugin.results.record import ProfileRecord
 
-_PROFILE_AXES = {"distance": "distance to the camera [mm]", "angle": "angle to the optical axis [degrees]"}
 #: Bins with a smaller share of the pixels are left out.
 _SMALLEST_SHARE = 1e-3
 #: Ratio of largest to smallest depth error, and loss, from which on the axis is logarithmic.
@@ -46,10 +45,11 @@ def profile_section(study: Study) -> Section:
 
 
 def _profile_charts(part: Part) -> list[Chart]:
-    charts = []
-    for name, x_label in _PROFILE_AXES.items():
+    charts, unit = [], part.study.length_unit
+    axes = {"distance": f"distance to the camera [{unit}]", "angle": "angle to the optical axis [degrees]"}
+    for name, x_label in axes.items():
         profiles = {method: _profiles(part, method, name) for method in part.study.methods}
-        for title, y_label in (("PSNR", "PSNR [dB]"), ("Depth error", "RMS depth error [mm]")):
+        for title, y_label in (("PSNR", "PSNR [dB]"), ("Depth error", f"RMS depth error [{unit}]")):
             lines = [
                 _profile_line(method, style, own, of_depth=title != "PSNR")
                 for style, (method, own) in enumerate(profiles.items())

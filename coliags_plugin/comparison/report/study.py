@@ -173,6 +173,12 @@ class Study:
         return {name: metrics[name] for base in bases for name in (base, base + SEEN_SUFFIX) if name in metrics}
 
     @property
+    def length_unit(self) -> str:
+        """Unit of lengths, as printed: that of the metrics that are lengths."""
+        units = {metric.unit for metric in self.metrics.values()}
+        return "units" if any(unit.startswith("units") for unit in units) else "mm"
+
+    @property
     def scenes(self) -> list[str]:
         """Scenes with a result, in the order given."""
         return list(dict.fromkeys(run.scene for run in self.runs))

@@ -71,7 +71,7 @@ def view_section(study: Study, reference: str, count: int) -> Section:
         rgb_error=_scale_end([view for view in views if not view.of_depth]),
         depth=_depth_limits(view.true_depth for view in views if view.true_depth is not None)
         or (common_limits(expected) if expected else None),
-        unit=_depth_unit(study),
+        unit=study.length_unit,
     )
     scenes = [
         (
@@ -225,12 +225,6 @@ def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
     ticks = linear_ticks(low, high)
     step = ticks[1] - ticks[0] if len(ticks) > 1 else round_up(high - low)
     return math.floor(low / step) * step, math.ceil(high / step) * step
-
-
-def _depth_unit(study: Study) -> str:
-    """Unit of depths: that of the metrics that are lengths."""
-    units = {metric.unit for metric in study.metrics.values()}
-    return "units" if any(unit.startswith("units") for unit in units) else "mm"
 
 
 def _jpeg(rgb: np.ndarray) -> EncodedImage:

@@ -25,9 +25,10 @@ class TrueSurface:
     """The true surface of a scene."""
 
     path: Path  # where it was read from
-    mesh: TriangleMesh  # world frame of the scene, mm
+    mesh: TriangleMesh  # world frame of the scene
     seen: Bool[np.ndarray, "F"]  # True for triangles that the camera saw
     seen_by: str  # how that is known; empty where it is not, and ``seen`` is all True
+    unit: str = "mm"  # of lengths: ``mm``, or ``units`` where it is unknown
 
 
 def find_true_surface(scene: Path) -> Path | None:
@@ -69,8 +70,8 @@ def _phantom_flags(path: Path, key: str, mesh: TriangleMesh) -> Bool[np.ndarray,
     return seen
 
 
-#: Distances within which a point counts as right, mm.
-THRESHOLDS_MM = (0.5, 1.0, 2.0)
+#: Distances within which a point counts as right, scene units (mm).
+THRESHOLDS = (0.5, 1.0, 2.0)
 #: Points on each of the surfaces.
 SAMPLES = 200_000
 #: Median distance, as a share of the mesh's diagonal, above which the surfaces are not of one frame and unit.
@@ -83,7 +84,7 @@ _FEW = 200
 class Score:
     """Shares of the reconstructed and of the seen true surface that lie within a distance of the other."""
 
-    threshold_mm: float
+    threshold: float
     precision: float
     recall: float
 
@@ -117,6 +118,7 @@ class SurfaceComparison:
     beyond_seen: float  # share of the reconstructed surface whose nearest true triangle is not seen
     seen_area: float  # area of the seen true surface, mm^2
     seen_by: str  # how it is known what was seen
+    unit: str  # as that of the true surface
     samples: int  # points on each surface
 
     @property
@@ -129,9 +131,9 @@ class SurfaceComparison:
         """Larger of the two 95th percentiles, mm."""
         return max(self.accuracy.percentile_95, self.completeness.percentile_95)
 
-    def f_at(self, threshold_mm: float) -> float:
+    def f_at(self, threshold: float) -> float:
         """F-score at one of the thresholds. Raises KeyError at another."""
-        return {score.threshold_mm: score.f for score in self.scores}[threshold_mm]
+        return {score.threshold: score.f for score in self.scores}[threshold]
 
     def as_json(self) -> dict[str, Any]:
         """All figures, those that follow from others included."""
@@ -175,12 +177,13 @@ def compare_meshes(mesh: TriangleMesh, truth: TrueSurface, samples: int = SAMPLE
     return SurfaceComparison(
         accuracy=_direction(distances),
         completeness=_direction(gaps),
-        scores=tuple(Score(t, float((distances <= t).mean()), float((gaps <= t).mean())) for t in THRESHOLDS_MM),
+        scores=tuple(Score(t, float((distances <= t).mean()), float((gaps <= t).mean())) for t in THRESHOLDS),
         normal_error=float(angles.mean()),
         normal_error_median=float(np.median(angles)),
         beyond_seen=float(1.0 - truth.seen[nearest].mean()),
         seen_area=float(truth.mesh.areas[truth.seen].sum()),
         seen_by=truth.seen_by,
+        unit=truth.unit,
         samples=samples,
     )
 

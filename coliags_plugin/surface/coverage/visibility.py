@@ -29,7 +29,7 @@ class FaceViews:
     # Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
     distance: Float32[np.ndarray, "F"]
     incidence: Float32[np.ndarray, "F"]  # smallest angle between viewing ray and normal, degrees
-    pixels_per_mm: Float32[np.ndarray, "F"]  # finest sampling of the surface by the pixels of an image, pixels per mm
+    pixels_per_length: Float32[np.ndarray, "F"]  # finest sampling of the surface by an image, pixels per mm
     brightness: Float32[np.ndarray, "F"]  # highest grey value, 0 to 1; NaN also without images
     best_frame: Int[np.ndarray, "F"]  # index of the frame that sampled it most finely; -1 where unseen
 

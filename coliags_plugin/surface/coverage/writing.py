@@ -144,8 +144,6 @@ def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | Non
 def partial_values(coverage: PartialCoverage) -> dict[str, Any]:
     """What was seen of the wall, as JSON values: null is what only a section has, and limits that were not applied."""
     values = _seen_values(coverage)
-    if not coverage.metric:
-        values["seen_surface"]["median_pixels_per_mm"] = None
     return values | {
         "unit": "mm" if coverage.metric else "unknown",
         "settings": {name: value if np.isfinite(value) else None for name, value in values["settings"].items()},
@@ -171,7 +169,7 @@ def _seen_values(coverage: SeenWall) -> dict[str, Any]:
         "seen_surface": {
             "median_distance": _median(coverage, views.distance, seen),
             "median_incidence_degrees": _median(coverage, views.incidence, seen),
-            "median_pixels_per_mm": _median(coverage, views.pixels_per_mm, seen),
+            "median_pixels_per_length": _median(coverage, views.pixels_per_length, seen),
             "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
         },
     }

@@ -30,7 +30,7 @@ _AMBIENT = 0.45
 def distance_colors(
     distances: Float[np.ndarray, "N"], known: Bool[np.ndarray, "N"] | None = None
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of distances in mm on the scale of depth errors, 0 to 2 mm; grey where not known."""
+    """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not known."""
     share = np.clip(distances / DEPTH_ERROR_LIMIT_MM, 0.0, 1.0)
     colors = color_table("error")[np.rint(share * 255.0).astype(np.uint8)]
     if known is not None:
@@ -56,14 +56,15 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
             return np.full((len(triangles), 3), 200, np.uint8)
         return np.asarray(mesh.colors[mesh.triangles[triangles]].mean(axis=1))
 
+    unit = truth.unit
     rows = [
         side_by_side(
             [draw_mesh(truth.mesh, camera, missed), draw_mesh(mesh, camera, wrong), draw_mesh(mesh, camera, plain)],
-            (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour"),
+            (f"{name} {number}: true, {unit} to the mesh", f"mesh, {unit} to the true surface", "mesh, colour"),
         )
         for number, (name, camera) in enumerate(views, start=1)
     ]
-    bar = color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", width=max(row.shape[1] for row in rows))
+    bar = color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, width=max(row.shape[1] for row in rows))
     return stacked([*rows, bar])
 
 

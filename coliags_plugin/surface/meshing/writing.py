@@ -78,8 +78,9 @@ def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
     if path is None or (given is None and not scene.is_metric):
         return None
     if not scene.is_metric:
-        _check_same_world(scene, path)
-    surface = read_true_surface(path)
+        surface = replace(read_true_surface(path), unit=_same_world(scene, path).length_unit)
+    else:
+        surface = read_true_surface(path)
     if surface.seen_by:
         return surface
     seen = first_hits(surface.mesh, scene.train)
@@ -102,7 +103,7 @@ def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, 
     return seen
 
 
-def _check_same_world(scene: Scene, truth: Path) -> None:
+def _same_world(scene: Scene, truth: Path) -> Scene:
     """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
     if not truth.is_dir():
         raise InputError(
@@ -110,7 +111,7 @@ def _check_same_world(scene: Scene, truth: Path) -> None:
             "the folder of a scene with the same poses, and with a true surface",
             "Pass --truth SCENE, or give the scene its scale first (docs/poses.md)",
         )
-    match_truth(scene, open_scene(truth))
+    return match_truth(scene, open_scene(truth)).scene
 
 
 def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scene: Scene) -> None:
@@ -160,24 +161,25 @@ def _relative_path(path: Path, scene: Scene) -> str:
 
 def comparison_blocks(compared: SurfaceComparison) -> list[Block]:
     """The figures of a comparison as two tables and a few sentences."""
+    unit = compared.unit
     directions = {
         "accuracy: mesh to true surface": compared.accuracy,
         "completeness: seen to mesh": compared.completeness,
     }
     distances = [[name, f"{d.mean:.3f}", f"{d.median:.3f}", f"{d.percentile_95:.3f}"] for name, d in directions.items()]
     shares = [
-        [f"{score.threshold_mm:g} mm", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
+        [f"{score.threshold:g} {unit}", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
         for score in compared.scores
     ]
     return [
-        simple_table(["mm", "mean", "median", "95 %"], distances),
+        simple_table([unit, "mean", "median", "95 %"], distances),
         simple_table(["within", "precision", "recall", "F"], shares),
         Paragraph(
-            f"Chamfer distance (mean of both means) {compared.chamfer:.3f} mm, HD95 {compared.hausdorff_95:.3f} mm, "
-            f"normals {compared.normal_error:.1f} degrees off"
+            f"Chamfer distance (mean of both means) {compared.chamfer:.3f} {unit}, "
+            f"HD95 {compared.hausdorff_95:.3f} {unit}, normals {compared.normal_error:.1f} degrees off"
         ),
         Paragraph(
-            f"seen: {compared.seen_area:.0f} mm^2 ({compared.seen_by}); "
+            f"seen: {compared.seen_area:.0f} {unit}^2 ({compared.seen_by}); "
             f"{compared.beyond_seen:.1%} of the mesh lies beyond it"
         ),
     ]

@@ -356,7 +356,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
     assert facts["data"]["frames"]["train"] == 21
     page = (tmp_path / "check.html").read_text()
     assert page.count("<img ") == 18
-    assert "z, scene units" in page
+    assert "z, mm" in page
 
 
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):

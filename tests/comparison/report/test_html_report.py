@@ -280,6 +280,18 @@ def test_curves_against_steps_and_seconds(tmp_path, two_runs):
     assert [kinds.count(kind) for kind in ("by-step", "by-seconds")] == [2, 2]
 
 
+def test_lengths_of_unknown_unit_are_in_units(tmp_path):
+    result = result_of("coliags")
+    metrics = {
+        name: metric.model_copy(update={"unit": metric.unit.replace("mm", "units")})
+        for name, metric in result.metrics.items()
+    }
+    page = report(tmp_path, [write_run(tmp_path / "run", result.model_copy(update={"metrics": metrics}))])
+    assert "PSNR [dB] over distance to the camera [units]" in page.charts()
+    assert "RMS depth error [units] over angle to the optical axis [degrees]" in page.charts()
+    assert "[mm]" not in page.words
+
+
 def test_profiles_are_pooled_by_pixels(tmp_path):
     """RGB errors .001 and .004 are 30 and 24 dB; the empty bin is left out, and so is one of few pixels."""
     results = [result_of("coliags"), result_of("coliags", "sigmoid"), result_of("3dgs")]

@@ -52,7 +52,7 @@ def test_a_sphere_seen_from_its_centre():
     assert views.frames.max() == 1 and (views.best_frame[views.seen] == 0).all() and (views.best_frame < 1).all()
     assert np.isnan(views.distance[~views.seen]).all() and np.isnan(views.brightness).all()
     # On the axis, a pixel of 1/f radians covers r / f of the surface.
-    assert views.pixels_per_mm[views.seen].min() == pytest.approx(lens.fx / radius, rel=0.02)
+    assert views.pixels_per_length[views.seen].min() == pytest.approx(lens.fx / radius, rel=0.02)
 
 
 def test_an_occluder_hides_its_shadow():
@@ -74,7 +74,7 @@ def test_two_frames_are_counted_and_the_best_of_each_measure_is_kept():
     assert views.frames[middle] == 2 and views.best_frame[middle] == 1
     assert views.distance[middle] == pytest.approx(20.0, abs=0.15)
     assert views.brightness[middle] == pytest.approx(200 / 255, abs=1e-3)
-    assert views.pixels_per_mm[middle] == pytest.approx(40.0 / 20.0, rel=0.02)
+    assert views.pixels_per_length[middle] == pytest.approx(40.0 / 20.0, rel=0.02)
 
 
 def test_triangles_between_the_rays_are_seen_by_their_centroids():

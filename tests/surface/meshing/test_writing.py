@@ -11,6 +11,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.terminal import terminal_text
@@ -115,6 +116,11 @@ def test_a_scene_of_unknown_scale(truth, tmp_path):
     write_mesh(folder / "truth/mesh.ply", wall_mesh())
     made = mesh_run(run, tmp_path / "compared", SETTINGS, formats=("ply",), truth=folder)
     assert made.comparison.f_at(0.5) > 0.9
+    assert made.comparison.unit == "mm", "the unit that the scene shares with that of the truth"
+    write_unit(folder, "unknown")
+    compared = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder).comparison
+    printed = terminal_text(comparison_blocks(compared))
+    assert f"{compared.chamfer:.3f} units" in printed and "mm" not in printed
     scene = wall_scene(9, 160, 120)
     shift = torch.zeros(4, 4)
     shift[0, 3] = 3.0
