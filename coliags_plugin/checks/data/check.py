@@ -13,7 +13,7 @@ from coliags_plugin.checks.data import facts
 from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import CHANGES
-from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, follow, match
+from coliags_plugin.checks.data.matches import EpipolarAgreement, FrameMatches, epipolar_agreement, follow, match
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale, Pair, agreement, best_scale
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.progress import Progress, with_progress
@@ -77,18 +77,20 @@ def check_scene(
     """Run all checks on a scene.
 
     ``at_stored_size`` loads the same scene with images of the stored size, in which points are matched if there is no
-    depth; None: those of ``scene``. They are matched by features, or where these fail, as in patients, followed from
-    frame to frame.
+    depth, or hardly any that can be trusted; None: those of ``scene``. They are matched by features. Where these fail,
+    as in patients, or contradict the poses, points are followed from frame to frame, which is more reliable.
     """
     video = scene.video
     sample = facts.sampled_frames(video)
     pairs = video_pairs(video)
-    with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
+    known = {(a, b): pair for a, b in pairs if (pair := Pair(a, b)).is_known}
+    with_depth = list(known.values()) if len(known) >= _JUDGED * len(pairs) else []
     agreements: dict[str, Agreement] = {}
     matches: dict[str, EpipolarAgreement] = {}
     matched_by: Literal["features", "tracks"] | None = None
     undecided: list[Finding] = []
     if with_depth:
+        pairs = [*known]
         for name in with_progress(list(CHANGES), "compare frames", progress):
             agreements[name] = agreement(with_depth, name)
     else:
@@ -98,22 +100,23 @@ def check_scene(
         place = {frame.name: number for number, frame in enumerate(full)}
         matched_by = "features"
         matched = match([(full[place[source.name]], full[place[target.name]]) for source, target in pairs])
-        if len(matched) < _MATCHED * len(pairs):
+        few = len(matched) < _MATCHED * len(pairs)
+        if few or any(rules.match_findings(_readings(matched))):
             # Points are lost over long ways.
-            matched_by, pairs = "tracks", video_pairs(video)
-            stretches = [full[place[source.name] : place[target.name] + 1] for source, target in pairs]
-            matched = follow(stretches, progress)
+            near = video_pairs(video)
+            followed = follow([full[place[source.name] : place[target.name] + 1] for source, target in near], progress)
+            if few or len(followed) >= _JUDGED * len(near):
+                matched_by, pairs, matched = "tracks", near, followed
         if len(matched) < _JUDGED * len(pairs):
             undecided = list(rules.unmatched(len(matched), len(pairs)))
         else:
-            errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
-            matches = {name: error for name, error in errors.items() if error is not None}
+            matches = _readings(matched)
             undecided = list(rules.undecided(matches))
     scale = best_scale(with_depth) if with_depth else None
     depth, path = facts.depth_facts(sample), facts.path_facts(video)
     images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
     findings = [
-        *rules.agreement_findings(agreements, scale, path, depth),
+        *rules.agreement_findings(agreements, scale, path, depth, is_estimated(video)),
         *rules.match_findings(matches),
         *rules.points_findings(scene.provenance),
         *rules.depth_findings(depth, scene.is_metric),
@@ -125,6 +128,17 @@ def check_scene(
     return SceneCheck(
         scene, pairs, depth, path, images, lamp, agreements, scale, matches, matched_by, findings, undecided
     )
+
+
+def is_estimated(frames: Sequence[Frame]) -> bool:
+    """Whether the depth of frames is an estimate, with a confidence."""
+    return any(frame.depth_confidence is not None for frame in frames)
+
+
+def _readings(matched: Sequence[FrameMatches]) -> dict[str, EpipolarAgreement]:
+    """Agreement of the matches with each pose hypothesis under which the camera moves."""
+    errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
+    return {name: error for name, error in errors.items() if error is not None}
 
 
 def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, Frame]]:

@@ -13,8 +13,10 @@ from coliags_plugin.checks.data.matches import EpipolarAgreement
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale
 from coliags_plugin.core.scenes import Frame
 
-#: Largest median depth difference of agreeing frames, relative to the depth; and under the pose hypothesis.
-MAX_DEPTH_ERROR, MAX_CHANGED_ERROR = 0.02, 0.04
+#: Largest median depth difference of agreeing frames, relative to the depth, if it is true; and if it is estimated: two
+#: normal errors that are below 5 % with the least probability compared, 0.8, differ by 3.7 %. It may be twice as large
+#: under a pose hypothesis.
+MAX_DEPTH_ERROR, MAX_ESTIMATE_ERROR = 0.02, 0.04
 #: Smaller errors, of the depth and of epipolar distances in px, are limited by sampling and sharpness, and no evidence.
 DEPTH_RESOLUTION, EPIPOLAR_RESOLUTION = 0.005, 0.5
 #: A pose hypothesis is reported when it reduces the error by this factor.
@@ -94,12 +96,17 @@ def lamp_findings(lamp: LampFacts | None) -> Iterator[Finding]:
 
 
 def agreement_findings(
-    readings: Mapping[str, Agreement], scale: BestScale | None, path: PathFacts | None, depth: DepthFacts | None
+    readings: Mapping[str, Agreement],
+    scale: BestScale | None,
+    path: PathFacts | None,
+    depth: DepthFacts | None,
+    estimated: bool,
 ) -> Iterator[Finding]:
     """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
     given = readings.get(GIVEN)
     if given is None or path is None or path.length == 0.0 or depth is None or _is_flat(depth):
         return
+    tolerance = MAX_ESTIMATE_ERROR if estimated else MAX_DEPTH_ERROR
     error = math.inf if given.depth_error is None or given.share < MIN_SHARE else given.depth_error
     errors = (
         f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels project into "
@@ -122,13 +129,13 @@ def agreement_findings(
             f"as given, {errors}; with depth times {scale.factor:.3g}, {_percent(by_scale)}",
             f"Check the units: depth seems to be {1.0 / scale.factor:.3g} times what the poses expect",
         )
-    elif best is not None and error > DEPTH_RESOLUTION and least * CLEARLY_BETTER < error and least < MAX_CHANGED_ERROR:
+    elif best is not None and error > DEPTH_RESOLUTION and least * CLEARLY_BETTER < error and least < 2.0 * tolerance:
         yield Finding(
             f"poses agree with depth when read as: {best}",
             f"as given, {errors}; read this way, {_percent(least)}",
             ADVICE[best],
         )
-    elif error > MAX_DEPTH_ERROR:
+    elif error > tolerance:
         still = readings[NO_MOTION].depth_error
         yield Finding(
             "frames do not agree on the surface",

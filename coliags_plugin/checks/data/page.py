@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from coliags_plugin.checks.data.check import SceneCheck
+from coliags_plugin.checks.data.check import SceneCheck, is_estimated
 from coliags_plugin.checks.data.findings import Finding
-from coliags_plugin.checks.data.reprojection import warp_image
+from coliags_plugin.checks.data.reprojection import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
@@ -98,9 +98,11 @@ def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
     gaps = [target.index - source.index for source, target in check.pairs] or [0]
     apart = f"{min(gaps)} to {max(gaps)} frames"
     if check.agreement:
+        estimated = is_estimated(check.scene.video)
+        trusted = f" of depth with a confidence of {LEAST_CONFIDENCE:g} or more" if estimated else ""
         note = (
             f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; medians "
-            "over all pixels. If the given poses are not the best row, they are suspect."
+            f"over all pixels{trusted}. If the given poses are not the best row, they are suspect."
         )
         lengths = f"depth error, {check.scene.length_unit}"
         head = ["depth error, %", lengths, "colour error, grey levels", "projects into the image, %"]

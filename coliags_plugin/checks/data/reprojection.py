@@ -18,6 +18,8 @@ from coliags_plugin.core.scenes import Frame
 _PIXELS = 4000
 #: Factors on depth of the coarse search.
 _SCALES = np.logspace(-4.0, 4.0, 65)
+#: Least confidence of estimated depth that is compared: it follows a prior where little is known.
+LEAST_CONFIDENCE = 0.8
 #: Stride of the pixels used in that search.
 _STRIDE = 8
 #: Smallest share of pixels that project into the other image for a factor to count.
@@ -48,6 +50,11 @@ class Pair:
         self._depth_there = there.reshape(-1)
         self._colors = source.image.reshape(-1, 3)[chosen].double()
         self._colors_there = target.image.reshape(-1, 3).double()
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is depth to compare in both frames."""
+        return bool(len(self._points) and torch.isfinite(self._depth_there).any())
 
     def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> ReprojectedPixels:
         """Reproject every n-th of the source's pixels, with both poses changed and both depths times ``scale``."""
@@ -138,10 +145,12 @@ def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bo
 
 
 def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
-    depth = frame.depth
+    """Depth that is compared; NaN where it is unknown, masked or estimated with little confidence."""
+    depth, confidence = frame.depth, frame.depth_confidence
     if depth is None:
         return torch.full(frame.image.shape[:2], torch.nan, dtype=torch.float64)
-    return torch.where(frame.valid, depth.double(), torch.nan)
+    trusted = frame.valid if confidence is None else frame.valid & (confidence >= LEAST_CONFIDENCE)
+    return torch.where(trusted, depth.double(), torch.nan)
 
 
 def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:

@@ -15,7 +15,7 @@ from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.findings import image_findings, path_findings
 from coliags_plugin.checks.data.hypotheses import CHANGES
-from coliags_plugin.checks.data.matches import epipolar_agreement, follow, match, supported
+from coliags_plugin.checks.data.matches import FrameMatches, epipolar_agreement, follow, match, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.checks.data.reprojection import Pair, agreement, best_scale
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -112,6 +112,66 @@ def test_depth_in_another_unit_than_poses(scene, factor):
     assert "depth and poses are in different units" in findings
     measured = float(findings.split("depth seems to be ")[1].split(" times")[0])
     assert measured == pytest.approx(factor, rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def estimate(scene):
+    """The scene with depth as estimated: 3 % wrong where it is confident, and anything in a corner where it is not."""
+    generator = torch.Generator().manual_seed(0)
+
+    def of(frame: Frame) -> Frame:
+        whole = frame.to("cpu")
+        depth = whole.depth * (1.0 + 0.03 * torch.randn(whole.depth.shape, generator=generator))
+        confidence = torch.full_like(depth, 0.9)
+        depth[:80, :100], confidence[:80, :100] = 7.0, 0.3
+        return replace(whole, depth=depth, depth_confidence=confidence)
+
+    sets = {name: [of(frame) for frame in frames] for name, frames in scene.test_sets.items()}
+    return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
+
+
+def test_estimated_depth_is_judged_where_it_is_confident(estimate):
+    check = check_scene(estimate)
+    assert check.findings == []
+    assert 0.02 < check.agreement["given"].depth_error < 0.04
+    assert "confidence of 0.8 or more" in page_text(check_page(check))
+    true = {
+        name: [replace(frame, depth_confidence=None) for frame in frames]
+        for name, frames in {"train": estimate.train, **estimate.test_sets}.items()
+    }
+    test = {"test": true["test"]}
+    assert "frames do not agree on the surface" in whats(replace(estimate, train=true["train"], test_sets=test))
+
+
+@pytest.mark.parametrize("wrong", ["scaled", "late", "reversed", "inverted"])
+def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
+    poses = [frame.camera.camera_to_world for frame in estimate.video]
+    given = {
+        "scaled": [scaled_translation(pose, 3.0) for pose in poses],
+        "late": poses[3:] + poses[-1:] * 3,
+        "reversed": poses[::-1],
+        "inverted": [torch.linalg.inv(pose) for pose in poses],
+    }[wrong]
+    of = {frame.name: pose for frame, pose in zip(estimate.video, given, strict=True)}
+
+    def posed(frames: list[Frame]) -> list[Frame]:
+        return [
+            replace(frame, camera=replace(frame.camera, camera_to_world=of[frame.name].clone())) for frame in frames
+        ]
+
+    sets = {name: posed(frames) for name, frames in estimate.test_sets.items()}
+    what = "read as: world-to-camera" if wrong == "inverted" else "frames do not agree on the surface"
+    assert what in whats(replace(estimate, train=posed(estimate.train), test_sets=sets))
+
+
+def test_depth_that_is_not_confident_anywhere_leaves_poses_to_the_images(estimate):
+    sets = {"train": estimate.train, **estimate.test_sets}
+    doubted = {
+        name: [replace(frame, depth_confidence=torch.zeros_like(frame.depth)) for frame in frames]
+        for name, frames in sets.items()
+    }
+    check = check_scene(replace(estimate, train=doubted["train"], test_sets={"test": doubted["test"]}))
+    assert (check.findings, check.agreement, check.matched_by) == ([], {}, "features")
 
 
 def test_everything_in_metres(scene):
@@ -314,6 +374,18 @@ def test_where_features_fail_points_are_followed(unmatched):
     assert check.matches["given"].error < 1.0
     assert check.matches["given"].count > 500
     assert "Points followed through" in page_text(check_page(check))
+
+
+def test_where_features_contradict_right_poses_points_are_followed(scene, monkeypatch):
+    def wrong(pairs):
+        rng = np.random.default_rng(0)
+        return [FrameMatches(source, target, *rng.uniform(20, 120, (2, 60, 2))) for source, target in pairs]
+
+    monkeypatch.setattr("coliags_plugin.checks.data.check.match", wrong)
+    check = check_scene(changed(scene, depth=lambda depth: None))
+    assert (check.findings, check.matched_by) == ([], "tracks")
+    monkeypatch.setattr("coliags_plugin.checks.data.check.follow", lambda stretches, progress: [])
+    assert "images do not agree with the poses" in whats(changed(scene, depth=lambda depth: None))
 
 
 def test_points_are_followed_through_frames(scene):

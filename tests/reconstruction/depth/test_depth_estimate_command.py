@@ -72,6 +72,19 @@ def contents(folder):
     return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+def test_the_data_check_trusts_the_estimate_and_contradicts_other_poses(estimated, tmp_path, capsys):
+    assert run("data", "check", estimated) == 0
+    assert "nothing suspect" in capsys.readouterr().out
+    wrong = shutil.copytree(estimated, tmp_path / "wrong")
+    content = json.loads((wrong / "transforms.json").read_text())
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 1.5
+    (wrong / "transforms.json").write_text(json.dumps(content))
+    assert run("data", "check", wrong) == 1
+    assert "depth and poses are in different units" in capsys.readouterr().out
+
+
 def test_a_wall(wall, estimated):
     errors, sure = [], []
     for one, other in zip(frames_of(estimated), frames_of(wall), strict=True):
