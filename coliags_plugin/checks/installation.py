@@ -32,19 +32,24 @@ LIBRARIES = {
 
 
 def check_installation() -> list[CheckResult]:
-    """Check everything that training and evaluation depend on."""
-    device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "no device: everything runs on the CPU"
+    """Check everything that training and evaluation depend on; what is missing and not required is skipped."""
     threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs"
     results = [
         CheckResult("coliags_plugin", "passed", __version__),
         CheckResult("python", "passed", f"{platform.python_version()} on {platform.machine()}"),
         CheckResult("torch", "passed", f"{torch.__version__}, {threads}"),
-        CheckResult("cuda", "passed", device),
+        _cuda(),
     ]
     results += [_library(name, module) for name, module in LIBRARIES.items()]
     results += [_renderer(name) for name in registry.renderers]
     results += [_lpips(net) for net in DEFAULT_NETS]
     return results
+
+
+def _cuda() -> CheckResult:
+    if torch.cuda.is_available():
+        return CheckResult("cuda", "passed", torch.cuda.get_device_name(0))
+    return CheckResult("cuda", "skipped", "no device: everything runs on the CPU")
 
 
 def _library(name: str, module: str) -> CheckResult:
@@ -68,7 +73,9 @@ def _renderer(name: str) -> CheckResult:
             return CheckResult(title, "failed", str(error))
         return CheckResult(title, "passed", f"would use {chosen.name} ({chosen.reason})")
     available = component.target.availability()
-    return CheckResult(title, "passed", f"{'can' if available.ok else 'cannot'} run here: {available.reason}")
+    if available.ok:
+        return CheckResult(title, "passed", f"can run here: {available.reason}")
+    return CheckResult(title, "skipped", f"cannot run here: {available.reason}")
 
 
 def _lpips(net: str) -> CheckResult:
@@ -78,5 +85,5 @@ def _lpips(net: str) -> CheckResult:
     except UnavailableError as error:
         folders = ", ".join(map(str, searched_folders()))
         detail = f"{error}. Looked in {folders}; {WEIGHTS_VARIABLE} can name a folder that has them"
-        return CheckResult(f"weights of LPIPS {net}", "passed", detail)
+        return CheckResult(f"weights of LPIPS {net}", "skipped", detail)
     return CheckResult(f"weights of LPIPS {net}", "passed", f"{backbone} and {heads}")

@@ -10,9 +10,11 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Runnable, renamed_argument
+from coliags_plugin._version import __version__
+from coliags_plugin.cli.arguments import Runnable
 from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
 from coliags_plugin.cli.depth import DepthCommand
+from coliags_plugin.cli.hints import hint
 from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
 from coliags_plugin.cli.making_runs import EvaluateCommand, ImportCommand, TrainCommand
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, ListCommand
@@ -21,6 +23,7 @@ from coliags_plugin.cli.reconstruct import ReconstructCommand
 from coliags_plugin.cli.results import ReportCommand, ResultsCommand
 from coliags_plugin.cli.run_outputs import CoverageCommand, ExportCommand, MeshCommand, RenderCommand, ViewCommand
 from coliags_plugin.cli.scenes import DataCommand, PhantomCommand
+from coliags_plugin.core.decoder_messages import separate_stderr
 from coliags_plugin.core.errors import ReportedError
 
 Command = (
@@ -50,7 +53,10 @@ Command = (
 
 #: Exit status for arguments that cannot be parsed.
 _USAGE_ERROR = 2
-DESCRIPTION = "Gaussian splatting for colonoscopy: training, evaluation and comparison of reconstruction methods."
+DESCRIPTION = (
+    "Gaussian splatting for colonoscopy: training, evaluation and comparison of reconstruction methods. "
+    "--version prints the version."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -59,13 +65,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of an idle machine and loses little on a
     # busy one. It is read when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    if argv is None:
+        separate_stderr()
+    words = sys.argv[1:] if argv is None else argv
+    if list(words) == ["--version"]:
+        print(f"coliags {__version__}")
+        sys.exit(0)
     try:
         command = tyro.cli(
-            Command, prog="coliags", description=DESCRIPTION, args=argv, config=(tyro.conf.FlagCreatePairsOff,)
+            Command, prog="coliags", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
         )
     except SystemExit as refused:
-        if refused.code == _USAGE_ERROR and (hint := renamed_argument(sys.argv[1:] if argv is None else argv)):
-            print(f"coliags: {hint}", file=sys.stderr)
+        if refused.code == _USAGE_ERROR and (meant := hint(words, Command)):
+            print(f"coliags: {meant}", file=sys.stderr)
         raise
     except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does
         sys.stderr.close()
@@ -75,15 +87,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run_command(command: Runnable) -> int:
     """Execute a command; reported errors become one line on stderr and an exit status."""
-    from rich.console import Console
-    from rich.logging import RichHandler
+    from coliags_plugin.cli.log_lines import LogLines
 
-    console = Console(file=sys.stderr)
-    logging.basicConfig(
-        level=logging.INFO,
-        format="%(message)s",
-        handlers=[RichHandler(console=console, show_time=False, show_path=False, show_level=False, highlighter=None)],
-    )
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[LogLines(sys.stderr)])
     try:
         command.run()
     except ReportedError as error:

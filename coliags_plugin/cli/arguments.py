@@ -1,10 +1,9 @@
-"""Arguments that several commands share, each with its help; their parsing, and checks of output folders."""
+"""Arguments that several commands share, each with its help; parsing of their values, and checks of output folders."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
 
@@ -18,16 +17,19 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="Settings")
 
-_PATH = tyro.conf.arg(metavar="PATH")
+#: Of options whose help says what is done without them, or which are flags.
+_NO_DEFAULT = ""
 
-OptionalPath = Annotated[Path | None, _PATH]
-OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
-OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
-OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM")]
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint=_NO_DEFAULT)]
+OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_NO_DEFAULT)]
+OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM", help_behavior_hint=_NO_DEFAULT)]
+#: What is done by default: ``--no-NAME``, which its help describes, leaves it out.
+DoneByDefault = Annotated[bool, tyro.conf.arg(help_behavior_hint=_NO_DEFAULT)]
 
 #: ``--output`` or ``-o``: the one spelling of where a command writes.
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
-OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
+OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
 #: ``--set key=value``, repeatable.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
@@ -37,11 +39,16 @@ SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
 DataFormat = Annotated[
     str | None,
     tyro.conf.arg(
-        metavar="NAME", help="Dataset format (`coliags list datamanagers`); default: recognised from the files."
+        metavar="NAME",
+        help="Dataset format (`coliags list datamanagers`); default: recognised from the files.",
+        help_behavior_hint=_NO_DEFAULT,
     ),
 ]
 MovedData = Annotated[
-    Path | None, tyro.conf.arg(metavar="PATH", help="The scene's folder, where it has moved since training.")
+    Path | None,
+    tyro.conf.arg(
+        metavar="PATH", help="The scene's folder, where it has moved since training.", help_behavior_hint=_NO_DEFAULT
+    ),
 ]
 Device = Annotated[Literal["auto", "cpu", "cuda"], tyro.conf.arg(help="Device to compute on.")]
 Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
@@ -69,20 +76,6 @@ class CommandGroup:
     def run(self) -> None:
         """Execute the subcommand."""
         self.subcommand.run()
-
-
-def renamed_argument(argv: Sequence[str]) -> str:
-    """What stands today for an argument of an older release among some that could not be parsed; empty without one."""
-    options = {word.partition("=")[0] for word in argv}
-    for old in ("--out", "--save"):
-        if old in options:
-            return f"{old} is now --output, or -o"
-    is_positional = list(argv[:1]) == ["phantom"] or list(argv[:2]) == ["poses", "convert"]
-    if is_positional and not options & {"--output", "-o"}:
-        return "what is written is now named by --output, or -o"
-    if any(option == "--json" and path.endswith(".json") for option, path in pairwise(argv)):
-        return "--json prints the summary, and takes no file: write `--json > FILE`"
-    return ""
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -25,7 +25,8 @@ class DoctorCommand:
         from coliags_plugin.reporting.terminal import terminal_text
 
         results = check_installation()
-        facts = [Fact(f"{'BAD' if each.status == 'failed' else 'ok '} {each.name}", each.detail) for each in results]
+        marks = {"passed": "ok ", "failed": "BAD", "skipped": "-  "}
+        facts = [Fact(f"{marks[each.status]} {each.name}", each.detail) for each in results]
         text = terminal_text([FactList(facts)])
         print_summary(text, {"checks": [asdict(each) for each in results]}, as_json=self.json)
         if any(each.status == "failed" for each in results):

@@ -21,8 +21,8 @@ class RenderCommand:
     """Folder to create; default RUN/renders, with --light or --flatten RUN/relit."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
-    video: bool = True
-    """Also write trajectory.mp4, rgb beside depth."""
+    video: arguments.DoneByDefault = True
+    """Do not write trajectory.mp4, rgb beside depth."""
     fps: float = 15.0
     """Frames per second of the video."""
     depth_kind: Literal["accumulated", "expected", "median"] = "expected"
@@ -192,8 +192,8 @@ class ExportCommand:
     lamp at the mean training camera; flattened: the same distance and angle everywhere."""
     seconds: float = 180.0
     """Time limit, seconds, of the fit of baked Gaussians to the run's renderings, done where baking loses much."""
-    measure: bool = True
-    """Compare each file with the run on the held-out views, for the record and the terminal."""
+    measure: arguments.DoneByDefault = True
+    """Do not compare each file with the run on the held-out views, for the record and the terminal."""
     format: tuple[Literal["ply", "spz", "splat", "glb"], ...] = ("ply",)
     """Formats, all of one baking: PLY as 3DGS writes it, SPZ, .splat, glTF with KHR_gaussian_splatting. Lengths stay
     those of the scene (mm)."""
@@ -242,8 +242,8 @@ class ViewCommand:
     better: ssh -L 8080:localhost:8080 THIS_MACHINE, and open http://localhost:8080 there."""
     port: int = 8080
     """Port to listen on; 0: any free one."""
-    open: bool = True
-    """Open a browser, where there is a display."""
+    open: arguments.DoneByDefault = True
+    """Do not open a browser, as is done where there is a display."""
     data: arguments.MovedData = None
     device: arguments.Device = "auto"
     json: arguments.AsJson = False

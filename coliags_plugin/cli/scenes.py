@@ -92,14 +92,14 @@ class DataCommand:
 
         with progress_callback() as progress:
             scene = open_scene(self.scene, self.format, self.set, progress)
-            at_stored_size = partial(open_scene, self.scene, self.format, self.set, stored_size=True)
+            at_stored_size = partial(open_scene, self.scene, scene.provenance["dataset"], self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
         if self.anonymous:
             check = check.anonymous()
         page = check_page(check)
         if self.html is not None:
             write_html(page, self.html)
-        chosen = [f"datamanager.{key}" for key in self.set]
+        chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
         chosen += [] if self.format is None else [f"datamanager.name={self.format}"]
         is_ready = check.depth is not None and not check.findings
         print_summary(

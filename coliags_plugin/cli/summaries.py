@@ -57,9 +57,8 @@ def depth_commands(scene: Path, assignments: Sequence[str] = ()) -> list[str]:
     ``assignments`` are options of its data manager, ``datamanager.KEY=VALUE``.
     """
     with_depth = scene.with_name(f"{scene.name}-depth")
-    options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])
     return [
-        coliags("depth", "estimate", scene, "--output", with_depth, *options),
+        coliags("depth", "estimate", scene, "--output", with_depth, *_set(assignments)),
         train_command(with_depth, ESTIMATED_DEPTH_METHOD, assignments),
     ]
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +21,7 @@ from coliags_plugin.config.components import (
     RendererNode,
     SamplerNode,
     StrategyNode,
+    make_component,
 )
 from coliags_plugin.config.method_files import is_path, method_files
 from coliags_plugin.config.yaml_tree import (
@@ -70,6 +72,10 @@ class ScheduleSettings(Settings):
     checkpoint_every: int = Field(default=5_000, ge=1)  # steps between checkpoints; the last step has one, too
 
 
+#: Parts of a method that are one component, and its kind.
+_SECTIONS = {"datamanager": "datamanagers", "field": "fields", "renderer": "renderers", "strategy": "strategies"}
+
+
 class MethodConfig(Settings):
     """A method: named components and their settings, as in a run folder's ``config.yaml``."""
 
@@ -108,6 +114,14 @@ class MethodConfig(Settings):
             known = ", ".join(registry.protocols.names())
             raise ValueError(f"no protocol '{name}'; known: {known}. {did_you_mean(name, registry.protocols.names())}")
         return name
+
+    @classmethod
+    def _meant(cls, key: str, data: Mapping[str, object]) -> str:
+        for section, kind in _SECTIONS.items():
+            with suppress(ValueError):  # a component with a problem of its own
+                if key in type(make_component(kind, data.get(section)).settings).model_fields:
+                    return f"Did you mean '{section}.{key}'?"
+        return super()._meant(key, data)
 
     def to_yaml(self) -> str:
         """The whole config, defaults included; itself a valid method config."""

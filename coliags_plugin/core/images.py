@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from coliags_plugin.core import bounds
+from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 
@@ -32,17 +34,16 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
     _check_size(path, data)
     image = None
-    if data and (not data.startswith(_PNG[:4]) or _is_whole_png(data)):
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
-        except cv2.error:  # of more than 2^30 pixels, for instance
-            image = None
-    if image is None:
-        raise InputError(
-            f"{path} ({len(data)} bytes) cannot be decoded",
-            "a complete image",
-            "It is damaged or cut short: fetch it again",
-        )
+    with decoder_messages():
+        if data and (not data.startswith(_PNG[:4]) or _is_whole_png(data)):
+            with suppress(cv2.error):  # of more than 2^30 pixels, for instance
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
+        if image is None:
+            raise InputError(
+                f"{path} ({len(data)} bytes) cannot be decoded",
+                "a complete image",
+                "It is damaged or cut short: fetch it again",
+            )
     return np.asarray(image)
 
 
@@ -58,6 +59,12 @@ def kind_of(image: np.ndarray) -> str:
     """Words for the channels and the type of decoded pixels, for errors."""
     channels = 1 if image.ndim == 2 else image.shape[2]
     return f"an image of {channels} channel{'s' * (channels > 1)} of {image.dtype}"
+
+
+def sizes_text(sizes: Iterable[tuple[int, int]]) -> str:
+    """Widths and heights as text: ``338 x 222``, or the smallest and largest of several, ``338 x 222 to 338 x 224``."""
+    found = sorted(set(sizes))
+    return " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((found[0], found[-1])))
 
 
 def _check_size(path: Path, data: bytes) -> None:

@@ -30,8 +30,9 @@ class LockedError(InputError):
 def locked(file: Path, what: str | Path, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock of a file, which ends with the process, however that ends.
 
-    The file is created, names the process that has the lock, and stays. ``what`` it protects is for messages. Another
-    process is waited for so many seconds, or without end; LockedError if it still holds the lock.
+    The file names the process that has the lock; it is removed at the end, and stays after a kill. ``what`` it protects
+    is for messages. Another process is waited for so many seconds, or without end; LockedError if it still holds the
+    lock.
     """
     make_folder(file.parent)
     lock = FileLock(file, poll_interval=_POLL_INTERVAL_S)
@@ -57,6 +58,8 @@ def locked(file: Path, what: str | Path, wait: float = 0.0) -> Iterator[None]:
             file.write_text(f"process {os.getpid()} on {platform.node()} since {began}", encoding="utf-8")
         yield
     finally:
+        with suppress(OSError):  # on Windows an open file
+            file.unlink()  # before the release: who waits for the removed file opens the next one
         lock.release()
 
 

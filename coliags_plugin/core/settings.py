@@ -37,7 +37,7 @@ class Settings(BaseModel):
             key: PydanticCustomError(
                 "unknown_key",
                 "unknown key '{key}'; known keys: {known}. {hint}",
-                {"key": str(key), "known": known, "hint": did_you_mean(str(key), cls.model_fields)},
+                {"key": str(key), "known": known, "hint": cls._meant(str(key), data)},
             )
             for key in data
             if key not in cls.model_fields
@@ -50,6 +50,11 @@ class Settings(BaseModel):
             details = [InitErrorDetails(type=why, loc=(key,), input=data[key]) for key, why in problems.items()]
             raise ValidationError.from_exception_data(cls.__name__, details)
         return data
+
+    @classmethod
+    def _meant(cls, key: str, data: Mapping[str, object]) -> str:
+        """The hint at an unknown key of some data."""
+        return did_you_mean(key, cls.model_fields)
 
 
 #: Settings of a component's base class.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from pathlib import Path
 
 from coliags_plugin.config import registry
@@ -11,6 +12,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.files import inventory
 
 log = logging.getLogger(__name__)
+
+#: Suffixes of video files, in lower case.
+VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
 
 
 def formats() -> list[str]:
@@ -23,11 +27,12 @@ def find_format(path: Path) -> str:
     known = ", ".join(formats())
     if not path.exists():
         raise InputError(f"no folder {path}", f"a scene in one of the formats {known}", "Check the path")
+    if path.is_file():
+        raise _no_folder(path)
     found = recognised(path)
     if not found:
-        holds = inventory(path) if path.is_dir() else "nothing"
         raise InputError(
-            f"{path} holds {holds}, which none of the formats {known} recognises",
+            f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
             "a scene's own folder",
             "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Images "
             "without poses become a scene by coliags poses track, if there is depth, or coliags poses sfm",
@@ -38,6 +43,17 @@ def find_format(path: Path) -> str:
     ((name, reason),) = found.items()
     log.info("%s: format %s (%s)", path, name, reason)
     return name
+
+
+def _no_folder(path: Path) -> InputError:
+    """What to do about a file that was given in the place of a scene's folder."""
+    folder, file = (shlex.quote(str(each)) for each in (path.parent, path))
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        makes = f"coliags reconstruct {file} --output FOLDER reconstructs it; coliags poses sfm {file} --output FOLDER"
+        return InputError(f"{path} is a video", "a scene's folder", f"{makes} makes a scene with poses")
+    if recognised(path.parent):
+        return InputError(f"{path} is a file of a scene", "the scene's folder", f"Give {folder}")
+    return InputError(f"{path} is a file", "a scene's folder, as docs/data.md describes", "")
 
 
 def recognised(path: Path) -> dict[str, str]:

@@ -15,6 +15,7 @@ import torch
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
@@ -51,6 +52,7 @@ class RecordedDataManager(DataManager):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self._bounds = self.fits
+        self._is_told = True  # in the log, what is read
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
@@ -73,16 +75,13 @@ class RecordedDataManager(DataManager):
         changes = {"width": None, "height": None, "keep_pixels": False, "initial_points": "none"}
         manager = type(self)(self.settings.model_copy(update=changes))
         manager._bounds = None
+        manager._is_told = False  # again
         return manager
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene at the working size, in the dataset's world frame and units; see :class:`DataManager`."""
         path, settings = Path(path), self.settings
         recording = self.open(path)
-        for doubt in dict.fromkeys(shot.rectification.doubt() for shot in recording.shots):
-            if doubt is not None:
-                log.warning("%s", doubt)
-        self._log_downscaling(recording, path)
         train_indices, test_indices = self._split(recording, path)
         recording = with_valid_seen_masks(recording, self.seen_split, train_indices, test_indices, path)
         train = self._frames(recording.shots, train_indices)
@@ -117,20 +116,22 @@ class RecordedDataManager(DataManager):
             },
             "invalid_depth_share": _invalid_depth_share(video) if settings.keep_pixels else None,
         }
-        log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
+        if self._is_told:
+            self._tell(recording, path)
         return Scene(path.resolve().name, train, test_sets, points, provenance)
 
-    def _log_downscaling(self, recording: Recording, path: Path) -> None:
-        """Log that images are downscaled by default."""
-        if self.settings.size is not None:
-            return
-        for rectification in (shot.rectification for shot in recording.shots):
-            stored = rectification.source_width, rectification.source_height
-            used = rectification.width, rectification.height
-            if used != stored:
-                change = "datamanager.width and datamanager.height set another size"
-                log.info("%s: images stored at %d x %d are used at %d x %d; %s", path, *stored, *used, change)
-                return
+    def _tell(self, recording: Recording, path: Path) -> None:
+        """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""
+        rectifications = [shot.rectification for shot in recording.shots]
+        for doubt in dict.fromkeys(rectification.doubt() for rectification in rectifications):
+            if doubt is not None:
+                log.warning("%s", doubt)
+        stored = sizes_text((each.source_width, each.source_height) for each in rectifications)
+        used = sizes_text((each.width, each.height) for each in rectifications)
+        if used != stored and self.settings.size is None:
+            change = "--set datamanager.width=W --set datamanager.height=H sets another size"
+            log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
+        log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
 
     def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[Frame]:
         return [StoredFrame(shots[index], index, self.settings.keep_pixels) for index in indices]
@@ -168,11 +169,12 @@ class RecordedDataManager(DataManager):
             return points, self._described_points("depth of the training frames", points)
         if own is None or recording.points_source is None:
             missing = POINTS_FILE if recording.points_source is None else recording.points_source.name
+            from_file = "--set datamanager.initial_points=file --set datamanager.points_file=FILE"
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",
                 f"Create a scene with points: coliags poses triangulate {shlex.quote(str(path))} -o FOLDER; or put "
-                f"{missing} (world of the poses) there; or set initial_points: file and points_file",
+                f"{missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(own(), settings.points_count, generator, recording.points_source)
         return points, self._described_points(recording.points_source, points)

@@ -68,7 +68,8 @@ def open_scene(
     """Read a scene without a method, also one that has nothing to make initial points from.
 
     The format is the name of a data manager, or else of the one that recognises the folder; options are ``key=value``
-    of it. With ``stored_size``, images are read at their stored size, each when it is used, and without initial points.
+    or ``datamanager.key=value`` of it, as in method configs. With ``stored_size``, images are read at their stored
+    size, each when it is used, and without initial points.
     """
     name = find_format(path) if data_format is None else data_format
     if stored_size:
@@ -100,7 +101,8 @@ def open_video(
 
 
 def _manager(name: str, options: Sequence[str], **more: str) -> DataManager:
-    given = override_all(Node({}, "options"), options).plain()
+    own = [option.removeprefix("datamanager.") for option in options]
+    given = override_all(Node({}, "options"), own).plain()
     try:
         component = make_component("datamanagers", {**given, **more, "name": name})
     except ValidationError as error:

@@ -32,9 +32,11 @@ _ESCAPES = {
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
     "…": r"\ldots{}",
+    "`": r"\textasciigrave{}",
     "\N{EN DASH}": "--",
 }
 _MINUS = re.compile(r"(?<![\w-])-(?=[\d.])")
+_CODE = re.compile("`([^`]+)`")
 _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 
 
@@ -121,5 +123,7 @@ def _comment(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Plain text as LaTeX."""
-    return _SPECIAL.sub(lambda match: _ESCAPES[match.group()], " ".join(text.split()))
+    """Plain text as LaTeX; what stands between backticks in typewriter type."""
+    parts = _CODE.split(" ".join(text.split()))
+    plain = [_SPECIAL.sub(lambda match: _ESCAPES[match.group()], part) for part in parts]
+    return "".join(rf"\texttt{{{part}}}" if number % 2 else part for number, part in enumerate(plain))

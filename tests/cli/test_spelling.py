@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import typing
 from pathlib import Path
 
 import pytest
 import tyro
 
+from coliags_plugin._version import __version__
 from coliags_plugin.cli import Command
-from coliags_plugin.cli.arguments import renamed_argument
+from coliags_plugin.cli.hints import hint, renamed_argument
 from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 
@@ -79,3 +81,39 @@ def test_old_spellings_are_refused_with_the_new_ones(argv, hint, capsys):
 def test_other_mistakes_are_not_taken_for_old_spellings():
     for argv in ("mesh RUN --outpu OUT", "phantom --output OUT --sed 1", "data check SCENE --json --bogus"):
         assert not renamed_argument(argv.split())
+
+
+@pytest.mark.parametrize(
+    ("argv", "meant"),
+    [
+        ("trian coliags --data SCENE", "train"),
+        ("poses sfn FRAMES", "sfm"),
+        ("train coliags --data SCENE --stepz=5", "--steps"),
+        ("render RUN --no-vido", "--no-video"),
+        ("weights lpips --form FOLDER", "--from"),
+        ("data check SCENE --htm page.html", "--html"),
+    ],
+)
+def test_the_nearest_command_or_option_is_named(argv, meant, capsys):
+    assert run(*argv.split()) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"coliags: Did you mean '{meant}'?"
+
+
+def test_nothing_is_suggested_where_nothing_is_near():
+    for argv in ("", "xylophone", "train coliags", "train coliags --zzzzzz", "poses"):
+        assert hint(argv.split(), Command) == ""
+
+
+def test_the_version(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr() == (f"coliags {__version__}\n", "")
+    assert run("--help") == 0
+    assert "--version" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", commands().values(), ids=commands())
+def test_a_negated_flag_says_what_it_does(kind, capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(kind, args=["--help"], config=(tyro.conf.FlagCreatePairsOff,))
+    rows = re.findall(r"--no-\S+ +(.*)", capsys.readouterr().out)
+    assert all(row.startswith("Do not ") for row in rows)

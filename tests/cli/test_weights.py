@@ -53,7 +53,7 @@ def test_a_newcomer_s_way(server, cache, capsys):
     """doctor names the command, which installs; then both say that all is there, and where."""
     assert run("doctor") == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "weights of LPIPS squeeze" in line]
-    assert "run `coliags weights lpips`" in line
+    assert line.startswith("-  ") and "run `coliags weights lpips`" in line
     where = f"LPIPS squeeze: backbone {cache / NAMES[0]}, linear heads {cache / NAMES[1]}\n"
     assert run("weights", "lpips", "--net", "squeeze") == 0
     assert capsys.readouterr().out == where
@@ -61,7 +61,8 @@ def test_a_newcomer_s_way(server, cache, capsys):
     assert capsys.readouterr().out == f"{where}Everything was there already.\n"
     assert len(server.requests) == 2
     assert run("doctor") == 0
-    assert f"{cache / NAMES[0]} and {cache / NAMES[1]}" in capsys.readouterr().out
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "weights of LPIPS squeeze" in line]
+    assert line.startswith("ok ") and line.endswith(f"{cache / NAMES[0]} and {cache / NAMES[1]}")
 
 
 def test_a_folder_that_lpips_does_not_search_says_what_to_set(server, cache, made, tmp_path, monkeypatch, capsys):

@@ -180,6 +180,7 @@ def test_bases_may_be_paths_beside_the_file(method_file):
             "base: coliags\nfield:\n  features: 99999999999999999999\n",
             ["mine.yaml:3", "field.features", "an integer of more than 64 bits"],
         ),
+        ("base: coliags\nvoxel_size: 1.0\n", ["unknown key 'voxel_size'", "Did you mean 'field.voxel_size'"]),
         ("base: coliags\nfeild: {}\n", ["mine.yaml:2", "unknown key 'feild'", "Did you mean 'field'"]),
         (
             "base: coliags\nrenderer: {name: cpu, near: 1.0}\nfield:\n  near_plane: 0.2\n",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import decode_image, encode_image, write_image, write_mask
+from coliags_plugin.core.images import decode_image, encode_image, sizes_text, write_image, write_mask
 
 
 def read(path):
@@ -78,3 +78,8 @@ def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, name  # KiB
     with pytest.raises(InputError, match="cannot read"):
         decode_image(tmp_path / "missing.png")
+
+
+def test_sizes_as_text():
+    assert sizes_text([(338, 223), (338, 223)]) == "338 x 223"
+    assert sizes_text([(338, 223), (338, 224), (338, 222)]) == "338 x 222 to 338 x 224"

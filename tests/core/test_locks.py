@@ -39,6 +39,7 @@ def test_a_killed_process_frees_its_lock(tmp_path, caplog):
         holder.kill()
     with locked(file, "the run", wait=5.0):
         assert str(os.getpid()) in file.read_text()
+    assert not file.exists()
     with locked(file, "the run"):
         pass
 

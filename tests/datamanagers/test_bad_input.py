@@ -46,6 +46,20 @@ def test_a_folder_that_is_not_there(tmp_path, name):
         load(tmp_path / "nowhere", name)
 
 
+def test_a_file_in_the_place_of_a_folder(copied, tmp_path):
+    folder = copied("nerfstudio")
+    with pytest.raises(InputError, match=rf"transforms.json is a file of a scene. .* Give {folder}\.$"):
+        find_format(folder / "transforms.json")
+    (folder / "a clip.MP4").touch()
+    with pytest.raises(InputError, match=rf"is a video\. .* coliags reconstruct '{folder}/a clip.MP4' --output FOLDER"):
+        find_format(folder / "a clip.MP4")
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(
+        InputError, match=r"notes.txt is a file\. Expected a scene's folder, as docs/data.md describes\.$"
+    ):
+        find_format(tmp_path / "notes.txt")
+
+
 def test_every_fault_meets_every_layout_it_can_befall():
     """The table is complete: of the faults that any scene can have, no layout is left out."""
     for fault in ("an image of another size", "an image cut short", "an empty folder", "no images"):

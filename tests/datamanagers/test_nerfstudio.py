@@ -337,7 +337,7 @@ def test_images_of_two_sizes(folder):
 
 def test_neither_depth_nor_points(folder):
     (folder / "points3D.ply").unlink()
-    with pytest.raises(InputError, match=r"neither depth files nor points3D\.ply.*initial_points: file"):
+    with pytest.raises(InputError, match=r"neither depth files nor points3D\.ply.*initial_points=file"):
         load(folder)
 
 

@@ -75,8 +75,8 @@ class TestSmallerImages:
 
     def test_both_sizes_and_the_setting_are_told_once(self, large, caplog):
         assert self.told(large, caplog) == [
-            f"{large}: images stored at 400 x 300 are used at 338 x 254; datamanager.width and datamanager.height "
-            "set another size"
+            f"{large}: images stored at 400 x 300 are used at 338 x 254; --set datamanager.width=W "
+            "--set datamanager.height=H sets another size"
         ]
 
     def test_nothing_is_told_of_a_size_that_was_asked_for(self, large, caplog):

@@ -194,7 +194,7 @@ def test_auto_and_the_doctor_give_the_reason(monkeypatch):
     told = {result.name: result for result in check_installation()}
     missing = "cannot run here: no CUDA device, as this PyTorch is built without CUDA"
     assert told["renderer gsplat"].detail == missing
-    assert told["renderer gsplat"].status == "passed"
+    assert told["renderer gsplat"].status == "skipped"
     assert f"would use {chosen.name} ({reason}" in told["renderer auto"].detail
 
 

@@ -189,7 +189,7 @@ def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
             "poses may be right or wrong",
             f"{given.count} matches lie {given.error:.2g} px from their epipolar lines, but the camera moves them by "
             f"{given.parallax:.2g} px only (median), beside its rotation",
-            "Look at frames further apart, --set frame_step=N, or at a part of the video with more motion",
+            "Look at frames further apart, --set datamanager.frame_step=N, or at a part of the video with more motion",
         )
 
 

@@ -12,6 +12,7 @@ import torch
 from coliags_plugin.checks.data.check import SceneCheck, is_estimated
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.reprojection import LEAST_CONFIDENCE, warp_image
+from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
@@ -57,8 +58,9 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     yield model.Fact("format", str(data.get("dataset", "unknown")), note=f"{layout} layout" if layout else "")
     yield model.Fact("frames", ", ".join(f"{count} {name}" for name, count in counts.items()))
     yield model.Fact("split", str(data.get("split", {}).get("name", "unknown")))
-    size = f"{camera.width} x {camera.height} px" + (f", stored {stored[0]} x {stored[1]}" if stored else "")
-    yield model.Fact("image size", size)
+    size = sizes_text((frame.camera.width, frame.camera.height) for frame in scene.video)
+    several = " and others" if " to " in size else ""
+    yield model.Fact("image size", f"{size} px" + (f", stored {stored[0]} x {stored[1]}{several}" if stored else ""))
     yield model.Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
     angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
     focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"

@@ -47,7 +47,7 @@ def match_frames(estimate: DepthSource, truth: DepthSource) -> FramePairs:
         f"{estimate.path} ({len(estimate.names)} frames with depth, the first {estimate.names[0]}) and {truth.path} "
         f"({len(truth.names)}, the first {truth.names[0]}) have no frame in common",
         "frames of equal names, or as many of them, in the same order",
-        "Rename the files, or choose frames by --set frame_step=N and max_frames=N",
+        "Rename the files, or choose frames by --set datamanager.frame_step=N --set datamanager.max_frames=N",
     )
 
 

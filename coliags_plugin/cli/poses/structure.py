@@ -69,7 +69,7 @@ class PosesTriangulateCommand:
 
         stored = scene.provenance["stored_size"]
         _LOG.info("features are detected at the stored size, %d x %d", *stored)
-        return open_scene(self.scene, self.format, options, stored_size=True).train
+        return open_scene(self.scene, scene.provenance["dataset"], options, stored_size=True).train
 
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:

@@ -157,11 +157,15 @@ class ColmapDataManager(RecordedDataManager):
                 f"{path} holds no COLMAP model",
                 "cameras, images and points3D, all .bin or all .txt, in sparse/0, sparse, colmap/sparse/0, "
                 "colmap/sparse or the folder itself",
-                "Check the path, or set datamanager.model",
+                "Check the path, or choose one with --set datamanager.model=FOLDER",
             )
         if len(found) > 1:
             others = ", ".join(folder.relative_to(path).as_posix() for folder in found[1:])
-            log.warning("reading %s; there are further models, which datamanager.model chooses: %s", found[0], others)
+            log.warning(
+                "reading %s; there are further models, which --set datamanager.model=FOLDER chooses: %s",
+                found[0],
+                others,
+            )
         return found[0]
 
     def _sparse_depth(
@@ -202,7 +206,9 @@ class ColmapDataManager(RecordedDataManager):
 def _image_paths(folder: Path, model: files.SparseModel, outside: bool) -> list[Path]:
     if not folder.is_dir():
         raise InputError(
-            f"no folder {folder}", "the images that the model was made from", "Set datamanager.images_folder"
+            f"no folder {folder}",
+            "the images that the model was made from",
+            "Name it with --set datamanager.images_folder=FOLDER",
         )
     paths = [named_file(folder, image.name, str(model.folder), outside) for image in model.images]
     missing = [path for path in paths if not path.is_file()]
@@ -211,7 +217,7 @@ def _image_paths(folder: Path, model: files.SparseModel, outside: bool) -> list[
         raise InputError(
             f"{len(missing)} of the {len(paths)} images of {model.folder} are not in {folder}: {named}",
             "every registered image, under the name the model has for it",
-            "Restore them, or set datamanager.images_folder",
+            "Restore them, or --set datamanager.images_folder=FOLDER",
         )
     return paths
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from jaxtyping import Float32, Shaped
 
+from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
@@ -38,6 +42,10 @@ class ExrDepth(DepthFormat):
         return np.where(stored > 0.0, stored / np.float32(self.divisor), np.float32(np.nan)).astype(np.float32)
 
 
+#: Files are read one at a time, as what OpenEXR prints is diverted for all threads.
+_ALONE = Lock()
+
+
 def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
     """Read a channel of an EXR file by its full name, from any part."""
     import OpenEXR
@@ -45,13 +53,18 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
     if not path.is_file():
         raise InputError(f"no file {path}", "an OpenEXR file")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with (
+            _ALONE,
+            redirect_stdout(io.StringIO()),  # OpenEXR prints warnings
+            decoder_messages(),
+            OpenEXR.File(str(path), separate_channels=True) as file,
+        ):
             # OpenEXR returns no parts for a damaged file.
             channels = {name: stored.pixels for part in file.parts for name, stored in part.channels.items()}
+            if not channels:
+                raise ValueError("no channels")
     except (OSError, RuntimeError, ValueError) as error:
         raise _damaged(path) from error
-    if not channels:
-        raise _damaged(path)
     if channel not in channels:
         raise InputError(
             f"{path} has the channels {', '.join(sorted(channels))}",

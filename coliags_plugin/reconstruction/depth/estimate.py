@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
@@ -189,9 +190,10 @@ def check_video(frames: Sequence[Frame]) -> None:
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         raise InputError(
-            f"images of {' and '.join(f'{width} x {height}' for width, height in sizes[:3])} pixels",
+            f"images of {sizes_text(sizes)} pixels",
             "images of one size",
-            "Set width and height of the data manager, or estimate each camera's frames apart",
+            f"--set datamanager.width={sizes[0][0]} --set datamanager.height={sizes[0][1]} makes them so, or estimate "
+            "each camera's frames apart",
         )
 
 

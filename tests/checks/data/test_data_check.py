@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -321,15 +322,19 @@ def test_the_moving_step_leaves_out_pauses_and_jumps():
     assert moving_step(np.zeros(5)) == 0.0
 
 
-def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys):
+def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplog):
     """At a quarter of the size, the texture is too fine for features."""
     write_frames(tmp_path / "tube", frames[:12], depth=False)
-    status = run("data", "check", tmp_path / "tube", "--set", "width=40", "--set", "height=32")
-    told = capsys.readouterr().out
+    size = ("--set", "width=40", "--set", "datamanager.height=32")  # with and without the prefix
+    with caplog.at_level(logging.INFO):
+        status = run("data", "check", tmp_path / "tube", *size)
+    told, log = capsys.readouterr().out, [record.getMessage() for record in caplog.records]
     assert status == 0
     assert "40 x 32 px, stored 160 x 128" in told
     given = next(line for line in told.splitlines() if line.startswith("given"))
     assert int(given.split()[-1]) > 500
+    for fact in ("format c3vd", "12 frames"):  # the scene is read twice, and told once
+        assert sum(fact in line for line in log) == 1
 
 
 @pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])

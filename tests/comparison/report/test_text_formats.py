@@ -10,7 +10,7 @@ import pytest
 from coliags_plugin.comparison.report.page import Choices, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.reporting.html_page import html_blocks
-from coliags_plugin.reporting.latex import latex_table, latex_text
+from coliags_plugin.reporting.latex import escaped, latex_table, latex_text
 from coliags_plugin.reporting.markdown import markdown_table, markdown_text
 from coliags_plugin.reporting.model import Column, Folded, Table, TableCell
 from coliags_plugin.reporting.numbers import DASH
@@ -192,3 +192,7 @@ def test_nasty_names_survive():
     tex = latex_table(table)
     assert r"a\_b \& 50 \% $<$of$>$ \{x\} \$y\$ \#1 \textasciitilde{} \textasciicircum{} \textbackslash{}z $|$" in tex
     assert Cells(html_blocks([table])).cells[0][0] == NASTY
+
+
+def test_commands_in_latex_are_typewriter_type():
+    assert escaped("run `coliags list_all`, or `a") == r"run \texttt{coliags list\_all}, or \textasciigrave{}a"

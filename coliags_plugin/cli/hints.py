@@ -1,0 +1,57 @@
+"""Hints at what was meant by arguments that cannot be parsed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any, get_args, get_type_hints
+
+import tyro
+
+from coliags_plugin.core.errors import did_you_mean
+
+
+def hint(argv: Sequence[str], commands: Any) -> str:
+    """What stands today for an argument of an older release, or the nearest command or option; empty without one.
+
+    ``commands`` is the union of the commands.
+    """
+    return renamed_argument(argv) or _nearest(argv, commands)
+
+
+def renamed_argument(argv: Sequence[str]) -> str:
+    """What stands today for an argument of an older release among some that could not be parsed; empty without one."""
+    options = {word.partition("=")[0] for word in argv}
+    for old in ("--out", "--save"):
+        if old in options:
+            return f"{old} is now --output, or -o"
+    is_positional = list(argv[:1]) == ["phantom"] or list(argv[:2]) == ["poses", "convert"]
+    if is_positional and not options & {"--output", "-o"}:
+        return "what is written is now named by --output, or -o"
+    if any(option == "--json" and path.endswith(".json") for option, path in pairwise(argv)):
+        return "--json prints the summary, and takes no file: write `--json > FILE`"
+    return ""
+
+
+def _nearest(argv: Sequence[str], commands: Any) -> str:
+    """The command that an unknown one resembles most, or else the option of its command."""
+    if not argv:
+        return ""
+    kinds = {name.name: kind for kind, name in map(get_args, get_args(commands))}
+    if argv[0] not in kinds:
+        return did_you_mean(argv[0], kinds)
+    kind = kinds[argv[0]]
+    fields = get_type_hints(kind, include_extras=True)
+    if (inner := fields.get("subcommand")) is not None:
+        return _nearest(argv[1:], get_args(inner)[0])
+    known = {option for field in fields.items() for option in _options(*field)}
+    unknown = (word.partition("=")[0] for word in argv if word.startswith("--"))
+    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
+
+
+def _options(field: str, kind: Any) -> Iterator[str]:
+    """The spellings of a field of a command as an option; none of a positional argument."""
+    metadata = getattr(kind, "__metadata__", ())
+    if tyro.conf.Positional not in metadata:
+        names = [name for each in metadata if (name := getattr(each, "name", None))] or [field.replace("_", "-")]
+        yield from (f"--{prefix}{name}" for name in names for prefix in ("", "no-"))
