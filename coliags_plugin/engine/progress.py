@@ -13,8 +13,9 @@ from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from coliags_plugin.engine.pace import Pace
 from coliags_plugin.reporting.numbers import duration
 
 #: Between plain lines, seconds.
@@ -35,7 +36,7 @@ def open_display(
 
 
 class TerminalBar:
-    """A bar with the remaining time."""
+    """A bar with the remaining time, once it is known."""
 
     def __init__(self, console: Console, title: str, total: int, start: int) -> None:
         columns = [
@@ -43,16 +44,18 @@ class TerminalBar:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             TextColumn("{task.fields[facts]}"),
         ]
         self._bar = Progress(*columns, console=console)
         self._bar.start()
-        self._task = self._bar.add_task(title, total=total, completed=start, facts="")
+        self._task = self._bar.add_task(title, total=total, completed=start, left="", facts="")
+        self._pace = Pace(total, start)
 
     def update(self, done: int, facts: str) -> None:
         """Show how much is done, with facts."""
-        self._bar.update(self._task, completed=done, facts=facts)
+        self._pace.update(done)
+        self._bar.update(self._task, completed=done, left=_to_go(self._pace), facts=facts)
 
     def close(self) -> None:
         """Leave what was shown last."""
@@ -65,12 +68,13 @@ class TextDisplay:
     def __init__(
         self, title: str, total: int, start: int, every: float, show: Callable[[str], None], at_once: bool = False
     ) -> None:
-        self._title, self._total, self._start, self._every, self._show = title, total, start, every, show
-        self._began = time.monotonic()
+        self._title, self._total, self._every, self._show = title, total, every, show
+        self._pace, self._began = Pace(total, start), time.monotonic()
         self._last = -math.inf if at_once else self._began
 
     def update(self, done: int, facts: str) -> None:
         """Show how much is done, with facts, where it is time to."""
+        self._pace.update(done)
         now = time.monotonic()
         if now - self._last >= self._every or done == self._total:
             self._last = now
@@ -81,9 +85,13 @@ class TextDisplay:
 
     def _line(self, done: int, facts: str, seconds: float) -> str:
         """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
-        left = seconds / max(1, done - self._start) * (self._total - done)
-        timing = f"took {duration(seconds)}" if done == self._total else f"{duration(left)} to go"
-        return f"{self._title} {done}/{self._total}, {timing}  {facts}".rstrip()
+        timing = f"took {duration(seconds)}" if done == self._total else _to_go(self._pace)
+        return f"{', '.join(filter(None, (f'{self._title} {done}/{self._total}', timing)))}  {facts}".rstrip()
+
+
+def _to_go(pace: Pace) -> str:
+    left = pace.left
+    return "" if left is None else f"{duration(left)} to go"
 
 
 class NotebookLine:
@@ -104,7 +112,7 @@ class NotebookLine:
 
 
 class ProgressReport:
-    """Progress from ``start`` towards a total, with facts and the remaining time, as a context manager.
+    """Progress from ``start`` towards a total, with facts and the remaining time (:class:`Pace`), as a context manager.
 
     Where there is neither a terminal nor a notebook, a line appears every ``plain_every`` seconds. The console is
     standard error by default.
