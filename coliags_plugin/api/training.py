@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +27,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     anonymous: bool = False,
+    loggers: Sequence[str] = (),
 ) -> Run:
     """Train a method on a scene.
 
@@ -43,13 +44,16 @@ def train(
         resume: Continue from the run's latest checkpoint.
         overwrite: Replace an existing run folder.
         anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
+        loggers: What also gets the training log, by name: ``tensorboard``, ``wandb``, or of another package.
 
     Raises:
-        InputError: Method, data or options are invalid or do not fit each other; nothing was written.
+        InputError: Method, data or options are invalid or do not fit each other, or a logger's library is missing;
+            nothing was written.
         InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP, after the state was saved.
         NotFiniteError: A loss or parameter became NaN or infinite.
     """
     from coliags_plugin.engine.devices import choose_device
+    from coliags_plugin.engine.loggers import find_loggers
     from coliags_plugin.engine.training import TrainingRequest, open_training
 
     if resume and overwrite:
@@ -60,10 +64,13 @@ def train(
     request = TrainingRequest(
         method, data, (*assignments(settings), *assignments(chosen)), seed, data_format, anonymous
     )
+    chosen_loggers = find_loggers(loggers)
     folder = _run_folder(method, data, output, resume)
     if_exists: Literal["resume", "overwrite", "refuse"] = "resume" if resume else "overwrite" if overwrite else "refuse"
     with open_training(request, folder, on, if_exists) as trainer:
-        trainer.train()
+        title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
+        config = trainer.method.config.model_dump()
+        trainer.train(followers=[logger(folder.path, title, config, trainer.step) for logger in chosen_loggers])
     return Run(folder.path, data=data, device=device)
 
 

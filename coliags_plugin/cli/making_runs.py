@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -28,6 +29,8 @@ class TrainCommand:
     """Renderer by name (`coliags list renderers`); default: the method's."""
     resume: bool = False
     """Continue from the run's latest checkpoint (without --output: the newest run of this method on this scene)."""
+    logger: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    """Also log to tensorboard or wandb, into the run folder (extra `loggers`), repeatable."""
     set: arguments.Assignments = ()
     """Change a value of the method config, for instance field.voxel_size=1.0."""
     format: arguments.DataFormat = None
@@ -54,6 +57,7 @@ class TrainCommand:
             resume=self.resume,
             overwrite=self.overwrite,
             anonymous=self.anonymous,
+            loggers=self.logger,
         )
         moved = ("--data", self.data) if self.anonymous else ()
         facts = {"method": run.method, "scene": run.scene_name, "seed": run.seed, "step": run.step}

@@ -220,6 +220,10 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "normal-consistency": "coliags_plugin.losses.regularization:NormalConsistencyLoss",
         "distortion": "coliags_plugin.losses.regularization:DistortionLoss",
     },
+    ("loggers", "logger"): {
+        "tensorboard": "coliags_plugin.engine.loggers:TensorBoardLogger",
+        "wandb": "coliags_plugin.engine.loggers:WandbLogger",
+    },
     ("metrics", "metric"): {
         "psnr": "coliags_plugin.metrics.image:PSNR",
         "ssim": "coliags_plugin.metrics.image:SSIM",
@@ -267,6 +271,7 @@ modules = REGISTRIES["modules"]
 samplers = REGISTRIES["samplers"]
 strategies = REGISTRIES["strategies"]
 losses = REGISTRIES["losses"]
+loggers = REGISTRIES["loggers"]
 metrics = REGISTRIES["metrics"]
 protocols = REGISTRIES["protocols"]
 pose_formats = REGISTRIES["pose_formats"]

@@ -16,6 +16,7 @@ from coliags_plugin.contracts.fields import (
     gaussians_under,
     knows_lamp,
 )
+from coliags_plugin.contracts.following import Follower, Logger, scalars
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear
@@ -28,12 +29,14 @@ __all__ = [
     "DataManager",
     "Draw",
     "Field",
+    "Follower",
     "GainModule",
     "GaussianField",
     "GeometryHead",
     "Head",
     "LampAware",
     "LitField",
+    "Logger",
     "Loss",
     "LossSettings",
     "Metric",
@@ -53,4 +56,5 @@ __all__ = [
     "gaussians_under",
     "knows_lamp",
     "log_linear",
+    "scalars",
 ]

@@ -8,14 +8,14 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from typing import Any
 
 import torch
 
 from coliags_plugin.config.method_config import LoadedMethod
-from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep
+from coliags_plugin.contracts import Draw, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
 from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
@@ -26,6 +26,7 @@ from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import device_name
+from coliags_plugin.engine.following import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
@@ -119,10 +120,13 @@ class Trainer:
         """Time spent in training, all resumptions together."""
         return self.costs.seconds
 
-    def train(self, save_seconds: float = math.inf, keep: int | None = None) -> None:
+    def train(
+        self, save_seconds: float = math.inf, keep: int | None = None, followers: Sequence[Follower] = ()
+    ) -> None:
         """Train to the last step, logging and saving on the way, or until a signal of :data:`STOPPING` comes.
 
         Besides those of the schedule, a checkpoint is written after so many seconds; of all, so many newest are kept.
+        Followers are told of every step and of rows of the log, and closed at the end.
         """
         schedule = self.method.config.schedule
         logger.info("%s", self.strategy.plan())
@@ -134,12 +138,16 @@ class Trainer:
             deferred_stop() as interrupted,
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
             self.run.log_writer() as log,
+            closing(Followers(followers)) as following,
         ):
             while self.step < self.steps:
                 row = self.take_step()
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
-                    log({**row, "seconds": round(self.seconds, 3)})
+                    row = {**row, "seconds": round(self.seconds, 3)}
+                    log(row)
+                    following.logged(row)
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
+                following.stepped(self.step)
                 stop = interrupted() or self.step == self.steps
                 late = time.monotonic() - saved >= save_seconds
                 if self.step % schedule.checkpoint_every == 0 or stop or late:

@@ -11,7 +11,7 @@ from coliags_plugin.config.registry import REGISTRIES, Registry
 from coliags_plugin.core.errors import InputError
 
 #: Kinds that no config has options for.
-WITHOUT_SETTINGS = {"protocols", "pose_formats", "phantom_layouts"}
+WITHOUT_SETTINGS = {"loggers", "protocols", "pose_formats", "phantom_layouts"}
 
 
 def test_every_builtin_can_be_imported_and_has_settings_where_its_kind_has_some():
