@@ -17,15 +17,17 @@ class MeshSettings(Settings):
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)
     voxel_pixels: float = Option(default=2.0, gt=0)  # see voxel_size
-    truncation: float = Option(default=3.0, ge=1, le=32)  # of the signed distance, in voxels
+    truncation: float = Option(default=2.0, ge=1, le=32)  # of the signed distance, in voxels
     depth: Literal["expected", "median"] = "median"  # kind of rendered depth (docs/conventions.md 3)
     # z-depth in scene units beyond which nothing is fused; null: that of the farthest initial point in a training view.
     max_depth: float | None = Option(default=None, gt=0)
-    # Colours as rendered, under the lamp of each view; or under one distance and angle to the lamp everywhere.
+    # Colours as recorded, under the lamp of each view; or rendered, at one distance and angle to the lamp everywhere.
     color: Literal["plain", "flattened"] = "plain"
     min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer
+    # Least sum of the squared qualities of the views of a place: 1 for one view, head-on from the median distance.
+    min_support: float = Option(default=0.25, ge=0)
     min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
 
 

@@ -13,19 +13,20 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.settings import validated
 from coliags_plugin.surface.meshing import fusion
-from coliags_plugin.surface.meshing.fusion import fuse_run, incidence_cosines
+from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
+from coliags_plugin.surface.meshing.views import incidence_cosines, rendered_depth
 from tests.scenes import camera_at, wall_color, wall_scene
 from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run
 
 
 def test_a_wall():
-    mesh = fuse_run(exact_run())
+    mesh = fuse_run(exact_run(scene=wall_scene(17, 160, 120, lamp=False)))
     assert np.abs(mesh.vertices[:, 2] - WALL).max() < 0.01
     # Seen from the cameras, which look along +z, triangles are counter-clockwise.
     assert (mesh.normals[:, 2] < -0.99).all()
     expected = wall_color(torch.from_numpy(mesh.vertices)).numpy()
-    assert np.abs(mesh.colors / 255.0 - expected).max() < 0.04
+    assert np.abs(mesh.colors / 255.0 - expected).max() < 0.01
 
 
 def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
@@ -122,6 +123,22 @@ def test_incidence_at_a_jump():
     depth[:, 30] = torch.nan
     cosines = incidence_cosines(depth, camera)
     assert cosines[:, [29, 31]].min() > 0.8 and not cosines[:, 30].isfinite().any()
+
+
+def test_quality_of_views():
+    """Confidence times cosine times nearness; a tenth of it at highlights and about them."""
+    scene = wall_scene(9, 160, 120)
+    frame = scene.train[0]
+    confidence = torch.full((120, 160), 0.5)
+    image = frame.image.clone()
+    image[60, 80] = 255
+    run = exact_run(scene=replace(scene, train=[replace(frame, image=image, depth_confidence=confidence)] * 2))
+    view = next(rendered_depth(run, MeshSettings()))
+    rays = frame.camera.rays()
+    pixel = view.depth.double() / (frame.camera.fx * frame.camera.fy) ** 0.5
+    expected = 0.5 * rays[..., 2] / rays.norm(dim=-1) * run.scene.pixel_footprint / pixel
+    about = (torch.arange(120)[:, None] - 60).abs().maximum((torch.arange(160) - 80).abs()) <= 2
+    torch.testing.assert_close(view.quality.double(), torch.where(about, 0.1, 1.0) * expected, rtol=1e-4, atol=1e-6)
 
 
 def test_defaults_follow_the_scene():

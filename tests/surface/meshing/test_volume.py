@@ -10,7 +10,8 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.surface.meshing.fusion import Volume
+from coliags_plugin.surface.meshing.views import DepthView
+from coliags_plugin.surface.meshing.volume import Volume
 from tests.scenes import wall_scene
 
 
@@ -29,43 +30,63 @@ def turned(angle: float) -> Camera:
     return Camera(80.0, 70.0, 63.0, 40.0, 120, 90, pose)
 
 
+def view_of(camera: Camera, depth: torch.Tensor, quality: float | torch.Tensor = 1.0) -> DepthView:
+    return DepthView(None, camera, depth.float(), torch.where(depth > 0, quality, 0.0).float())
+
+
 def test_a_sphere_is_where_it_is():
-    volume = Volume(0.5, 4.0)
-    colors = np.full((90, 120, 3), (200, 100, 50), np.uint8)
-    for step in range(12):
-        camera = turned(2 * math.pi * step / 12)
-        volume.add(sphere_depth(camera, 20.0).float().numpy(), colors, camera)
-    mesh = volume.mesh(1)
+    cameras = [turned(2 * math.pi * step / 12) for step in range(12)]
+    mesh = Volume([view_of(camera, sphere_depth(camera, 20.0)) for camera in cameras], 0.5, 3.0).mesh(1, 0.0)
     distance = np.linalg.norm(mesh.vertices, axis=1) - 20.0
-    assert abs(distance.mean()) < 0.02
-    assert np.abs(distance).max() < 0.25
+    assert abs(distance.mean()) < 0.01
+    assert np.abs(distance).max() < 0.1
     # Counter-clockwise seen from within: normals point to the centre.
     assert ((mesh.normals * mesh.centers).sum(1) < 0).mean() > 0.999
-    assert np.abs(mesh.colors.astype(int) - (200, 100, 50)).max() <= 1
 
 
 def test_pixel_centres():
     """Half a pixel of shift would move an oblique wall by several tenths of a millimetre."""
-    volume = Volume(0.4, 4.0)
-    for frame in wall_scene(frames=9, width=160, height=120).train:
-        volume.add(frame.depth.numpy(), frame.image.numpy(), frame.camera)
-    mesh = volume.mesh(3)
+    views = [view_of(frame.camera, frame.depth) for frame in wall_scene(frames=9, width=160, height=120).train]
+    mesh = Volume(views, 0.4, 4.0).mesh(3, 0.0)
     assert np.abs(mesh.vertices[:, 2] - 20.0).max() < 0.01
 
 
 def test_places_of_few_views_are_left_out():
-    volume, camera, black = Volume(0.5, 4.0), turned(0.0), np.zeros((90, 120, 3), np.uint8)
-    depth = np.full((90, 120), 20.0, np.float32)
-    volume.add(np.zeros_like(depth), black, camera)
-    assert len(volume.mesh(1)) == 0
-    volume.add(depth, black, camera)
-    volume.add(depth * (np.arange(120) >= 60), black, camera)
-    assert volume.mesh(1).areas.sum() == pytest.approx(2 * volume.mesh(2).areas.sum(), rel=0.1)
-    assert len(volume.mesh(3)) == 0
+    camera, depth = turned(0.0), torch.full((90, 120), 20.0)
+    right = depth * (torch.arange(120) >= 60)
+    assert len(Volume([view_of(camera, torch.zeros_like(depth))], 0.5, 4.0).mesh(1, 0.0)) == 0
+    volume = Volume([view_of(camera, depth), view_of(camera, right)], 0.5, 4.0)
+    assert volume.mesh(1, 0.0).areas.sum() == pytest.approx(2 * volume.mesh(2, 0.0).areas.sum(), rel=0.1)
+    assert len(volume.mesh(3, 0.0)) == 0
+
+
+def test_places_of_little_support_are_left_out():
+    camera, depth = turned(0.0), torch.full((90, 120), 20.0)
+    quality = torch.where(torch.arange(120) >= 60, 1.0, 0.5).expand(90, 120)
+    volume = Volume([view_of(camera, depth, quality)] * 2, 0.5, 4.0)
+    whole, half = (volume.mesh(1, support).areas.sum() for support in (0.4, 1.0))
+    assert whole == pytest.approx(2 * half, rel=0.1)
+    assert len(volume.mesh(1, 2.5)) == 0
+
+
+def test_of_two_views_the_better_counts_more():
+    """A mean weighted by the fourth power of the quality, the distances of both being within the truncation."""
+    camera = turned(0.0)
+    pair = [view_of(camera, torch.full((90, 120), z), quality) for z, quality in ((20.0, 1.0), (20.4, 0.5))]
+    mesh = Volume(pair, 0.5, 4.0).mesh(1, 0.0)
+    assert camera.project(torch.from_numpy(mesh.vertices).double())[1].mean() == pytest.approx(20 + 0.4 / 17, abs=1e-3)
+
+
+def test_views_clear_the_space_before_what_they_see():
+    """A wall that one poor view claims in the midst of the space that others see through."""
+    camera = turned(0.0)
+    claimed = view_of(camera, torch.full((90, 120), 10.0), 0.3)
+    real = [view_of(camera, torch.full((90, 120), 20.0))] * 2
+    z = camera.project(torch.from_numpy(Volume([claimed, *real], 0.5, 3.0).mesh(1, 0.0).vertices).double())[1]
+    assert z.min() > 19.9
 
 
 def test_voxels_too_small_for_the_memory_are_refused(monkeypatch):
-    monkeypatch.setattr("coliags_plugin.surface.meshing.fusion._MAX_BLOCKS", 1000)
-    volume = Volume(0.1, 4.0)
+    monkeypatch.setattr("coliags_plugin.surface.meshing.volume._MAX_BLOCKS", 1000)
     with pytest.raises(InputError, match=r"larger voxels\. Try --voxel 0.2"):
-        volume.add(np.full((90, 120), 20.0, np.float32), np.zeros((90, 120, 3), np.uint8), turned(0.0))
+        Volume([view_of(turned(0.0), torch.full((90, 120), 20.0))], 0.1, 4.0)

@@ -1,0 +1,94 @@
+"""Depth of a run as seen from its training poses, and how much each pixel of it counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights, image_and_mask
+from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of
+
+#: Share of its weight that a pixel keeps at a highlight, and the pixels about one that belong to it.
+_GLINT, _MARGIN = 0.1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """Depth to fuse, as a camera sees it.
+
+    Attributes:
+        frame: That the view is of.
+        camera: That it was rendered from, on the CPU in float64; with corrected poses not the frame's own.
+        depth: z-depth, scene units; 0 where nothing is fused. [H, W]
+        quality: Confidence times the cosine of the angle between ray and normal times nearness, which is 1 where a
+            pixel is as large on the surface as it is in the median of the scene; 0 where nothing is fused. [H, W]
+    """
+
+    frame: Frame
+    camera: Camera
+    depth: Float[Tensor, "H W"]
+    quality: Float[Tensor, "H W"]
+
+
+def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[DepthView]:
+    """The depth rendered from each training pose, through the view modules of the run.
+
+    Left out is what is not opaque, ignored by the frame's mask, beyond the range of depth or of the sensor, or seen too
+    obliquely. Of estimated depth, the confidence is the frame's; highlights count little, as what they show is not the
+    wall.
+    """
+    kind = f"depth_{settings.depth}"
+    reach, footprint = max_depth_of(settings, trained.scene), trained.scene.pixel_footprint
+    for frame in trained.scene.train:
+        output = render_view(trained, frame, ("alpha", kind))
+        camera = (frame.camera if output.camera is None else output.camera).to("cpu", torch.float64)
+        depth, alpha = output[kind].detach().cpu().double(), output.alpha.detach().cpu()
+        cosines = incidence_cosines(depth, camera)
+        good = (alpha >= settings.min_alpha) & frame.valid.cpu() & (depth > 0) & (depth <= reach)
+        good &= cosines >= np.cos(np.radians(settings.max_incidence))
+        if frame.depth_at_least is not None:
+            good &= ~frame.depth_at_least.cpu().isfinite()
+        nearness = footprint * (camera.fx * camera.fy) ** 0.5 / depth if np.isfinite(footprint) else 1.0
+        quality = torch.where(good, cosines * nearness * trust(frame), 0.0)
+        yield DepthView(frame, camera, torch.where(good, depth, 0.0).float(), quality.float())
+
+
+def trust(frame: Frame) -> Float[Tensor, "H W"]:
+    """How far the pixels of a frame show the wall: the confidence of its depth, and little at highlights. [H, W]"""
+    glints = torch.from_numpy(dilated(highlights(image_and_mask(frame)[0], FeatureSettings()), _MARGIN))
+    confidence = 1.0 if frame.depth_confidence is None else frame.depth_confidence.cpu()
+    return torch.where(glints, _GLINT, 1.0) * confidence
+
+
+def incidence_cosines(depth: Float[Tensor, "H W"], camera: Camera) -> Float[Tensor, "H W"]:
+    """Cosine of the angle between ray and normal of the surface that a depth map describes. [H, W]
+
+    The normal is that of the point and those of its two neighbours, of left or right and above or below, that are
+    nearer in depth, so that the last pixel before a jump counts as the surface that it belongs to, and one in the midst
+    of the jump as a very oblique one. NaN where no neighbours have depth.
+    """
+    points = camera.unproject(depth)
+    across, down = (_smaller_step(points, depth, axis) for axis in (1, 0))
+    normals, rays = torch.linalg.cross(across, down), camera.rays()
+    return (normals * rays).sum(-1).abs() / (normals.norm(dim=-1) * rays.norm(dim=-1))
+
+
+def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], axis: int) -> Float[Tensor, "H W 3"]:
+    """From each point to the next along an axis, or from the last one to it: whichever depths differ less. [H, W, 3]"""
+    steps, jumps = torch.diff(points, dim=axis), torch.diff(depth, dim=axis).abs()
+    jumps = torch.where(jumps.isfinite(), jumps, torch.inf)
+    nothing = torch.full_like(points.narrow(axis, 0, 1), torch.nan)
+    endless = torch.full_like(depth.narrow(axis, 0, 1), torch.inf)
+    ahead, behind = torch.cat([steps, nothing], axis), torch.cat([nothing, steps], axis)
+    nearer = torch.cat([jumps, endless], axis) <= torch.cat([endless, jumps], axis)
+    return torch.where(nearer[..., None], ahead, behind)

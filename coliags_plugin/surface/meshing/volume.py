@@ -1,0 +1,149 @@
+"""Truncated signed distance field of depth images, in sparse blocks of voxels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.meshing.views import DepthView, incidence_cosines
+
+#: Edge of a block, voxels, and its voxels.
+_BLOCK = 8
+_VOXELS = _BLOCK**3
+#: Places of the voxels in a block, x changing first. [512, 3]
+_PLACES = np.stack(np.unravel_index(np.arange(_VOXELS), (_BLOCK,) * 3)[::-1], axis=1).astype(np.float64)
+#: A block of nine numbers a voxel, float32, four of them here and five in open3d, is 18 kB: at most 5.5 GB.
+_MAX_BLOCKS = 300_000
+#: Blocks whose voxels are projected at once.
+_AT_ONCE = 2_000
+#: Blocks are counted from minus this along each axis, so that a key of 60 bits holds all three.
+_HALF_RANGE = 2**19
+_KEY = np.array([4 * _HALF_RANGE**2, 2 * _HALF_RANGE, 1])
+
+
+class Volume:
+    """Weighted mean of the signed distances to the surfaces of depth images, in blocks of voxels near those surfaces.
+
+    A voxel in front of the surface of a view is at that distance, at most the truncation; one farther behind it than
+    the truncation has no part in the view. So every view clears the space before what it sees: surface there that only
+    worse views claim vanishes. Distances are along the normal of the surface at the pixel.
+
+    Args:
+        views: Weighted by their quality to the power of four, so that of unequal views the better one counts.
+        voxel_size: Edge of a voxel, scene units.
+        truncation: Largest distance, in voxels.
+    """
+
+    def __init__(self, views: Sequence[DepthView], voxel_size: float, truncation: float) -> None:
+        self.voxel_size, self.truncation = voxel_size, truncation
+        keys = [self._keys_near(view) for view in views if (view.depth > 0).any()]
+        found = np.unique(np.concatenate(keys)) if keys else np.zeros(0, np.int64)
+        if len(found) > _MAX_BLOCKS:
+            raise InputError(
+                f"voxels of {voxel_size:.3g} scene units need more than {_MAX_BLOCKS:,} blocks of {_BLOCK}^3 voxels",
+                "larger voxels",
+                f"Try --voxel {2 * voxel_size:.2g}",
+            )
+        self._blocks = np.stack(np.unravel_index(found, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE
+        size = len(found) * _VOXELS
+        self._distance, self._weight = torch.zeros(size), torch.zeros(size)
+        self._support, self._seen = torch.zeros(size), torch.zeros(size)
+        for view in views:
+            self._add(view)
+
+    def _keys_near(self, view: DepthView) -> Int[np.ndarray, "B"]:
+        """Keys of the blocks within the truncation of a pixel's surface point along its ray. [B]"""
+        row, column = torch.nonzero(view.depth > 0, as_tuple=True)
+        rays = view.camera.rays_at(torch.stack([column, row], dim=1)).numpy()
+        center, z = view.camera.center.numpy(), view.depth[row, column].double().numpy()
+        edge, band = _BLOCK * self.voxel_size, self.truncation * self.voxel_size
+        found = []
+        for shift in np.linspace(-band, band, 2 * math.ceil(2 * self.truncation / _BLOCK) + 1):
+            places = np.floor((center + (z + shift)[:, None] * rays) / edge).astype(np.int64) + _HALF_RANGE
+            # One number per block, as rows take ten times as long to sort.
+            found.append(np.unique(places @ _KEY))
+        return np.unique(np.concatenate(found))
+
+    def _add(self, view: DepthView) -> None:
+        camera, band = view.camera, self.truncation * self.voxel_size
+        # From a step in z-depth to the distance along the normal.
+        slant = incidence_cosines(view.depth.double(), camera).nan_to_num() * camera.rays().norm(dim=-1)
+        depth, quality, slant = view.depth.flatten(), view.quality.flatten(), slant.float().flatten()
+        for voxels, z, pixels in self._projected(view):
+            distance = ((depth[pixels] - z) * slant[pixels] / band).clamp(max=1.0)
+            good = (quality[pixels] > 0) & (distance > -1.0)
+            squared = torch.where(good, quality[pixels] ** 2, 0.0)
+            self._distance[voxels] += squared**2 * distance
+            self._weight[voxels] += squared**2
+            near = good & (distance < 1.0)
+            self._support[voxels] += squared * near
+            self._seen[voxels] += near
+
+    def _projected(self, view: DepthView) -> Iterator[tuple[Int[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"]]]:
+        """Voxels inside an image, their z-depths and pixels, row by row; in parts. [N], [N], [N]"""
+        camera, edge, size = view.camera, _BLOCK * self.voxel_size, (view.camera.width, view.camera.height)
+        turn = camera.camera_to_world[:3, :3]
+        corners = (torch.from_numpy(self._blocks * edge) - camera.center) @ turn
+        steps = (torch.from_numpy(_PLACES * self.voxel_size) @ turn).float()
+        near = (view.depth.max() + 2.0 * edge > corners[:, 2]) & _in_frustum(corners + steps.mean(0), camera, edge)
+        for part in torch.split(torch.nonzero(near)[:, 0], _AT_ONCE):
+            x, y, z = (corners[part].float()[:, None] + steps).reshape(-1, 3).unbind(1)
+            column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            inside = (z > 0) & (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
+            voxels = (part[:, None] * _VOXELS + torch.arange(_VOXELS)).flatten()[inside]
+            yield voxels, z[inside], row[inside].long() * size[0] + column[inside].long()
+
+    def mesh(self, min_views: int, min_support: float) -> TriangleMesh:
+        """The zero level of the distance, where so many views show it and their squared qualities add up to so much.
+
+        Triangles are counter-clockwise seen from the side of the cameras; vertices between neighbouring voxels are
+        shared.
+        """
+        if not len(self._blocks):
+            return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
+        # open3d takes voxels of no weight for known where the threshold is 0.
+        least = max(min_support, float(np.finfo(np.float32).tiny))
+        made = self._grid(torch.where(self._seen >= min_views, self._support, 0.0)).extract_triangle_mesh(least)
+        vertices, triangles = made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64)
+        mesh = TriangleMesh(vertices.copy(), triangles)
+        return mesh.part(mesh.areas > 0.0)
+
+    def _grid(self, weight: Float[Tensor, "N"]) -> Any:
+        """The field as an ``open3d.t.geometry.VoxelBlockGrid``."""
+        open3d = import_open3d("fuses depth")
+        grid = open3d.t.geometry.VoxelBlockGrid(
+            # Without colours, open3d fails where there is no surface.
+            attr_names=("tsdf", "weight", "color"),
+            attr_dtypes=(open3d.core.float32,) * 3,
+            attr_channels=((1,), (1,), (3,)),
+            voxel_size=self.voxel_size,
+            block_resolution=_BLOCK,
+            block_count=len(self._blocks),
+            device=open3d.core.Device("CPU:0"),
+        )
+        keys = open3d.core.Tensor(self._blocks.astype(np.int32))
+        grid.hashmap().activate(keys)
+        places = grid.hashmap().find(keys)[0].numpy()
+        mean = self._distance / self._weight.clamp(min=torch.finfo().tiny)
+        for name, values in (("tsdf", mean), ("weight", weight)):
+            grid.attribute(name).numpy()[places] = values.view(-1, _BLOCK, _BLOCK, _BLOCK, 1).numpy()
+        return grid
+
+
+def _in_frustum(centers: Float[Tensor, "B 3"], camera: Camera, edge: float) -> Bool[Tensor, "B"]:
+    """Which cubes, given in the camera's axes, may be inside its image. [B]"""
+    right, below = camera.width - camera.cx, camera.height - camera.cy
+    sides = [[camera.fx, 0, camera.cx], [-camera.fx, 0, right], [0, camera.fy, camera.cy], [0, -camera.fy, below]]
+    normals = torch.nn.functional.normalize(torch.tensor(sides, dtype=centers.dtype), dim=1)
+    radius = 0.5 * 3**0.5 * edge
+    return (centers @ normals.T > -radius).all(dim=1) & (centers[:, 2] > -radius)
