@@ -185,12 +185,13 @@ class Run:
         depth_kind: DepthKind = "expected",
         depth_tiff: bool = False,
         light_map: bool = False,
+        along: str | Path | None = None,
         overwrite: bool = False,
     ) -> Path:
         """Write colour, depth and error images of a set of frames, and a video along the trajectory.
 
         Args:
-            output: Folder to make; None: ``renders`` in the run folder, ``relit`` for a relit run.
+            output: Folder to make; None: in the run folder ``renders``, relit ``relit``, along a path ``path``.
             frames: See :meth:`frame_names`.
             video: Also write ``trajectory.mp4``, rgb beside depth.
             fps: Frames per second of the video.
@@ -198,19 +199,24 @@ class Run:
             depth_kind: ``accumulated``, ``expected`` or ``median`` (docs/conventions.md 3).
             depth_tiff: Also write depth as float32 TIFF, scene units.
             light_map: Also write the learned light, beside a phantom's: ``light.html`` and ``light.json``.
+            along: File of a camera path, as the browser view saves it (docs/viewer.md 6): its video alone is written.
             overwrite: Replace the folder where it exists.
 
         Returns:
             The folder.
 
         Raises:
-            InputError: See :meth:`load`; no such frames or channel; or the folder exists or cannot be written.
+            InputError: See :meth:`load`; no such frames or channel; the file is no camera path; or the folder exists or
+                cannot be written.
         """
+        from coliags_plugin.engine.camera_path import CameraPath
         from coliags_plugin.engine.rendering import render_run
 
+        path = None if along is None else CameraPath.read(Path(along))
         trained = self.load()
-        folder = Path(output) if output is not None else self.path / ("relit" if trained.relit else "renders")
-        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, light_map)
+        name = "path" if path is not None else "relit" if trained.relit else "renders"
+        folder = Path(output) if output is not None else self.path / name
+        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, light_map, path)
         return folder
 
     def mesh(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -9,8 +10,11 @@ from typing import Any, Literal
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.method_config import method_name
+from coliags_plugin.contracts import Follower
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
+
+log = logging.getLogger(__name__)
 
 
 def train(
@@ -28,6 +32,7 @@ def train(
     overwrite: bool = False,
     anonymous: bool = False,
     loggers: Sequence[str] = (),
+    view_port: int | None = None,
 ) -> Run:
     """Train a method on a scene.
 
@@ -45,6 +50,7 @@ def train(
         overwrite: Replace an existing run folder.
         anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
         loggers: What also gets the training log, by name: ``tensorboard``, ``wandb``, or of another package.
+        view_port: Port at which browsers see the run while it is trained; None: they do not; 0: any free one.
 
     Raises:
         InputError: Method, data or options are invalid or do not fit each other, or a logger's library is missing;
@@ -65,12 +71,23 @@ def train(
         method, data, (*assignments(settings), *assignments(chosen)), seed, data_format, anonymous
     )
     chosen_loggers = find_loggers(loggers)
+    if view_port is not None:
+        from coliags_plugin.export.viewer.serving import check_server
+
+        check_server("127.0.0.1", view_port)
     folder = _run_folder(method, data, output, resume)
     if_exists: Literal["resume", "overwrite", "refuse"] = "resume" if resume else "overwrite" if overwrite else "refuse"
     with open_training(request, folder, on, if_exists) as trainer:
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
         config = trainer.method.config.model_dump()
-        trainer.train(followers=[logger(folder.path, title, config, trainer.step) for logger in chosen_loggers])
+        followers: list[Follower] = [logger(folder.path, title, config, trainer.step) for logger in chosen_loggers]
+        if view_port is not None:
+            from coliags_plugin.export.viewer.live import LiveView
+
+            live = LiveView(trainer, view_port)
+            log.info("%s shows the run until training ends", live.viewer.url)
+            followers.append(live)
+        trainer.train(followers=followers)
     return Run(folder.path, data=data, device=device)
 
 

@@ -29,6 +29,10 @@ class TrainCommand:
     """Renderer by name (`coliags list renderers`); default: the method's."""
     resume: bool = False
     """Continue from the run's latest checkpoint (without --output: the newest run of this method on this scene)."""
+    view: bool = False
+    """Show the run in a browser while it is trained (extra `viewer`)."""
+    port: int = 8080
+    """Port of --view on this machine; 0: any free one."""
     logger: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = ()
     """Also log to tensorboard or wandb, into the run folder (extra `loggers`), repeatable."""
     set: arguments.Assignments = ()
@@ -58,6 +62,7 @@ class TrainCommand:
             overwrite=self.overwrite,
             anonymous=self.anonymous,
             loggers=self.logger,
+            view_port=self.port if self.view else None,
         )
         moved = ("--data", self.data) if self.anonymous else ()
         facts = {"method": run.method, "scene": run.scene_name, "seed": run.seed, "step": run.step}

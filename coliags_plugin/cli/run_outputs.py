@@ -18,7 +18,9 @@ class RenderCommand:
 
     path: arguments.RunFolder
     output: arguments.OptionalOutput = None
-    """Folder to create; default RUN/renders, with --light or --flatten RUN/relit."""
+    """Folder to create; default RUN/renders, with --light or --flatten RUN/relit, with --path RUN/path."""
+    along: Annotated[arguments.OptionalPath, tyro.conf.arg(name="path")] = None
+    """Write a video along a camera path, saved in `coliags view`, and nothing else."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
     video: arguments.DoneByDefault = True
@@ -68,6 +70,7 @@ class RenderCommand:
             depth_kind=self.depth_kind,
             depth_tiff=self.depth_tiff,
             light_map=self.light_map,
+            along=self.along,
             overwrite=self.overwrite,
         )
         print_summary(written=[folder], then=[view_command(self.path, self.data)], as_json=self.json)

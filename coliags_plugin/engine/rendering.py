@@ -17,6 +17,7 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import render_held
 from coliags_plugin.engine.light_map import write_light_map
 from coliags_plugin.engine.progress import ProgressReport
@@ -51,21 +52,25 @@ def render_run(
     depth_kind: DepthKind = "expected",
     depth_tiff: bool = False,
     light_map: bool = False,
+    along: CameraPath | None = None,
 ) -> None:
     """Render colour, depth and error images of a set of frames, and a video along the trajectory.
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
     is estimated; as float32 TIFF it has scene units and all pixels. Feature channels have one or three numbers, 1 is
-    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth.
+    white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth. With a camera path
+    to go ``along``, there are no images of frames, and the video is ``path.mp4``.
     """
-    chosen = choose_frames(trained.scene, frames)
+    chosen = [] if along is not None else choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
     depth = f"depth_{depth_kind}"
     wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
     trained.model.check_outputs(wants, f"depth of kind '{depth_kind}'")
-    path = choose_frames(trained.scene, "all")
-    sample = chosen[:: max(1, len(chosen) // 4)][:4]
+    path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
+    if along is not None:
+        path = list(along.cameras(trained.scene.train[0].camera, fps))
+    sample = (chosen or path)[:: max(1, len(chosen or path) // 4)][:4]
     sampled = [as_array(render_view(trained, frame, wants)[depth]) for frame in sample]
     limits = depth_limits(sampled, unit)
     with (
@@ -83,7 +88,7 @@ def render_run(
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
         if (folder / "depth_error").exists():  # some frame has true depth
             write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
-        if not trained.relit:
+        if chosen and not trained.relit:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
         for light in (trained.lamp, trained.held):
             if light is not None:
@@ -91,7 +96,8 @@ def render_run(
         if light_map:
             write_light_map(trained, folder)
         if video:
-            write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
+            name = "trajectory.mp4" if along is None else "path.mp4"
+            write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, fps)
 
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:
@@ -155,10 +161,15 @@ def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float])
 
 
 def _film(
-    trained: TrainedRun, path: list[Frame], depth: str, limits: tuple[float, float], progress: ProgressReport, done: int
+    trained: TrainedRun,
+    path: Sequence[Frame | Camera],
+    depth: str,
+    limits: tuple[float, float],
+    progress: ProgressReport,
+    done: int,
 ) -> Iterator[np.ndarray]:
-    for count, frame in enumerate(path, start=1):
-        output = render_view(trained, frame, ("rgb", "alpha", depth))
+    for count, view in enumerate(path, start=1):
+        output = render_view(trained, view, ("rgb", "alpha", depth))
         rgb = eight_bit(output.rgb).cpu().numpy()
         yield np.concatenate([rgb, depth_picture(output, depth, limits)], axis=1)
         progress.update(done + count)

@@ -33,8 +33,7 @@ def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Pat
     """
     if path.suffix.lower() != ".mp4":
         raise InputError(f"video file {path}", "a name that ends in .mp4")
-    if not (math.isfinite(fps) and fps > 0.0):
-        raise InputError(f"{fps} frames a second", "a positive number")
+    check_rate(fps)
     # FFmpeg chooses the container by the suffix, and opens the file itself.
     with atomic_path(path) as scratch:
         scratch.write_bytes(bytes(4096))  # OpenCV would call a full disk a missing codec
@@ -44,6 +43,12 @@ def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Pat
         if _frame_count(scratch) != count:
             raise InputError(f"the video written to {path} is incomplete", "a disk with space left", "Free some")
     _LOG.info("encoded %s: %d frames, %g per second", path.name, count, fps)
+
+
+def check_rate(fps: float) -> None:
+    """Refuse what is no number of frames a second."""
+    if not 0.0 < fps < math.inf:
+        raise InputError(f"{fps} frames a second", "a positive number")
 
 
 def _frame_count(path: Path) -> int:

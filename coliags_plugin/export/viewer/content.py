@@ -143,6 +143,16 @@ class ViewerContent:
         return cls(trained, trained.scene.video, baked, decoder, FramePictures(trained), wire_unit(baked))
 
     @classmethod
+    def live(cls, trained: TrainedRun) -> ViewerContent:
+        """Content of a run that is being trained: Gaussians as each view sees them, and none beside, as they change."""
+        gaussian_field = trained.model.field
+        if not isinstance(gaussian_field, GaussianField):
+            return cls.of(trained)
+        decoder = ViewDecoder(gaussian_field, NOTHING, trained.device)
+        first = decoder.of(trained.scene.train[0].camera)
+        return cls(trained, trained.scene.video, first, decoder, FramePictures(trained), wire_unit(first))
+
+    @classmethod
     def of_cloud(cls, trained: TrainedRun, cloud: SplatCloud, first: int = 0) -> ViewerContent:
         """Content of some Gaussians of a run; the view starts at a training frame."""
         return cls(trained, trained.scene.video, cloud, None, FramePictures(trained), wire_unit(cloud), first)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.export.viewer.content import Picture, ViewerContent, mesh_files
+from coliags_plugin.export.viewer.keyframes import KeyframeControls
 from coliags_plugin.export.viewer.layers import add_cameras, add_mesh
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.outputs.image_files import as_array
@@ -24,22 +26,25 @@ _HIDING_SIZES = 3.0
 class Controls:
     """Slider through the video, light, threshold, layers and pictures, in viser's panel of one browser.
 
-    ``changed`` is told of another light, threshold or kind of picture, ``go_to`` of another frame.
+    ``changed`` is told of another light, threshold or kind of picture, ``go_to`` of another frame; ``camera`` is the
+    browser's.
     """
 
     def __init__(
-        self, client: Any, content: ViewerContent, changed: Callable[[], None], go_to: Callable[[int], None]
+        self,
+        client: Any,
+        content: ViewerContent,
+        changed: Callable[[], None],
+        go_to: Callable[[int], None],
+        camera: Callable[[], Camera],
     ) -> None:
         self._content = content
         self._client = client
         self._go_to = go_to
         self._layers: dict[str, list[Any]] = {}
-        gui, trained = client.gui, content.trained
-        held_out = len(content.frames) - len(trained.scene.train)
-        gui.add_markdown(
-            f"**{content.title}**, step {trained.step}; {len(content.frames)} frames, {held_out} held out; "
-            f"lengths in {trained.scene.length_unit}"
-        )
+        gui = client.gui
+        self._about = gui.add_markdown("")
+        self.step = content.trained.step
         self._frame = gui.add_slider("Frame", 0, max(1, len(content.frames) - 1), 1, 0)
         self._frame.on_update(lambda _: self._frame_chosen())
         self._about_frame = gui.add_markdown(self._frame_text())
@@ -57,7 +62,23 @@ class Controls:
             self._picture = gui.add_dropdown("Beside it", content.pictures.kinds)
             self._picture.on_update(lambda _: changed())
             self._rendered = gui.add_image(as_array(content.frames[0].image) // 4, label="is being rendered")
+        with gui.add_folder("Camera path"):
+            self.keyframes = KeyframeControls(gui, content.trained.run.path, camera)
         self._status = gui.add_markdown("")
+
+    @property
+    def step(self) -> int:
+        """The training step that is shown."""
+        return self._step
+
+    @step.setter
+    def step(self, step: int) -> None:
+        self._step = step
+        scene, count = self._content.trained.scene, len(self._content.frames)
+        self._about.content = (
+            f"**{self._content.title}**, step {step}; {count} frames, {count - len(scene.train)} held out; "
+            f"lengths in {scene.length_unit}"
+        )
 
     @property
     def frame(self) -> int:

@@ -30,17 +30,21 @@ logger = logging.getLogger(__name__)
 class Viewer:
     """A run that is being served to browsers, until it is closed. Use it as a context manager, or close it.
 
-    It listens on the name or address ``host``, at a port, any free one for 0.
+    It listens on the name or address ``host``, at a port, any free one for 0. With ``content``, sessions are brought up
+    to date by their :meth:`~coliags_plugin.export.viewer.session.Session.update`, and not by threads of their own.
     """
 
-    def __init__(self, trained: TrainedRun, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self, trained: TrainedRun, host: str = "127.0.0.1", port: int = 8080, content: ViewerContent | None = None
+    ) -> None:
         self._server = start_server(host, port)
         self._host = host
         self._sessions: dict[int, Session] = {}
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         try:
-            self.content = ViewerContent.of(trained)
+            self.content = content or ViewerContent.of(trained)
+            self._own_threads = content is None
             set_start(self._server, self.content)
         except BaseException:
             stop_server(self._server)
@@ -94,6 +98,8 @@ class Viewer:
             self._sessions[client.client_id] = session
         if client.client_id not in self._server.get_clients():  # it has left in the meantime
             self._gone(client)
+        if not self._own_threads:
+            return
         thread = threading.Thread(target=session.run, name=f"view-{client.client_id}", daemon=True)
         self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()
@@ -141,6 +147,12 @@ def import_viser() -> Any:
             "Install it with `pip install 'coliags_plugin[viewer]'`",
         ) from error
     return viser
+
+
+def check_server(host: str, port: int) -> None:
+    """Raise InputError where viser is not installed, or cannot listen at an address."""
+    import_viser()
+    _check_address(host, port)
 
 
 def start_server(host: str, port: int) -> Any:

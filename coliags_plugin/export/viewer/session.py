@@ -79,10 +79,11 @@ class Session:
         self._picture_of: tuple[int, str] | None = None
         self._splats: Any = None
         self._headlight = add_headlight(client.scene, tuple(client.camera.position))
-        self.controls = Controls(client, content, self.options_changed, self.go_to)
+        self.controls = Controls(client, content, self.options_changed, self.go_to, self._camera)
         client.camera.on_update(lambda _: self.camera_moved())
         if content.decoder is not None:
-            self._send(content.decoder.beside, 0.0)
+            if len(content.decoder.beside):
+                self._send(content.decoder.beside, 0.0)
             self._pace.want()
 
     def camera_moved(self) -> None:
@@ -95,6 +96,12 @@ class Session:
         """Light, threshold or kind of picture has changed."""
         self._pace.want()
         self._wake.set()
+
+    def model_changed(self, step: int) -> None:
+        """The run has been trained on, up to this step."""
+        self.controls.step = step
+        self._picture_of = None
+        self._pace.want()
 
     def go_to(self, index: int) -> None:
         """Move the browser's camera to the pose of a frame of the video."""
@@ -118,19 +125,22 @@ class Session:
     def run(self) -> None:
         """Keep the browser up to date until it has gone."""
         while not self._closed:
-            try:
-                wait = self.step()
-            except Exception:
-                if self._closed:
-                    return
+            wait = self.update()
+            if not self._closed:
+                self._wake.wait(wait)
+                self._wake.clear()
+
+    def update(self) -> float | None:
+        """Do what is due. Returns seconds until more is due, 0 where it may be now; None until something changes."""
+        try:
+            return self._step()
+        except Exception:
+            if not self._closed:
                 logger.exception("the view could not be brought up to date")
                 self.controls.status = "The last update failed; see the terminal."
-                wait = None
-            self._wake.wait(wait)
-            self._wake.clear()
+            return None
 
-    def step(self) -> float | None:
-        """Do what is due. Returns seconds until more is due; None until something changes."""
+    def _step(self) -> float | None:
         wanted = (self.controls.frame, self.controls.picture)
         if self._pace.wait() == 0.0:
             self._pace.begin()
