@@ -556,7 +556,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             ),
             r"images/0005_color\.png has no distmap_path, but others have",
         ),
-        (remove("rgb_mask.png"), r"no file .*rgb_mask\.png.*mask: false"),
+        (remove("rgb_mask.png"), r"no file .*rgb_mask\.png.*mask=false"),
         (paint("rgb_mask.png", (26, 32)), r"rgb_mask\.png is 32 x 26.*64 x 51"),
         (
             repaint("rgb_mask.png", 0, lambda mask: np.dstack([mask, mask // 2, mask])),

@@ -342,7 +342,9 @@ class TestRelease:
 
 class TestRefused:
     def test_slam_poses_that_are_not_there(self, mine):
-        with pytest.raises(InputError, match=r"wall has no params.npz.*Set params_file, or poses: ground-truth"):
+        with pytest.raises(
+            InputError, match=r"wall has no params.npz.*params_file=FILE, or --set datamanager.poses=ground-truth"
+        ):
             load(mine)
 
     def test_test_frames_without_any_pose(self, mine):

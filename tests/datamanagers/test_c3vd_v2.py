@@ -165,7 +165,7 @@ class TestIntrinsicsFile:
         with pytest.raises(InputError, match="is ambiguous or implausible") as refused:
             read_camera_intrinsics(tmp_path / "camera_intrinsics.txt")
         assert seen in str(refused.value)
-        assert re.search(r"camera_intrinsics\.txt .*set lens: v2.*or lens: v1", str(refused.value))
+        assert re.search(r"camera_intrinsics\.txt .*datamanager.lens=v2.*or v1", str(refused.value))
 
 
 def test_images_and_poses_are_enough_where_points_are_given(mine):

@@ -228,7 +228,7 @@ class TestOrder:
     def test_whole_numbers_can_be_times(self, my_numbered):
         lines = (my_numbered / "groundtruth.txt").read_text().splitlines()
         (my_numbered / "groundtruth.txt").write_text("\n".join(lines[:6] + lines[7:]) + "\n")
-        with pytest.raises(InputError, match=r"groundtruth.txt has 11 poses for 12 images.*association: time"):
+        with pytest.raises(InputError, match=r"groundtruth.txt has 11 poses for 12 images.*association=time"):
             load(my_numbered)
         scene = load(my_numbered, association="time")
         assert names(everything(scene)) == [str(index) for index in range(12) if index != 5]
@@ -313,7 +313,7 @@ class TestPancakes:
         assert scene.provenance["points"]["source"].endswith("mesh.obj")
 
     def test_metric_depth_where_it_is_metric(self, folder):
-        with pytest.raises(InputError, match=r"or set depth: none if depth is relative"):
+        with pytest.raises(InputError, match=r"or --set datamanager.depth=none if it is relative"):
             load(folder)
         assert worst(load(folder, depth_scale=SCALE).train[0])[0] < 0.001
 

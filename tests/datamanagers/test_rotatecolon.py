@@ -184,7 +184,9 @@ class TestFiles:
 
     def test_the_test_folder_may_be_another(self, mine):
         (mine / "test_views_1").rename(mine / "test_views_2")
-        with pytest.raises(InputError, match=r"transforms_test.json but no folder test_views_1.*Set test_folder"):
+        with pytest.raises(
+            InputError, match=r"transforms_test.json but no folder test_views_1.*datamanager.test_folder="
+        ):
             load(mine)
         assert len(load(mine, test_folder="test_views_2").test_sets["test"]) == 2
 

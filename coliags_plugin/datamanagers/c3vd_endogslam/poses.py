@@ -97,7 +97,7 @@ def _mapped(
         raise InputError(
             f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
             "EndoGSLAM's result, for option poses: slam",
-            "Set params_file, or poses: ground-truth",
+            "Name it with --set datamanager.params_file=FILE, or --set datamanager.poses=ground-truth",
         )
     from_file = None if file is None else slam.from_true @ _inverse(file.camera_to_world[0])
     camera_to_world = slam.params.camera_to_world

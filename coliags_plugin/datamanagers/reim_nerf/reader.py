@@ -107,7 +107,9 @@ def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
     """Valid stored pixels: the mask file is white where a pixel is ignored."""
     if not mask.is_file():
         raise InputError(
-            f"no file {mask}", "the mask of pixels outside the lens's image circle", "Restore it, or set mask: false"
+            f"no file {mask}",
+            "the mask of pixels outside the lens's image circle",
+            "Restore it, or --set datamanager.mask=false",
         )
     ignored = read_mask(mask)
     if ignored.shape != (height, width):

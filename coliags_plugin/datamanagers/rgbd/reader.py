@@ -197,7 +197,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
                 "timestamps of one clock in names and trajectory, in seconds",
-                "Shift the trajectory's timestamps, or set association: order if line n belongs to image n",
+                "Shift the trajectory's timestamps, or --set datamanager.association=order if line n is image n's",
             )
         posed = pose >= 0
         depth = np.full(len(images), -1)
@@ -209,7 +209,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"no depth file within {tolerance:g} of an image that has a pose",
                 "depth files named by timestamps of the images' clock",
-                "Rename them, or set depth: none",
+                "Rename them, or --set datamanager.depth=none",
             )
         kept = np.flatnonzero(complete)
         dropped = {"without_pose": int((~posed).sum()), "without_depth": int((posed & ~complete).sum())}
@@ -238,7 +238,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"{file} has {len(trajectory)} poses for {len(numbered)} images",
                 "a pose for every image, in order",
-                "Restore the missing ones; or set association: time, if images are named by its timestamps",
+                "Restore the missing ones, or --set datamanager.association=time if its timestamps name images",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
         deep = files.by_number(depths)
@@ -248,7 +248,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"{file.parent} has {len(numbered)} images and {len(deep)} depth files; frame "
                 f"{' '.join(map(str, lone))} has only one of the two",
                 "a depth file for every image, or none at all",
-                "Restore the missing files, or set depth: none",
+                "Restore the missing files, or --set datamanager.depth=none",
             )
         return _Frames(
             list(numbered.values()), [deep.get(key) for key in numbered], range(len(numbered)), {"by": "order"}
@@ -268,7 +268,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"{file}: pose {index} has timestamp {trajectory.timestamps[index]:g}, but image {index} is "
                 f"{list(numbered.values())[index].name}",
                 "line n for image n, or timestamps equal to the image names",
-                "Set association: time if the names are timestamps, or order if the timestamps are meaningless",
+                "--set datamanager.association=time if the names are timestamps, or order if these mean nothing",
             )
 
     def _depth_scale(self, camera: files.CameraFile, path: Path) -> float:
@@ -284,7 +284,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"{path} has depth files, but their number of steps per unit of the trajectory is not given",
                 '"depth_scale" in camera.json, or the option depth_scale; TUM\'s files have 5000 steps per metre',
-                "Set it, for instance --set datamanager.depth_scale=5000, or set depth: none if depth is relative",
+                "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
             )
         return scale
 

@@ -69,7 +69,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
         raise InputError(
             f"{path} has the channels {', '.join(sorted(channels))}",
             f"a channel {channel}",
-            "Set depth_channel to the one that holds depth",
+            "Choose the one that holds depth with --set datamanager.depth_channel=NAME",
         )
     return np.asarray(channels[channel]).astype(np.float32)
 

@@ -119,7 +119,7 @@ class RotateColonDataManager(RecordedDataManager):
             raise InputError(
                 f"{path} has {layout.TEST} but no folder {self.settings.test_folder}",
                 "the images of the test views",
-                "Set test_folder to the folder they are in",
+                "Name the folder they are in with --set datamanager.test_folder=FOLDER",
             )
         return train, layout.find_views(path / layout.TEST, images, None)
 
