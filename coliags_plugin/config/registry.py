@@ -192,6 +192,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "gain": "coliags_plugin.modules.gain:FrameGain",
         "response": "coliags_plugin.modules.response:CameraResponse",
         "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
+        "image-warp": "coliags_plugin.modules.image_warp:ImageWarp",
     },
     ("samplers", "sampler"): {
         "frames": "coliags_plugin.engine.samplers:FrameSampler",

@@ -34,9 +34,9 @@ class SceneSettings(Settings):
     )
     split: Split = Field(
         "every-8th",
-        description="Test frames: 'every-8th': 0, 8, 16, ... as in the paper; 'endogslam': 7, 15, 23, ...; "
-        "'block': one contiguous block of the video; 'all-train': none; 'own': the dataset's own split. Counted after "
-        "frame_step and max_frames.",
+        description="Test frames: 'every-8th': 0, 8, 16, ... as in the paper; 'inner-8th': 4, 12, 20, ... without the "
+        "last frame; 'endogslam': 7, 15, 23, ...; 'block': one contiguous block of the video; 'all-train': none; "
+        "'own': the dataset's own split. Counted after frame_step and max_frames.",
     )
     block: tuple[Share, Share] = Field(
         (0.4, 0.6), description="Split 'block': start and end of the block, as fractions of the video."

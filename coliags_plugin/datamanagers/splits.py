@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-Split = Literal["every-8th", "endogslam", "block", "all-train", "own"]
+Split = Literal["every-8th", "inner-8th", "endogslam", "block", "all-train", "own"]
 
 EVERY = 8
 
@@ -16,13 +16,16 @@ EVERY = 8
 def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) -> Bool[np.ndarray, "N"]:
     """Mask of the test frames among ``count`` frames in video order.
 
-    ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM, PR-Endo;
-    docs/data.md 3); ``block``: one contiguous block, given by fractions of the video, so that test views are not
+    ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``inner-8th``: 4, 12, 20, ... without the last frame,
+    so that every one is between training frames; ``endogslam``: 7, 15, 23, ... (EndoGSLAM, PR-Endo; docs/data.md 3);
+    ``block``: one contiguous block, given by fractions of the video, so that test views are not
     between neighbouring training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
     """
     index = np.arange(count)
     if split == "every-8th":
         return np.asarray(index % EVERY == 0)
+    if split == "inner-8th":
+        return np.asarray((index % EVERY == EVERY // 2) & (index < count - 1))
     if split == "endogslam":
         return np.asarray(index % EVERY == EVERY - 1)
     if split == "block":

@@ -74,6 +74,7 @@ class StageContext:
         size = self.settings.size
         options = ["initial_points=none", "keep_pixels=false", *self.model_options]
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]
+        options += ["split=inner-8th"] if self.data_format is None else []
         scene = open_scene(self.posed, self.data_format or "colmap", options, self.progress, stored_size)
         return scene if self.data_format is not None else scene.without(read_blurred(self.frames))
 

@@ -44,10 +44,8 @@ _VIEWS = 6
 _KINDS = ("recorded.png", "depth.png", "flattened light.png")
 #: Rows of the table of stretches above which it is folded.
 _LONG = 12
-#: What else is told of the held-out PSNR.
-_APART = {"psnr_between": "PSNR between training frames", "psnr_pose_refined": "PSNR, pose refined"}
 #: Figures of a sub-map that have a mean over all, with their units.
-_MEASURED = {"psnr": "dB", "ssim": "1", **dict.fromkeys(_APART, "dB"), "psnr_training": "dB", "gap": "dB"}
+_MEASURED = {"psnr": "dB", "ssim": "1", "psnr_pose_refined": "dB", "psnr_training": "dB", "gap": "dB"}
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
@@ -87,6 +85,7 @@ def results_of(record: Record) -> list[SubmapResults]:
 
 def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | None = None) -> Table:
     """Figures of the sub-maps and their means; ``spans`` tell where in the video each is."""
+    refined = any("psnr_pose_refined" in one.figures for one in results)
     columns = [
         Column("submap", "Sub-map", words=True),
         Column("frames", "Frames"),
@@ -94,7 +93,7 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         Column("held_out", "Held out"),
         Column("psnr", "PSNR", "dB", "higher"),
         Column("ssim", "SSIM", "1", "higher"),
-        *([Column(key, text, "dB") for key, text in _APART.items() if any(key in one.figures for one in results)]),
+        *([Column("psnr_pose_refined", "PSNR, pose refined", "dB")] if refined else []),
         Column("psnr_training", "PSNR of training views", "dB"),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),

@@ -14,9 +14,7 @@ from coliags_plugin.reporting.numbers import area_text
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.trained import TrainedRun
-    from coliags_plugin.results.record import Result
 
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
@@ -90,17 +88,7 @@ def evaluate(context: StageContext) -> StageOutcome:
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
     made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
-    figures |= _psnr_between(trained.scene, result)
     return StageOutcome(f"held-out frames: {shown}", made, figures=figures | _training_psnr(trained))
-
-
-def _psnr_between(scene: Scene, result: Result) -> dict[str, float]:
-    """Mean PSNR of the held-out frames with training frames before and after them; empty where there are none."""
-    times, main = [frame.index for frame in scene.train], result.sets[result.main_set]
-    between = {frame.name for frame in scene.video if min(times) < frame.index < max(times)}
-    scored = zip(main.frames, main.values.get("psnr", ()), strict=False)
-    values = [value for name, value in scored if name in between and value is not None]
-    return {"psnr_between": sum(values) / len(values)} if values else {}
 
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:

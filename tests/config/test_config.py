@@ -80,6 +80,8 @@ def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only(
                 "modules.poses": "pose-correction",
                 'optimizers."poses.translation"': "{lr: 0.03, final_lr: 0.003}",
                 'optimizers."poses.rotation"': "{lr: 0.001, final_lr: 0.0001}",
+                "modules.warp": "image-warp",
+                'optimizers."warp.displacement"': "{lr: 0.1, final_lr: 0.01}",
             },
         ),
     ],

@@ -14,6 +14,8 @@ from coliags_plugin.datamanagers.splits import held_out
     ("arguments", "test"),
     [
         (("every-8th", 25), [0, 8, 16, 24]),
+        (("inner-8th", 21), [4, 12]),
+        (("inner-8th", 22), [4, 12, 20]),
         (("endogslam", 25), [7, 15, 23]),
         (("block", 20), [8, 9, 10, 11]),
         (("block", 10, (0.0, 0.3)), [0, 1, 2]),

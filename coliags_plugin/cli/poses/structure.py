@@ -90,6 +90,7 @@ def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
     is_test = [frame.index in test_indices for frame in video]
     options: dict[Split, list[str]] = {
         "every-8th": [],
+        "inner-8th": ["datamanager.split=inner-8th"],
         "endogslam": ["datamanager.split=endogslam"],
         "all-train": ["datamanager.split=all-train"],
         "block": ["datamanager.split=block", f"datamanager.block=[{block[0]:g}, {block[1]:g}]"],

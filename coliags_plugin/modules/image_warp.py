@@ -1,0 +1,105 @@
+"""Displacement of the image per frame, for tissue that moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts import ViewModule
+from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import Scene, View
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.modules.frame_rows import FrameRows
+
+
+class ImageWarpSettings(Settings):
+    """Options of the displacement of images."""
+
+    cells: int = Field(default=8, ge=1)  # of the grid, along either side of the image
+    # held-out frames: displacements interpolated in time between those of the training frames, or none
+    untrained: Literal["interpolate", "none"] = "interpolate"
+
+
+class ImageWarp(ViewModule[ImageWarpSettings]):
+    """Learned smooth displacement of the rendered colours of each training frame.
+
+    What a living wall has moved by since the other frames is, in one image, a displacement of its pixels. Depth and
+    alpha stay those of the rigid wall. The mean displacement over the frames is subtracted, since geometry and poses
+    explain it as well.
+
+    Held-out frames of the video are displaced as the training frames around them; free cameras are not.
+    """
+
+    Settings: ClassVar[type[Settings]] = ImageWarpSettings
+    whole_image: ClassVar[bool] = True
+
+    def __init__(self, settings: ImageWarpSettings, scene: Scene) -> None:
+        super().__init__()
+        self.settings = settings
+        self.frames = FrameRows(scene)
+        nodes = settings.cells + 1
+        self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes))
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: ImageWarpSettings, generator: torch.Generator) -> Self:
+        """Module with zero displacements."""
+        return cls(settings, scene)
+
+    @property
+    def untrained_views(self) -> str:
+        """Displacement of views that are not training frames."""
+        if self.settings.untrained == "none":
+            return "views without training are not displaced"
+        return (
+            "views without training are displaced by what is interpolated between the training frames before and "
+            "after them; views beside the video as the nearest training camera"
+        )
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Displacements of the grid's nodes, percent of the image's width."""
+        return {"displacement": [self.displacement]}
+
+    def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
+        """Displace the colours."""
+        nodes = self._nodes(view)
+        if nodes is None:
+            return output
+        height, width = output.rgb.shape[:2]
+        shift = nn.functional.interpolate(nodes[None], (height, width), mode="bicubic", align_corners=True)[0]
+        return replace(output, rgb=sample(output.rgb, shift * (width / 100.0)))
+
+    def _nodes(self, view: View | None) -> Float[Tensor, "2 N N"] | None:
+        """Displacements of the grid's nodes for a view; None where there are none."""
+        free = self.displacement - self.displacement.mean(0)
+        row = self.frames.row(view)
+        if row is not None:
+            return free[row]
+        if view is None or self.settings.untrained == "none":
+            return None
+        before, after, share = self.frames.neighbours(view)
+        return torch.lerp(free[before], free[after], share)
+
+    @property
+    def learned(self) -> JsonObject:
+        """Root mean square of the displacements over the training frames, percent of the image's width."""
+        free = self.displacement.detach() - self.displacement.detach().mean(0)
+        return {"displacement": float(free.square().sum(1).mean().sqrt())}
+
+
+def sample(image: Float[Tensor, "H W C"], shift: Float[Tensor, "2 H W"]) -> Float[Tensor, "H W C"]:
+    """The image's values at every pixel moved by a shift (x, y) in pixels, bilinear; at the edge those of the edge."""
+    height, width = image.shape[:2]
+    x = torch.arange(width, device=image.device) + 0.5 + shift[0]
+    y = torch.arange(height, device=image.device)[:, None] + 0.5 + shift[1]
+    grid = torch.stack([2.0 * x / width - 1.0, 2.0 * y / height - 1.0], dim=-1)
+    sampled = nn.functional.grid_sample(
+        image.movedim(-1, 0)[None], grid[None], padding_mode="border", align_corners=False
+    )
+    return sampled[0].movedim(0, -1)
