@@ -118,6 +118,12 @@ class Camera(Intrinsics):
         upper = torch.cat([turn @ pose[:3, :3], center[:, None]], dim=1)
         return replace(self, camera_to_world=torch.cat([upper, pose[3:]]))
 
+    def scaled(self, factor: float) -> Camera:
+        """The camera in a world whose lengths are ``factor`` times as large."""
+        pose = self.camera_to_world.clone()
+        pose[:3, 3] *= factor
+        return replace(self, camera_to_world=pose, near_plane=factor * self.near_plane)
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its pose on another device or of another dtype."""
         return replace(self, camera_to_world=self.camera_to_world.to(device=device, dtype=dtype))

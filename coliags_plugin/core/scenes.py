@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -28,6 +28,10 @@ class SparseDepth:
 
     pixels: Float[Tensor, "K 2"]
     depth: Float[Tensor, "K"]
+
+    def scaled(self, factor: float) -> SparseDepth:
+        """The same points in a world whose lengths are ``factor`` times as large."""
+        return replace(self, depth=factor * self.depth)
 
     def to(self, device: torch.device | str) -> SparseDepth:
         """The same points on another device."""
@@ -169,6 +173,13 @@ class Frame(_MaskedImage):
         object.__setattr__(frame, "camera", replace(self.camera, near_plane=near_plane))
         return frame
 
+    def scaled(self, factor: float) -> Frame:
+        """The same frame, read as lazily as before, in a world whose lengths are ``factor`` times as large."""
+        sparse, depths = self.sparse_depth, {"depth": self.depth, "depth_at_least": self.depth_at_least}
+        scaled: dict[str, Any] = {name: None if depth is None else factor * depth for name, depth in depths.items()}
+        scaled["sparse_depth"] = None if sparse is None else sparse.scaled(factor)
+        return replace(self, camera=self.camera.scaled(factor), **scaled)
+
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
         return View(self.name, float(self.index), trained)
@@ -245,9 +256,18 @@ class Scene:
 
     def with_near_plane(self, near_plane: float) -> Scene:
         """The scene with another near plane of all cameras, scene units."""
-        train = [frame.with_near_plane(near_plane) for frame in self.train]
-        tests = {name: [frame.with_near_plane(near_plane) for frame in part] for name, part in self.test_sets.items()}
-        return replace(self, train=train, test_sets=tests)
+        return self._with_frames(lambda frame: frame.with_near_plane(near_plane))
+
+    def scaled(self, factor: float) -> Scene:
+        """The scene in a world whose lengths are ``factor`` times as large."""
+        if factor == 1.0:
+            return self
+        points = replace(self.points, positions=factor * self.points.positions)
+        return replace(self._with_frames(lambda frame: frame.scaled(factor)), points=points)
+
+    def _with_frames(self, changed: Callable[[Frame], Frame]) -> Scene:
+        tests = {name: [changed(frame) for frame in part] for name, part in self.test_sets.items()}
+        return replace(self, train=[changed(frame) for frame in self.train], test_sets=tests)
 
     def without(self, names: Collection[str]) -> Scene:
         """The scene without the frames of these names."""

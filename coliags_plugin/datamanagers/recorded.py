@@ -26,7 +26,7 @@ from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSetting
 from coliags_plugin.datamanagers.seen_masks import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
-from coliags_plugin.datamanagers.units import read_unit
+from coliags_plugin.datamanagers.units import FACTORS, Unit, read_unit
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +48,8 @@ class RecordedDataManager(DataManager):
     fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
     #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
+    #: Unit of length of the dataset's files, where a scene states none.
+    unit: ClassVar[Unit] = "mm"
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -66,6 +68,10 @@ class RecordedDataManager(DataManager):
         """See :meth:`DataManager.fingerprint`; reads no pixels."""
         return self.open(Path(path)).fingerprint
 
+    def stated_unit(self, path: Path) -> Unit:
+        """Unit of length of a scene's files, by the settings, the scene or the format, in this order."""
+        return self.settings.unit or read_unit(path, self.unit)
+
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
         return self.settings.size or fitted(width, height, self._bounds)
@@ -79,7 +85,10 @@ class RecordedDataManager(DataManager):
         return manager
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
-        """Read the scene at the working size, in the dataset's world frame and units; see :class:`DataManager`."""
+        """Read the scene at the working size, in the dataset's world frame; see :class:`DataManager`.
+
+        Lengths are in mm, or in the dataset's own unit where that is unknown.
+        """
         path, settings = Path(path), self.settings
         recording = self.open(path)
         train_indices, test_indices = self._split(recording, path)
@@ -101,11 +110,12 @@ class RecordedDataManager(DataManager):
             "train": [frame.name for frame in train],
             "test_sets": {name: [frame.name for frame in frames] for name, frames in test_sets.items()},
         }
+        unit = recording.facts.get("unit") or self.stated_unit(path)
         provenance = {
             "dataset": self.name,
             "path": str(path.resolve()),
-            "unit": read_unit(path),
             **recording.facts,
+            "unit": unit if unit == "unknown" else "mm",
             "fingerprint": recording.fingerprint,
             "split": split,
             "points": described,
@@ -118,7 +128,7 @@ class RecordedDataManager(DataManager):
         }
         if self._is_told:
             self._tell(recording, path)
-        return Scene(path.resolve().name, train, test_sets, points, provenance)
+        return Scene(path.resolve().name, train, test_sets, points, provenance).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
         """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""

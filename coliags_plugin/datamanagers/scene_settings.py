@@ -9,6 +9,7 @@ from typing_extensions import Self
 
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.units import Unit
 
 POINTS_FILE = "points3D.ply"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -25,6 +26,11 @@ class SceneSettings(Settings):
         "quarter of a raw frame; for 'reim-nerf' 270 x 216; for 'c3vd-endogslam' and 'rotatecolon' as stored.",
     )
     height: int | None = Field(None, gt=0, description="Working height, pixels; goes with width.")
+    unit: Unit | None = Field(
+        None,
+        description="Unit of length of the scene's files, 'mm', 'cm', 'm' or 'unknown'; known lengths are converted to "
+        "mm. None: as stated by unit.txt, or else the format's: mm for C3VD's and REIM-NeRF's, unknown for others.",
+    )
     focal_scale: float = Field(
         1.0,
         gt=0.0,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,13 +40,24 @@ class StoredFrame(Frame):
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
         camera = shot.rectification.camera(shot.camera_to_world)
         values = {"name": shot.name, "index": index, "camera": camera, "sparse_depth": shot.sparse_depth}
-        for name, value in {**values, "_shot": shot, "_keep": keep, "_pixels": None}.items():
+        for name, value in {**values, "_shot": shot, "_keep": keep, "_pixels": None, "_scale": 1.0}.items():
             object.__setattr__(self, name, value)
 
     @property
     def shot(self) -> Shot:
-        """Files, pose and camera of the frame."""
-        return self._shot
+        """Files, pose and camera of the frame, the pose in the frame's world."""
+        pose = self._shot.camera_to_world.copy()
+        pose[:3, 3] *= self._scale
+        return replace(self._shot, camera_to_world=pose)
+
+    def scaled(self, factor: float) -> Frame:
+        """See :class:`Frame`."""
+        frame, sparse = copy(self), self.sparse_depth
+        changes: dict[str, Any] = {"camera": self.camera.scaled(factor), "_scale": factor * self._scale}
+        changes["sparse_depth"] = None if sparse is None else sparse.scaled(factor)
+        for name, value in changes.items():
+            object.__setattr__(frame, name, value)
+        return frame
 
     @property
     def image(self) -> UInt8[Tensor, "H W 3"]:
@@ -121,7 +134,7 @@ class StoredFrame(Frame):
         form = self._shot.depth_format
         if stored is None or form is None:
             return None
-        depth = form.z_depth(stored)
+        depth = form.z_depth(stored) * np.float32(self._scale)
         if ((depth <= 0.0) | (depth > bounds.LENGTH)).any():  # NaN is unknown
             raise InputError(
                 f"{self._shot.depth}: depth reaches from {np.nanmin(depth):g} to {np.nanmax(depth):g} scene units",
@@ -132,11 +145,13 @@ class StoredFrame(Frame):
 
     def _bound(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
         form = self._shot.depth_format
-        return None if stored is None or form is None else _tensor(form.clipped_at(stored))
+        bound = None if stored is None or form is None else form.clipped_at(stored)
+        return None if bound is None else _tensor(bound * np.float32(self._scale))
 
     _shot: Shot
     _keep: bool
     _pixels: _Pixels | None
+    _scale: float  # of the frame's lengths, relative to those of the shot
 
 
 def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -24,6 +25,11 @@ from coliags_plugin.engine.progress import progress_callback
 
 log = logging.getLogger(__name__)
 
+#: Median depth of scenes of unknown unit in training: with about the depth that colons have in mm, constants in mm
+#: (docs/methods.md 4.4) have about the effect that they have on a colon.
+UNKNOWN_MEDIAN_DEPTH = 30.0
+#: In the provenance of a run's scene: the factor on its lengths in training; not there: 1.
+SCALE_KEY = "training_scale"
 #: Seconds of reading after which progress is reported.
 READING_IS_LONG = 2.0
 
@@ -49,6 +55,26 @@ def load_scene(config: MethodConfig, path: Path) -> Scene:
     with progress_callback(after=READING_IS_LONG) as progress:
         scene = data_manager(config.datamanager, path).load(path, progress)
     return scene.with_near_plane(config.near_plane)
+
+
+def training_scale(scene: Scene) -> float:
+    """Factor on the lengths of a scene of unknown unit, by which constants in mm have about their usual effect.
+
+    It makes the median depth of the points in view :data:`UNKNOWN_MEDIAN_DEPTH`; 1 where that is at most twice or half
+    as large already, where no point tells it, or where the unit is known.
+    """
+    depths = scene.depths_in_view()
+    median = float(depths.median()) if len(depths) and not scene.is_metric else UNKNOWN_MEDIAN_DEPTH
+    factor = UNKNOWN_MEDIAN_DEPTH / median
+    return 1.0 if 0.5 <= factor <= 2.0 else factor
+
+
+def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
+    """A scene to train on, with a near plane; its provenance and the log tell the factor on its lengths."""
+    if scale != 1.0:
+        log.info("the unit of length of scene '%s' is unknown: trained at %.4g times its size", scene.name, scale)
+    provenance = {**scene.provenance, SCALE_KEY: scale}
+    return replace(scene.scaled(scale).with_near_plane(near_plane), provenance=provenance)
 
 
 def data_manager(component: Component, path: Path) -> DataManager:

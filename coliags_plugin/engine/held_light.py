@@ -43,7 +43,8 @@ def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
     device = next(model.field.parameters()).device
     for camera in cameras[:: max(1, len(cameras) // _CAMERAS)]:
         placed = model.placed(camera).to(device)
-        output = model.renderer.render(model.field, placed, ("rgb", "alpha", "depth_accumulated"))
+        rendered = model.renderer.render(model.field, placed, ("rgb", "alpha", "depth_accumulated"))
+        output = model.in_scene_units(rendered)
         seen = output.alpha >= OPAQUE_ALPHA
         lengths = placed.rays().norm(dim=-1)[seen]
         distances.append(output["depth_accumulated"][seen] / output.alpha[seen] * lengths)
@@ -70,7 +71,8 @@ def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight 
 def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Sequence[str]) -> RenderOutput:
     """Render a view of a model under a held light, or else the camera's own lamp, without view modules."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
-    return renderer.draw(gaussians_under(field, camera, light), camera, wants)
+    scaled = None if light is None else light.scaled(model.scale)
+    return model.in_scene_units(renderer.draw(gaussians_under(field, camera, scaled), camera, wants))
 
 
 def gaussians_of(model: Model) -> GaussianField:
@@ -98,8 +100,7 @@ def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
             f"a method with one of these fields: {lit}",
             "Train such a method, for instance pr-endo",
         )
-    lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules, model.near_plane).eval()
-    return replace(trained, model=lit_model, lamp=lamp)
+    return replace(trained, model=model.with_field(model.field.with_lamp(lamp), model.scale), lamp=lamp)
 
 
 def flatten(trained: TrainedRun) -> TrainedRun:

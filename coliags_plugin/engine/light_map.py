@@ -115,7 +115,7 @@ def light_map(trained: TrainedRun) -> JsonObject | None:
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     around = middle * torch.stack([radians.sin(), torch.zeros_like(radians), radians.cos()], dim=1)
     rays = (distances[:, None] * axis, around, middle * axis[None])
-    learned = None if field is None else _relative(field.attenuation, rays, trained.device)
+    learned = None if field is None else _relative(field.attenuation, rays, trained.device, model.scale)
     if learned is None and gain is None and curve is None:
         return None
     truth = find_true_light(Path(scene.provenance.get("path", "")))
@@ -171,10 +171,10 @@ def write_light_map(trained: TrainedRun, folder: Path) -> None:
 
 
 def _relative(
-    law: Any, rays: tuple[Tensor, Tensor, Tensor], device: torch.device
+    law: Any, rays: tuple[Tensor, Tensor, Tensor], device: torch.device, scale: float = 1.0
 ) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P C"]] | None:
     """Attenuation over distance and over angle, relative to the axis at the median distance; None without a law."""
-    values = [law(points.float().to(device)) for points in rays]
+    values = [law(scale * points.float().to(device)) for points in rays]
     if values[0] is None:
         return None
     along, around, at = (part.cpu().double() for part in values)

@@ -14,7 +14,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 
 
@@ -25,21 +25,32 @@ class Model(nn.Module):
         field: Scene representation.
         renderer: Renderer of the field.
         view_modules: By their names in the method config; cameras pass through them in this order, outputs too.
-        near_plane: Of every camera that it renders from, scene units.
+        near_plane: Of every camera that it renders from, in the model's unit of length.
+        scale: Length of a scene unit in the model's unit, in which field and modules are: cameras are given, and
+            outputs are, in scene units.
     """
 
     field: Field
 
     def __init__(
-        self, field: Field, renderer: Renderer, view_modules: Mapping[str, ViewModule], near_plane: float = NEAR_PLANE
+        self,
+        field: Field,
+        renderer: Renderer,
+        view_modules: Mapping[str, ViewModule],
+        near_plane: float = NEAR_PLANE,
+        scale: float = 1.0,
     ) -> None:
         super().__init__()
         self.field = field
         self.renderer = renderer
-        self.near_plane = near_plane
+        self.near_plane, self.scale = near_plane, scale
         # A ModuleDict would refuse names of its own attributes, such as "train" and "keys".
         self._view_modules = nn.ModuleList(view_modules.values())
         self._names = tuple(view_modules)
+
+    def with_field(self, field: Field, scale: float) -> Model:
+        """The same model of another field, or at another scale; it shares the parts, in the same mode."""
+        return Model(field, self.renderer, self.view_modules, self.near_plane, scale).train(self.training)
 
     @property
     def view_modules(self) -> dict[str, ViewModule]:
@@ -47,8 +58,18 @@ class Model(nn.Module):
         return dict(zip(self._names, self._view_modules, strict=True))  # type: ignore[arg-type]
 
     def placed(self, camera: Camera) -> Camera:
-        """A camera, wherever it comes from, with the near plane of the model."""
-        return replace(camera, near_plane=self.near_plane)
+        """A camera, wherever it comes from, in the model's unit and with its near plane."""
+        scaled = camera if self.scale == 1.0 else camera.scaled(self.scale)
+        return replace(scaled, near_plane=self.near_plane)
+
+    def in_scene_units(self, output: RenderOutput) -> RenderOutput:
+        """What was rendered from a :meth:`placed` camera, with its camera and depths in scene units."""
+        if self.scale == 1.0:
+            return output
+        factors = {name: self.scale if name.startswith("inverse") else 1.0 / self.scale for name in DEPTH_KINDS}
+        maps = {name: factors[name] * values if name in factors else values for name, values in output.maps.items()}
+        camera = None if output.camera is None else output.camera.scaled(1.0 / self.scale)
+        return replace(output, camera=camera, maps=maps)
 
     def render(
         self,
@@ -85,7 +106,7 @@ class Model(nn.Module):
             stages = [self.renderer.render_in_training(self.field, camera, needed, pixels, generator)]
         for module in modules:
             stages.append(module.shade(stages[-1], view))
-        return stages
+        return [self.in_scene_units(stage) for stage in stages]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by group: the field's under their own names, a module's as ``<module>.<group>``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
-from coliags_plugin.engine.data_formats import load_scene
+from coliags_plugin.engine.data_formats import SCALE_KEY, load_scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
@@ -45,6 +45,16 @@ class TrainedRun:
         return self.lamp is not None or self.held is not None
 
     @cached_property
+    def in_model_units(self) -> TrainedRun:
+        """The run with its scene in the model's unit of length, for what uses the model's field itself."""
+        scale = self.model.scale
+        if scale == 1.0:
+            return self
+        model = self.model.with_field(self.model.field, 1.0)
+        held = None if self.held is None else self.held.scaled(scale)
+        return replace(self, model=model, scene=self.scene.scaled(scale), held=held)
+
+    @cached_property
     def training_frames(self) -> frozenset[str]:
         """Names of the frames it was trained on."""
         return frozenset(frame.name for frame in self.scene.train)
@@ -57,11 +67,13 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     identity, provenance = run.identity(), run.provenance()
     method, folder = identity.method, data or identity.scene_path
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
-    scene = load_scene(config, folder)
+    scale = provenance["scene"]["provenance"].get(SCALE_KEY, 1.0)
+    scene = load_scene(config, folder).with_near_plane(config.near_plane / scale)
     if scene.provenance.get("fingerprint") != identity.fingerprint:
         raise InputError(
             f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
         )
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
-    model = restore_model(saved, config, scene, renderer).to(device).eval()
+    model = restore_model(saved, config, scene.scaled(scale), renderer).to(device).eval()
+    model.scale = scale
     return TrainedRun(run, config, method, scene, model, saved.step, device, identity.seed, provenance, saved.cost)

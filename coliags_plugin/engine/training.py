@@ -14,7 +14,7 @@ import torch
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.data_formats import load_method_for, load_scene
+from coliags_plugin.engine.data_formats import SCALE_KEY, at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.evaluator import check_evaluable
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
@@ -72,15 +72,17 @@ def open_training(
         # The config stored in the run, even if that of this name has changed since.
         method = load_method_for(request.data, str(folder.config_file.resolve()), overrides, data_format)
         method = replace(method, name=name)
-        seed = int(folder.provenance()["seed"])
+        provenance = folder.provenance()
+        seed, scale = int(provenance["seed"]), provenance["scene"]["provenance"].get(SCALE_KEY, 1.0)
         if request.seed not in (None, seed):
             begun = f"{folder.path}, which was started with seed {seed}"
             raise InputError(f"--seed {request.seed} for {begun}", "no --seed, or that one")
     else:
         folder.check_free(if_exists == "overwrite")
         method = load_method_for(request.data, request.method, request.overrides, request.data_format)
-        method, seed = replace(method, name=request.method_name or method.name), request.seed or 0
+        method, seed, scale = replace(method, name=request.method_name or method.name), request.seed or 0, None
     scene, path = load_scene(method.config, request.data), str(request.data.resolve())
+    scene = at_scale(scene, training_scale(scene) if scale is None else scale, method.config.near_plane)
     if request.scene_name is not None:
         scene = replace(scene, name=request.scene_name)
     if request.anonymous:

@@ -75,6 +75,10 @@ class HeldLight(ABC):
         """Plain values, for a record."""
 
     @abstractmethod
+    def scaled(self, factor: float) -> HeldLight:
+        """The light in a world whose lengths are ``factor`` times as large."""
+
+    @abstractmethod
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Unit vectors from points of a surface, world frame, with unit normals to the lamp."""
 
@@ -97,6 +101,10 @@ class LightOfCamera(HeldLight):
         distances = sight.norm(dim=1)
         return distances, (sight @ camera.optical_axis / distances.clamp_min(_MIN_DISTANCE)).clamp(0.0, 1.0)
 
+    def scaled(self, factor: float) -> LightOfCamera:
+        """See :meth:`HeldLight.scaled`."""
+        return LightOfCamera(self.camera.scaled(factor))
+
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """See :meth:`HeldLight.towards`."""
         return torch.nn.functional.normalize(self.camera.center.to(points) - points, dim=1)
@@ -117,6 +125,10 @@ class FlattenedLight(HeldLight):
     def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """See :meth:`HeldLight.incidence`."""
         return points.new_full((len(points),), self.distance), points.new_full((len(points),), self.cosine)
+
+    def scaled(self, factor: float) -> FlattenedLight:
+        """See :meth:`HeldLight.scaled`."""
+        return FlattenedLight(factor * self.distance, self.cosine)
 
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """See :meth:`HeldLight.towards`."""

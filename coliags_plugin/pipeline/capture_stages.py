@@ -12,7 +12,6 @@ from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST
 from coliags_plugin.pipeline.stages import StageOutcome
-from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH
 
 #: Share of the frames below which it is said that the poses are of a part of the video only.
 _MOST = 0.7
@@ -29,6 +28,7 @@ def make_frames(context: StageContext) -> StageOutcome:
 
 def make_poses(context: StageContext) -> StageOutcome:
     """Estimate poses and points by structure from motion, and write them as a scene."""
+    from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
     from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
     from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frames import read_blurred
 from coliags_plugin.pipeline.settings import ReconstructionSettings
-from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps, scale_of
+from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps
 
 if TYPE_CHECKING:
     import torch
@@ -78,13 +78,10 @@ class StageContext:
         scene = open_scene(self.posed, self.data_format or "colmap", options, self.progress, stored_size)
         return scene if self.data_format is not None else scene.without(read_blurred(self.frames))
 
-    @cached_property
+    @property
     def model_options(self) -> list[str]:
-        """Options of the posed scene's data manager: which model is read, and its scale."""
-        options = [] if self.submap.model is None else [f"model={self.submap.model}"]
-        # Poses that were estimated here have their scale.
-        scale = scale_of(self.posed, self.submap) if self.data_format == "colmap" else 1.0
-        return options if scale == 1.0 else [*options, f"scale={scale:.6g}"]
+        """Options of the posed scene's data manager: which model is read."""
+        return [] if self.submap.model is None else [f"model={self.submap.model}"]
 
     @property
     def scene(self) -> Path:

@@ -5,15 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from coliags_plugin.datamanagers.colmap.atlas import model_unit, read_atlas
-from coliags_plugin.datamanagers.colmap.files import find_models, read_model
+from coliags_plugin.datamanagers.colmap.files import find_models
 from coliags_plugin.geometry.poses import colmap
-
-#: Median depth of a model whose scale is unknown, units: with about the depth that colons have in mm, constants in mm
-#: (docs/methods.md 4.4) have about the effect that they have on a colon.
-UNKNOWN_MEDIAN_DEPTH = 30.0
 
 
 @dataclass(frozen=True)
@@ -49,16 +42,3 @@ def find_submaps(scene: Path, least: int) -> list[Submap]:
         for number, (folder, count) in enumerate(zip(models, counts, strict=True))
         if number == 0 or count >= least
     ]
-
-
-def scale_of(scene: Path, submap: Submap) -> float:
-    """Factor to a median depth of ``UNKNOWN_MEDIAN_DEPTH``; 1 where the unit is known, or no point tells."""
-    folder = scene / submap.model if submap.model is not None else find_models(scene)[0]
-    if model_unit(scene, folder, read_atlas(scene)) != "unknown":
-        return 1.0
-    model = read_model(folder)
-    depths = [
-        (model.positions[image.points] - pose[:3, 3]) @ pose[:3, 2]
-        for image, pose in zip(model.images, model.camera_to_world, strict=True)
-    ]
-    return UNKNOWN_MEDIAN_DEPTH / float(np.median(np.concatenate(depths))) if len(model.positions) else 1.0

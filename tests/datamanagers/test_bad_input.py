@@ -119,7 +119,7 @@ def test_depth_in_metres_is_suspect(copied, name):
     folder = copied(name)
     METRES[name](folder)
     found = {finding.what: finding for finding in check_scene(load(folder, name)).findings}
-    assert "mm" in found["depth looks like metres"].do
+    assert "unit=m" in found["depth looks like metres"].do
     assert "depth and poses are in different units" in found
 
 

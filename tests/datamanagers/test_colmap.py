@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from pydantic import ValidationError
 
 from coliags_plugin.checks.data.findings import points_findings
 from coliags_plugin.core.errors import InputError
@@ -133,6 +134,14 @@ def test_the_unit_is_unknown_until_it_is_stated(folder):
     assert not load(folder).is_metric
     write_unit(folder, "mm")
     assert load(folder).is_metric
+    unknown, raw, metric = load(folder, unit="unknown"), load(folder), load(folder, unit="cm")
+    assert not unknown.is_metric and metric.is_metric
+    torch.testing.assert_close(metric.points.positions, 10.0 * raw.points.positions)
+    for frame, given in zip(metric.train, raw.train, strict=True):
+        torch.testing.assert_close(frame.camera.center, 10.0 * given.camera.center)
+        torch.testing.assert_close(frame.sparse_depth.depth, 10.0 * given.sparse_depth.depth)
+    with pytest.raises(ValidationError, match="inch"):
+        load(folder, unit="inch")
 
 
 def test_cameras_of_different_sizes_each_have_their_view(tmp_path):

@@ -19,6 +19,7 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
@@ -224,11 +225,24 @@ def test_metres_become_millimetres(tmp_path):
     points = load_points(tmp_path / "points3D.ply").positions.numpy() / 1000.0
     write_ply(tmp_path / "metres.ply", point_properties(points, np.zeros(points.shape, np.uint8)))
     changed(tmp_path, frames=content["frames"], ply_file_path="metres.ply")
-    scene = load(tmp_path, scale=1000.0, initial_points="data")
+    assert not load(tmp_path).is_metric
+    write_unit(tmp_path, "m")
+    scene = load(tmp_path, initial_points="data")
+    assert scene.is_metric
     for frame in scene.train:
         np.testing.assert_allclose(frame.camera.camera_to_world, poses(COUNT)[frame.index], atol=1e-5)
         assert off_wall(frame.camera.unproject(frame.depth).reshape(-1, 3).double().numpy()).max() < 0.06
     assert off_wall(scene.points.positions.double().numpy()).max() < 1e-3
+    scaled = load(tmp_path, unit="mm", scale=1000.0, initial_points="data")
+    torch.testing.assert_close(scaled.train[1].depth, scene.train[1].depth, equal_nan=True)
+    torch.testing.assert_close(scaled.points.positions, scene.points.positions)
+
+
+def test_depth_files_are_in_millimetres_by_default_whatever_the_unit(tmp_path):
+    write(tmp_path, frame_keys=depth_files(tmp_path, 0.1, ".npy"))
+    assert float(load(tmp_path, unit="mm").train[0].depth.nanmedian()) == pytest.approx(
+        float(load(tmp_path, unit="m").train[0].depth.nanmedian())
+    )
 
 
 def test_masks_of_some_frames(tmp_path):

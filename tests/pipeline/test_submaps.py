@@ -16,12 +16,13 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
+from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
-from coliags_plugin.pipeline.submaps import UNKNOWN_MEDIAN_DEPTH, Submap, find_submaps
+from coliags_plugin.pipeline.submaps import Submap, find_submaps
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
@@ -48,13 +49,12 @@ def test_models_with_enough_frames_are_sub_maps_and_the_largest_always(atlas):
     assert find_submaps(atlas, 4) == [Submap()]  # nothing to choose from, and no option for it
 
 
-def test_each_sub_map_has_its_own_frames_and_median_depth(atlas, tmp_path, caplog):
+def test_each_sub_map_has_its_own_frames_and_unit(atlas, tmp_path, caplog):
     for number, context in enumerate(context_of(atlas, tmp_path / "out", least_submap=5).submaps()):
         scene = context.open_posed()
         assert len(scene.video) == COUNTS[number]
         assert not scene.is_metric
-        factor = UNKNOWN_MEDIAN_DEPTH / (2.0 * (number + 1))
-        np.testing.assert_allclose(positions(scene.video), factor * positions(tube_frames(COUNTS[number], 1.0)), 1e-4)
+        np.testing.assert_allclose(positions(scene.video), positions(tube_frames(COUNTS[number], 1.0)), 1e-4)
         assert context.folder == tmp_path / "out" / ("" if number == 0 else f"submap-{number}")
     assert "no pose" not in caplog.text  # the atlas says it
 

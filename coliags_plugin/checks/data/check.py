@@ -102,11 +102,13 @@ def check_scene(
         matched = match([(full[place[source.name]], full[place[target.name]]) for source, target in pairs])
         few = len(matched) < _MATCHED * len(pairs)
         if few or any(rules.match_findings(_readings(matched))):
-            # Points are lost over long ways.
-            near = video_pairs(video)
-            followed = follow([full[place[source.name] : place[target.name] + 1] for source, target in near], progress)
-            if few or len(followed) >= _JUDGED * len(near):
-                matched_by, pairs, matched = "tracks", near, followed
+            # Points are lost over long ways, and short ones tell less of the poses.
+            for chosen in [video_pairs(video)] if few else [pairs, video_pairs(video)]:
+                ways = [full[place[source.name] : place[target.name] + 1] for source, target in chosen]
+                followed = follow(ways, progress)
+                if few or len(followed) >= _JUDGED * len(chosen):
+                    matched_by, pairs, matched = "tracks", chosen, followed
+                    break
         if len(matched) < _JUDGED * len(pairs):
             undecided = list(rules.unmatched(len(matched), len(pairs)))
         else:

@@ -63,18 +63,11 @@ def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
             "Check the depth files: a failed export can leave images of one value",
         )
-    if depth.median < 1.0 and not metric:
-        yield Finding(
-            "depth is beside the near plane",
-            f"median {depth.median:.4g}; renderers clip at {NEAR:g}",
-            "Multiply poses and depth by one factor, for instance 10: their unit is unknown anyway",
-        )
-    elif depth.median < 1.0:
+    if depth.median < 1.0 and metric:
         yield Finding(
             "depth looks like metres",
-            f"median {depth.median:.4g}; this package expects millimetres, and renderers clip at a near plane of "
-            f"{NEAR:g}",
-            "Give lengths in mm: poses and depth times 1000, or the format's unit option",
+            f"median {depth.median:.4g} mm; renderers clip at a near plane of {NEAR:g} mm",
+            "State the unit of the files: --set datamanager.unit=m, or unit.txt with m",
         )
     elif depth.median > 1000.0 and metric:
         yield Finding(

@@ -67,7 +67,8 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     yield model.Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
     yield model.Fact("pose convention", _convention(data.get("pose_convention")))
     unit = scene.length_unit
-    yield model.Fact("unit of length", unit if scene.is_metric else "unknown (unit.txt with mm states it)")
+    stated = "unknown (--set datamanager.unit=mm or a file unit.txt states it)"
+    yield model.Fact("unit of length", unit if scene.is_metric else stated)
     if depth := check.depth:
         values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
         unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"

@@ -48,7 +48,12 @@ class PosesTrackCommand:
             scene, posed = open_video(self.scene, self.format, options, progress)
             tracking = track(RgbdVideo(scene.train), scene.train[0].camera.intrinsics, settings, progress)
             trajectory = write_rgbd_scene(
-                self.output, scene.train, tracking.camera_to_world, overwrite=self.overwrite, progress=progress
+                self.output,
+                scene.train,
+                tracking.camera_to_world,
+                unit="mm" if scene.is_metric else "unknown",
+                overwrite=self.overwrite,
+                progress=progress,
             )
         _warn_of_losses(tracking)
         lines = [*_described(tracking), *([_errors(tracking, scene)] if posed else [])]

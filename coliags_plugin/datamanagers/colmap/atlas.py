@@ -70,4 +70,4 @@ def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:
     COLMAP's own models are of an arbitrary scale: unknown where neither states it.
     """
     units = {} if atlas is None else {scene / stretch.model: stretch.unit for stretch in atlas.submaps}
-    return units.get(model) or read_unit(scene, otherwise="unknown")
+    return units.get(model) or read_unit(scene)

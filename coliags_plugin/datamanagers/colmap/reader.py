@@ -27,6 +27,7 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
+from coliags_plugin.datamanagers.units import FACTORS
 from coliags_plugin.geometry.lenses.models import PinholeLens
 
 log = logging.getLogger(__name__)
@@ -51,8 +52,7 @@ class ColmapSettings(SceneSettings):
     scale: float = Field(
         1.0,
         gt=0.0,
-        description="Millimetres per unit of the model, whose scale is arbitrary. Poses, points and sparse depth are "
-        "multiplied by it.",
+        description="Factor on lengths of the model, whose scale is arbitrary: on poses, points and sparse depth.",
     )
     max_reprojection_error: float = Field(
         2.0,
@@ -63,7 +63,9 @@ class ColmapSettings(SceneSettings):
         3, ge=2, description="Least track length of points that give sparse depth; all points are initial points."
     )
     depth_unit: float = Field(
-        1.0, gt=0.0, description="Millimetres per stored unit of the files in depths/ (after scale)."
+        1.0,
+        gt=0.0,
+        description="Millimetres per stored unit of the files in depths/; units of the model where that is unknown.",
     )
 
 
@@ -99,6 +101,7 @@ class ColmapDataManager(RecordedDataManager):
         names = short_names([image.name for image in model.images])
         others = unposed_images(paths, (*masks, *depths))
         atlas = read_atlas(path)
+        unit = settings.unit or model_unit(path, model.folder, atlas)
         if atlas is None:  # else it says why images have no pose, or which other model has one
             warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
@@ -117,7 +120,7 @@ class ColmapDataManager(RecordedDataManager):
                     rectification,
                     camera_to_world,
                     depth,
-                    None if depth is None else depth_format(depth, settings.depth_unit),
+                    None if depth is None else depth_format(depth, settings.depth_unit / FACTORS[unit]),
                     masks[index],
                     seen.get(index),
                     sparse,
@@ -127,7 +130,7 @@ class ColmapDataManager(RecordedDataManager):
         facts: dict[str, Any] = {
             "layout": "colmap",
             "model": str(model.folder),
-            "unit": model_unit(path, model.folder, atlas),
+            "unit": unit,
             "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if set(kinds) - files.PINHOLES else None,
             "cameras": len(rectification_of),

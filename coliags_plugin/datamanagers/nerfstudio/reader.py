@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
-from coliags_plugin.datamanagers.units import printed_unit
+from coliags_plugin.datamanagers.units import FACTORS, Unit, printed_unit
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 
@@ -35,13 +35,13 @@ class NerfstudioSettings(SceneSettings):
     scale: float = Field(
         1.0,
         gt=0.0,
-        description="Millimetres in the file's unit of length: 1000 for metres. Poses and points are multiplied by it.",
+        description="Factor on lengths of poses, points and depth, for a file whose unit has no name.",
     )
     depth_unit_scale_factor: float | None = Field(
         None,
         gt=0.0,
         description="World units before applied_scale per stored depth unit. None: the file's value of this name, or a "
-        "millimetre.",
+        "millimetre; of a world of unknown unit, one of its units.",
     )
     pixel_centers: PixelCenters = Field(
         "half",
@@ -57,6 +57,7 @@ class NerfstudioDataManager(RecordedDataManager):
 
     settings: NerfstudioSettings
     name = "nerfstudio"
+    unit = "unknown"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -75,7 +76,8 @@ class NerfstudioDataManager(RecordedDataManager):
         entries = transforms.entries(names, settings.pixel_centers)
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
-        depth_unit = self._depth_unit(transforms)
+        unit = self.stated_unit(path)
+        depth_unit = self._depth_unit(transforms, unit)
         lenses = {entry.camera: entry.camera for entry in entries}
         rectification_of = rectifications(lenses, file, self.working_size, settings.focal_scale)
         images = [entry.image for entry in entries]
@@ -117,7 +119,7 @@ class NerfstudioDataManager(RecordedDataManager):
         }
         own_points, source = self._own_points(path, transforms)
         return Recording(
-            kind=f"nerfstudio, {trajectory.summary(printed_unit(path))}",
+            kind=f"nerfstudio, {trajectory.summary(printed_unit(unit))}",
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, [*images, *others], [file]),
@@ -126,12 +128,12 @@ class NerfstudioDataManager(RecordedDataManager):
             points_source=source,
         )
 
-    def _depth_unit(self, transforms: Transforms) -> float:
-        """Millimetres per stored depth unit."""
+    def _depth_unit(self, transforms: Transforms, unit: Unit) -> float:
+        """World units per stored depth unit."""
         for factor in (self.settings.depth_unit_scale_factor, transforms.depth_unit()):
             if factor is not None:
                 return factor * self.settings.scale
-        return 1.0
+        return 1.0 / FACTORS[unit]
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""

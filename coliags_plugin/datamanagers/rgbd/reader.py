@@ -74,6 +74,7 @@ class RGBDDataManager(RecordedDataManager):
 
     settings: RGBDSettings
     name = "rgbd"
+    unit = "unknown"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -144,7 +145,7 @@ class RGBDDataManager(RecordedDataManager):
             facts["pose_convention"] = {
                 "order": "TUM: camera-to-world, quaternion with w last",
                 "poses": len(trajectory),
-                "summary": trajectory.summary(printed_unit(path)),
+                "summary": trajectory.summary(printed_unit(self.stated_unit(path))),
             }
         points = next((file for file in (path / POINTS_FILE, files.find_mesh(path)) if file and file.is_file()), None)
         return Recording(

@@ -15,6 +15,7 @@ from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.files import is_time, times
+from coliags_plugin.datamanagers.units import Unit, write_unit
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
@@ -47,6 +48,7 @@ def write_rgbd_scene(
     frames: Sequence[Frame],
     camera_to_world: Float[np.ndarray, "N 4 4"],
     *,
+    unit: Unit = "unknown",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
@@ -60,6 +62,7 @@ def write_rgbd_scene(
         folder: The folder to create.
         frames: In video order, all of one camera; their poses are not used.
         camera_to_world: Rigid, OpenCV axes, the unit of the depth. [N, 4, 4]
+        unit: Of lengths.
         overwrite: Replace an existing folder.
         progress: Progress callback.
 
@@ -89,6 +92,7 @@ def write_rgbd_scene(
         tum.write(scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(name) for name in names])))
         k = intrinsics
         write_camera_json(scratch / CAMERA, k, w=k.width, h=k.height, depth_scale=scale)
+        write_unit(scratch, unit)
     return folder / TRAJECTORY
 
 

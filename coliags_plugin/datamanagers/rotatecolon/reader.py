@@ -61,6 +61,8 @@ class RotateColonDataManager(RecordedDataManager):
 
     settings: RotateColonSettings
     name = "rotatecolon"
+    #: The dataset does not document it.
+    unit = "unknown"
     #: Published results use the stored size.
     fits = None
     seen_split = "all-train"

@@ -171,6 +171,8 @@ def bake(
     are fitted to what the run renders, for so many seconds at most
     (:mod:`~coliags_plugin.export.baking.distillation`).
     """
+    scale, light = trained.model.scale, None if light is None else light.scaled(trained.model.scale)
+    trained = trained.in_model_units
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     averages, seen = _averaged(trained, views, light)
     kept = averages.kept()
@@ -188,7 +190,7 @@ def bake(
             made = field()
         steps = distil(made, trained, light, seconds)
     facts = {"views": len(views), "visible": visible, "steps": steps, "seconds": seconds}
-    return cloud_of_field(made), facts
+    return cloud_of_field(made).scaled(1.0 / scale), facts
 
 
 def _averaged(

@@ -176,14 +176,15 @@ def _held(
 def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:
     """A model of explicit Gaussians, with a renderer of the run's config for 3D Gaussians and no view modules."""
     renderer = choose_renderer(trained.config.renderer, "gaussians3d", trained.device).renderer
-    return Model(field, renderer, {}, trained.model.near_plane).to(trained.device).eval()
+    near_plane = trained.model.near_plane / trained.model.scale
+    return Model(field, renderer, {}, near_plane).to(trained.device).eval()
 
 
 @torch.no_grad()
 def adjusted_camera(trained: TrainedRun, frame: Frame) -> Camera:
-    """Camera of a frame, as the run's view modules adjust it, float32 on the run's device."""
+    """Camera of a frame, scene units, as the run's view modules adjust it, float32 on the run's device."""
     camera = trained.model.placed(frame.camera.to(trained.device))
     view = frame.view(trained=frame.name in trained.training_frames)
     for module in trained.model.view_modules.values():
         camera = module.adjust_camera(camera, view)
-    return camera.to(dtype=torch.float32)
+    return camera.scaled(1.0 / trained.model.scale).to(dtype=torch.float32)

@@ -77,7 +77,7 @@ def export_run(
     held: HeldLight | None = None
     baking: dict[str, Any] | None = None
     if isinstance(field, ExplicitGaussians):
-        cloud = cloud_of_field(field)
+        cloud = cloud_of_field(field).scaled(1.0 / trained.model.scale)
     else:
         baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
         held = baked_in if knows_lamp(field) else None

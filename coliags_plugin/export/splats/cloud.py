@@ -82,6 +82,10 @@ class SplatCloud:
         """Some of the Gaussians."""
         return SplatCloud(*(values[kept] for values in vars(self).values()))
 
+    def scaled(self, factor: float) -> SplatCloud:
+        """The Gaussians in a world whose lengths are ``factor`` times as large."""
+        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
+
     def concat(self, others: SplatCloud) -> SplatCloud:
         """These Gaussians and others, of as many scales and harmonics."""
         pairs = zip(vars(self).values(), vars(others).values(), strict=True)

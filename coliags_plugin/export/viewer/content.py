@@ -133,8 +133,10 @@ class ViewerContent:
         if isinstance(gaussian_field, GaussianField):
             logger.info("decoding the Gaussians of %s", trained.method)
             cameras = [frame.camera.to(trained.device) for frame in trained.scene.train]
-            baked = shown(mean_gaussians(gaussian_field, spread(cameras)))
-            decoder = ViewDecoder(gaussian_field, most_visible(baked, MOST_BESIDE), trained.device)
+            scale = trained.model.scale
+            placed = [camera.scaled(scale) for camera in spread(cameras)]
+            baked = shown(mean_gaussians(gaussian_field, placed)).scaled(1.0 / scale)
+            decoder = ViewDecoder(gaussian_field, most_visible(baked, MOST_BESIDE), trained.device, scale)
         else:
             logger.warning(
                 "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
@@ -148,7 +150,7 @@ class ViewerContent:
         gaussian_field = trained.model.field
         if not isinstance(gaussian_field, GaussianField):
             return cls.of(trained)
-        decoder = ViewDecoder(gaussian_field, NOTHING, trained.device)
+        decoder = ViewDecoder(gaussian_field, NOTHING, trained.device, trained.model.scale)
         first = decoder.of(trained.scene.train[0].camera)
         return cls(trained, trained.scene.video, first, decoder, FramePictures(trained), wire_unit(first))
 

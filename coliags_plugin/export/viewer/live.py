@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 from coliags_plugin.contracts import Follower
+from coliags_plugin.engine.data_formats import SCALE_KEY
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.content import ViewerContent
@@ -24,8 +25,10 @@ class LiveView(Follower):
 
     def __init__(self, trainer: Trainer, port: int = 8080) -> None:
         method, provenance = trainer.method, trainer.provenance()
+        scale = trainer.scene.provenance.get(SCALE_KEY, 1.0)
+        scene, model = trainer.scene.scaled(1.0 / scale), trainer.model.with_field(trainer.model.field, scale)
         trained = TrainedRun(
-            trainer.run, method.config, method.name, trainer.scene, trainer.model, trainer.step, trainer.device,
+            trainer.run, method.config, method.name, scene, model, trainer.step, trainer.device,
             trainer.seed, provenance,
         )  # fmt: skip
         self._viewer = Viewer(trained, port=port, content=ViewerContent.live(trained))

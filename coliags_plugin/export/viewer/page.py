@@ -8,7 +8,7 @@ import tempfile
 import zlib
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -53,8 +53,8 @@ class Layer:
         unit = 2.0 ** math.ceil(math.log2(reach / _REACH)) if reach > 0.0 else 1.0
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "cloud.spz"
-            write_spz(file, _scaled(cloud, 1.0 / unit))
-            data, drawn = file.read_bytes(), _scaled(read_splat_spz(file), unit)
+            write_spz(file, cloud.scaled(1.0 / unit))
+            data, drawn = file.read_bytes(), read_splat_spz(file).scaled(unit)
         return cls(name, "", {"kind": "gaussians", "unit": unit, "data": b64encode(data).decode("ascii")}), drawn
 
     @classmethod
@@ -77,10 +77,6 @@ class Layer:
             "data": b64encode(data).decode("ascii"),
         }
         return cls(name, about, packed)
-
-
-def _scaled(cloud: SplatCloud, factor: float) -> SplatCloud:
-    return replace(cloud, means=cloud.means * np.float32(factor), scales=cloud.scales * np.float32(factor))
 
 
 @dataclass(frozen=True)

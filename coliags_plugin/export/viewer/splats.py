@@ -64,11 +64,11 @@ class ViewDecoder:
     """Decodes a field for a view, and takes what lies beside it from other Gaussians of the whole scene.
 
     A field yields the Gaussians that a camera sees; without the others, a turn of the head would show nothing until
-    the next decoding.
+    the next decoding. ``scale``: length of a scene unit in that of the field.
     """
 
-    def __init__(self, field: GaussianField, beside: SplatCloud, device: torch.device) -> None:
-        self.beside = beside
+    def __init__(self, field: GaussianField, beside: SplatCloud, device: torch.device, scale: float = 1.0) -> None:
+        self.beside, self._scale = beside, scale
         self._field = field
         self._device = device
 
@@ -79,7 +79,8 @@ class ViewDecoder:
         They are in this light, or in that of the lamp on the camera.
         """
         wide = widened(camera).to(self._device)
-        seen = shown(gaussians_under(self._field, wide, light))
+        light = None if light is None else light.scaled(self._scale)
+        seen = shown(gaussians_under(self._field, wide.scaled(self._scale), light)).scaled(1.0 / self._scale)
         return seen.concat(self.beside.part(~in_view(self.beside.means, wide)))
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
@@ -22,7 +23,7 @@ _DISTORTION: dict[str, Any] = {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002
 
 
 class NerfstudioLayout(Layout):
-    """images/, depth/ and a transforms.json in millimetres with an OPENCV camera."""
+    """images/, depth/, unit.txt and a transforms.json with an OPENCV camera."""
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The default camera with OpenCV's lens distortion."""
@@ -54,6 +55,7 @@ class NerfstudioLayout(Layout):
             "frames": frames,
         }
         write_json(folder / "transforms.json", content)
+        write_unit(folder, "mm")
 
 
 def _name(index: int) -> str:

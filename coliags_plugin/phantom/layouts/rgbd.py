@@ -10,6 +10,7 @@ from jaxtyping import Float
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -33,6 +34,7 @@ class RGBDLayout(Layout):
         times = [_time(index) for index in range(len(poses))]
         tum.write(folder / "groundtruth.txt", Trajectory(poses, timestamps=np.array(times, np.float64)))
         write_camera_json(folder / CAMERA, lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
+        write_unit(folder, "mm")
         for kind in ("rgb", "depth"):
             lines = ["# timestamp filename", *(f"{time} {kind}/{time}.png" for time in times)]
             atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")

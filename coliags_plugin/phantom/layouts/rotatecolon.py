@@ -13,6 +13,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
+from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
@@ -60,6 +61,7 @@ class RotateColonLayout(Layout):
             for index, pose in enumerate(poses)
         ]
         write_json(folder / (TEST if part == "rotation" else TRAIN), {"camera_angle_x": _ANGLE, "frames": frames})
+        write_unit(folder, "mm")
 
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""

@@ -1,0 +1,153 @@
+"""Scenes of unknown unit are trained at a size at which constants in mm mean something, and results have their own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.engine import trained as trained_module
+from coliags_plugin.engine import training as training_module
+from coliags_plugin.engine.data_formats import SCALE_KEY, UNKNOWN_MEDIAN_DEPTH, training_scale
+from coliags_plugin.engine.evaluator import evaluate
+from coliags_plugin.engine.held_light import flatten
+from coliags_plugin.engine.light_map import light_map
+from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trained import load_trained
+from coliags_plugin.engine.training import TrainingRequest, open_training
+from coliags_plugin.export.baking.exporting import export_run
+from coliags_plugin.export.splats.files import read_splats
+from coliags_plugin.export.viewer.content import ViewerContent
+from coliags_plugin.outputs.image_files import read_depth_tiff
+from coliags_plugin.results.reading import RESULT_FILE, read_result
+from coliags_plugin.surface.meshing.fusion import fuse_run
+from coliags_plugin.surface.meshing.settings import MeshSettings
+from tests.comparison.small import TINY
+from tests.scenes import wall_scene
+
+CPU = torch.device("cpu")
+DEPTHS = ("rgb", "alpha", "depth_accumulated", "depth_expected", "inverse_depth_accumulated")
+
+
+def with_unit(scene, unit):
+    return replace(scene, provenance={"fingerprint": "wall", "dataset": "c3vd", "unit": unit})
+
+
+@pytest.fixture(scope="module")
+def small():
+    """The wall in a unit of its own: 64 times as small."""
+    return with_unit(wall_scene().scaled(1 / 64), "unknown")
+
+
+@pytest.fixture(scope="module")
+def factor(small):
+    return training_scale(small)
+
+
+def trained_on(scene, path, resumed=False):
+    """A short run, loaded."""
+    patch = pytest.MonkeyPatch()
+    for module in (training_module, trained_module):
+        patch.setattr(module, "load_scene", lambda config, _: scene.with_near_plane(config.near_plane))
+    try:
+        request = TrainingRequest("coliags-plus", path, (*TINY, "datamanager.name=c3vd", "schedule.steps=6"))
+        for if_exists in ("refuse", "continue") if resumed else ("refuse",):
+            with open_training(request, RunFolder(path / "run"), CPU, if_exists) as trainer:
+                trainer.train()
+        return load_trained(path / "run", CPU)
+    finally:
+        patch.undo()
+
+
+@pytest.fixture(scope="module")
+def runs(small, factor, tmp_path_factory):
+    """Runs on the small wall of unknown unit, and on the same wall in mm at the size at which the former is trained."""
+    folder = tmp_path_factory.mktemp("runs")
+    scenes = {"own": small, "mm": with_unit(small.scaled(factor), "mm")}
+    return [trained_on(scene, folder / name, resumed=name == "own") for name, scene in scenes.items()]
+
+
+def test_the_median_depth_in_view_becomes_that_of_a_colon(small, factor):
+    assert float(small.scaled(factor).depths_in_view().median()) == pytest.approx(UNKNOWN_MEDIAN_DEPTH)
+    assert training_scale(with_unit(small, "mm")) == 1.0
+    assert training_scale(small.scaled(0.6 * factor)) == training_scale(small.scaled(1.9 * factor)) == 1.0
+    assert training_scale(small.scaled(3.0 * factor)) == pytest.approx(1 / 3)
+    assert training_scale(replace(small, points=PointCloud(torch.zeros(0, 3)))) == 1.0
+
+
+def test_a_scene_of_unknown_unit_trains_like_the_same_in_mm(runs, factor):
+    own, mm = runs
+    assert own.provenance["scene"]["provenance"][SCALE_KEY] == own.model.scale == factor
+    assert mm.model.scale == 1.0 and own.step == mm.step == 6
+    for one, other in zip(own.model.parameters(), mm.model.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_views_have_depths_in_their_own_unit(runs, factor):
+    own, mm = runs
+    for one, other in zip(own.scene.video, mm.scene.video, strict=True):
+        given, at_scale = render_view(own, one, DEPTHS), render_view(mm, other, DEPTHS)
+        torch.testing.assert_close(given.rgb, at_scale.rgb, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(factor * given["depth_expected"], at_scale["depth_expected"], rtol=1e-3, atol=1e-3)
+        inverse = given["inverse_depth_accumulated"] / factor
+        torch.testing.assert_close(inverse, at_scale["inverse_depth_accumulated"], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(factor * given.camera.center, at_scale.camera.center, rtol=1e-4, atol=1e-4)
+    flat, flat_mm = flatten(own), flatten(mm)
+    assert factor * flat.held.distance == pytest.approx(flat_mm.held.distance, rel=1e-3)
+    one, other = (render_view(run, run.scene.train[0], DEPTHS[:3]) for run in (flat, flat_mm))
+    torch.testing.assert_close(one.rgb, other.rgb, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(factor * one["depth_accumulated"], other["depth_accumulated"], rtol=1e-3, atol=1e-3)
+
+
+def test_evaluations_are_in_its_own_unit(runs, factor):
+    results = [read_result(evaluate(run, "paper") / RESULT_FILE) for run in runs]
+    assert results[0].metrics["depth_median_error"].unit == "units"
+    assert results[0].mean("psnr") == pytest.approx(results[1].mean("psnr"), abs=0.01)
+    depths = [read_depth_tiff(next((run.run.evaluations / "paper/expected_depth/test").iterdir())) for run in runs]
+    np.testing.assert_allclose(factor * depths[0], depths[1], rtol=1e-3)
+    light, light_mm = (light_map(run) for run in runs)
+    assert factor * light["reference_distance"] == pytest.approx(light_mm["reference_distance"], rel=1e-4)
+    for curve in ("by_distance", "by_angle", "gains"):
+        np.testing.assert_allclose(light["curves"][curve], light_mm["curves"][curve], rtol=1e-4)
+
+
+def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
+    meshes = [fuse_run(run, MeshSettings(min_views=1, min_alpha=0.5, voxel_pixels=1.0)) for run in runs]
+    bounds = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in meshes]
+    np.testing.assert_allclose(factor * bounds[0], bounds[1], atol=1.0)
+    assert factor**2 * meshes[0].areas.sum() == pytest.approx(meshes[1].areas.sum(), rel=0.05)
+    files = [export_run(run, {"ply": tmp_path / f"{n}.ply"}, "mean", seconds=0.0)[0] for n, run in enumerate(runs)]
+    clouds = [read_splats(file.file) for file in files]
+    np.testing.assert_allclose(factor * clouds[0].means, clouds[1].means, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(factor * clouds[0].scales, clouds[1].scales, rtol=1e-2)
+    records = [json.loads(file.record_file.read_text()) for file in files]
+    assert [record["unit"] for record in records] == ["units", "mm"]
+    export, export_mm = (record["cost"]["test"] for record in records)
+    assert export["export"]["psnr"] == pytest.approx(export_mm["export"]["psnr"], abs=0.05)
+    assert factor**2 * export["export"]["depth_mse"] == pytest.approx(export_mm["export"]["depth_mse"], rel=0.02)
+    views = [ViewerContent.of(run) for run in runs]
+    np.testing.assert_allclose(factor * views[0].baked.means, views[1].baked.means, rtol=1e-3, atol=1e-3)
+    seen = [view.decoder.of(view.first_camera, view.flattened) for view in views]
+    np.testing.assert_allclose(factor * seen[0].means, seen[1].means, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(seen[0].harmonics, seen[1].harmonics, atol=1e-3)
+
+
+def test_a_run_without_a_recorded_scale_is_as_it_was(small, tmp_path):
+    """Runs of versions that did not scale lie in the unit of their scene."""
+    path = tmp_path / "mm"
+    run = trained_on(with_unit(small, "mm"), path)  # not scaled, as its unit is known
+    record = json.loads(run.run.provenance_file.read_text())
+    del record["scene"]["provenance"][SCALE_KEY]
+    record["scene"]["provenance"]["unit"] = "unknown"
+    run.run.provenance_file.write_text(json.dumps(record))
+    patch = pytest.MonkeyPatch()
+    patch.setattr(trained_module, "load_scene", lambda config, _: small)
+    again = load_trained(path / "run", CPU)
+    patch.undo()
+    assert again.model.scale == 1.0 and not again.scene.is_metric
+    torch.testing.assert_close(render_view(again, again.scene.train[0]).rgb, render_view(run, run.scene.train[0]).rgb)
