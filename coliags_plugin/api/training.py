@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.method_config import method_name
-from coliags_plugin.contracts import Follower
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from coliags_plugin.contracts import Follower  # with torch
 
 log = logging.getLogger(__name__)
 
