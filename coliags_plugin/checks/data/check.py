@@ -78,7 +78,7 @@ def check_scene(
 
     ``at_stored_size`` loads the same scene with images of the stored size, in which points are matched if there is no
     depth, or hardly any that can be trusted; None: those of ``scene``. They are matched by features. Where these fail,
-    as in patients, or contradict the poses, points are followed from frame to frame, which is more reliable.
+    as in patients, or contradict poses with which points followed from frame to frame clearly agree, these count.
     """
     video = scene.video
     sample = facts.sampled_frames(video)
@@ -107,7 +107,8 @@ def check_scene(
                 ways = [full[place[source.name] : place[target.name] + 1] for source, target in chosen]
                 followed = follow(ways, progress)
                 if few or len(followed) >= _JUDGED * len(chosen):
-                    matched_by, pairs, matched = "tracks", chosen, followed
+                    if few or rules.clearly_agrees(_readings(followed), _readings(matched)):
+                        matched_by, pairs, matched = "tracks", chosen, followed
                     break
         if len(matched) < _JUDGED * len(pairs):
             undecided = list(rules.unmatched(len(matched), len(pairs)))

@@ -174,6 +174,14 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
         )
 
 
+def clearly_agrees(readings: Mapping[str, EpipolarAgreement], others: Mapping[str, EpipolarAgreement]) -> bool:
+    """Whether matches agree with poses that others contradict, and by far: then these others are wrong."""
+    given = readings.get(GIVEN)
+    return (
+        given is not None and not any(match_findings(readings)) and given.error * CLEARLY_BETTER < others[GIVEN].error
+    )
+
+
 def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
     """Poses that matched points can neither confirm nor refute, for lack of parallax."""
     given = readings.get(GIVEN)
