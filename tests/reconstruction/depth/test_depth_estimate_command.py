@@ -231,7 +231,7 @@ def test_bad_options_are_refused(wall, tmp_path, capsys):
 def test_frames_of_several_sizes_are_refused():
     frames = wall_frames(sideways(4))
     frames[1] = dataclasses.replace(frames[1], camera=frames[1].camera.resized(48, 40))
-    with pytest.raises(InputError, match="images of 48 x 40 and 96 x 80 pixels"):
+    with pytest.raises(InputError, match="images of 48 x 40 to 96 x 80 pixels"):
         check_video(frames)
 
 
