@@ -1,4 +1,4 @@
-"""PSNR of held-out frames interpolated from the frames of the video next to them: what a rendering compares with.
+"""PSNR of held-out frames interpolated from their neighbours in the video: a baseline for renderings.
 
 ``python benchmarks/interpolated_frames.py SCENE [datamanager.split=inner-8th ...]`` prints means over the held-out
 frames that have a training frame directly before and after them: of the more similar one, of the mean of both, and of

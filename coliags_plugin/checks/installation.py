@@ -32,7 +32,7 @@ LIBRARIES = {
 
 
 def check_installation() -> list[CheckResult]:
-    """Check everything that training and evaluation depend on; what is missing and not required is skipped."""
+    """Check what training and evaluation depend on; a missing optional part has status ``skipped``."""
     threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs"
     results = [
         CheckResult("coliags_plugin", "passed", __version__),

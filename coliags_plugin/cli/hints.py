@@ -1,4 +1,4 @@
-"""Hints at what was meant by arguments that cannot be parsed."""
+"""Hints for mistyped or outdated command-line arguments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import did_you_mean
 
 
 def hint(argv: Sequence[str], commands: Any) -> str:
-    """What stands today for an argument of an older release, or the nearest command or option; empty without one.
+    """Hint for arguments that cannot be parsed: the new spelling of an old one, or the nearest name; empty without one.
 
     ``commands`` is the union of the commands.
     """
@@ -20,7 +20,7 @@ def hint(argv: Sequence[str], commands: Any) -> str:
 
 
 def renamed_argument(argv: Sequence[str]) -> str:
-    """What stands today for an argument of an older release among some that could not be parsed; empty without one."""
+    """Hint with the present spelling of an argument of an older release; empty without one."""
     options = {word.partition("=")[0] for word in argv}
     for old in ("--out", "--save"):
         if old in options:

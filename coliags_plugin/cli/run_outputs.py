@@ -20,7 +20,7 @@ class RenderCommand:
     output: arguments.OptionalOutput = None
     """Folder to create; default RUN/renders, with --light or --flatten RUN/relit, with --path RUN/path."""
     along: Annotated[arguments.OptionalPath, tyro.conf.arg(name="path")] = None
-    """Write a video along a camera path, saved in `coliags view`, and nothing else."""
+    """Render only a video along this camera path, a file saved in `coliags view`."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
     video: arguments.DoneByDefault = True
@@ -246,7 +246,7 @@ class ViewCommand:
     port: int = 8080
     """Port to listen on; 0: any free one."""
     open: arguments.DoneByDefault = True
-    """Do not open a browser, as is done where there is a display."""
+    """Do not open a browser (by default one is opened where there is a display)."""
     data: arguments.MovedData = None
     device: arguments.Device = "auto"
     json: arguments.AsJson = False

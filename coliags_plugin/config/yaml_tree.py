@@ -135,7 +135,7 @@ def parse_tree(text: str, source: str) -> Node:
 def parse_value(text: str) -> object:
     """The value of ``--set key=VALUE``, read as YAML."""
     try:
-        return _tuples(yaml.load(text, _Loader))
+        return tuples(yaml.load(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError):
         return text
 
@@ -163,7 +163,7 @@ def _check_extent(root: yaml.Node, source: str) -> None:
 def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
     origin = f"{source}:{node.start_mark.line + 1}"
     if not isinstance(node, yaml.MappingNode):
-        return Node(_tuples(loader.construct_object(node, deep=True)), origin)
+        return Node(tuples(loader.construct_object(node, deep=True)), origin)
     children: dict[str, Node] = {}
     for key_node, value_node in node.value:
         key = str(loader.construct_object(key_node))
@@ -174,11 +174,12 @@ def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
     return Node(children, origin)
 
 
-def _tuples(value: object) -> object:
+def tuples(value: object) -> object:
+    """Plain values with lists as the tuples that settings are made of."""
     if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
+        return tuple(tuples(item) for item in value)
     if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
+        return {key: tuples(item) for key, item in value.items()}
     return value
 
 

@@ -1,4 +1,4 @@
-"""Base class of what follows a run while it is trained."""
+"""Base classes of observers of a training run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coliags_plugin.core.json_files import JsonObject
 
 
 class Follower:
-    """What follows a run while it is trained, and changes nothing of it."""
+    """Observer of a training run, called after every step and every row of the log; it changes nothing of the run."""
 
     def logged(self, row: JsonObject) -> None:
         """A row has been added to the training log (docs/results_files.md)."""
@@ -24,7 +24,7 @@ class Follower:
 
 
 class Logger(Follower, ABC):
-    """Base class of loggers: they take the rows of the training log elsewhere.
+    """Base class of loggers, which copy the rows of the training log to another service or format.
 
     Args:
         run: The run folder.

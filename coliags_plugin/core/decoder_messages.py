@@ -1,4 +1,4 @@
-"""What decoders in C write to standard error, kept off the terminal."""
+"""Redirection of the messages that image libraries in C print to standard error."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import UnsupportedOperation
+from typing import IO
 
 log = logging.getLogger(__name__)
 
@@ -18,7 +19,7 @@ _STDERR = 2
 
 
 def separate_stderr() -> None:
-    """Give Python's standard error a descriptor of its own; :func:`decoder_messages` does nothing without."""
+    """Duplicate the descriptor of ``sys.stderr``, so that :func:`decoder_messages` can redirect that of C libraries."""
     with suppress(OSError, AttributeError):  # it is closed
         encoding = sys.stderr.encoding
         sys.stderr = open(os.dup(_STDERR), "w", buffering=1, encoding=encoding, errors="backslashreplace")
@@ -31,7 +32,7 @@ class _Kept:
         self._lock = threading.Lock()
         self._threads = 0
         self._failed = False  # a decoding since the first of the threads began
-        self._file = tempfile.TemporaryFile()
+        self._file: IO[bytes] | None = None  # made when first diverted
         self._place: int | None = None  # a descriptor that leads where the one led that is diverted; None: none is
 
     def begin(self) -> None:
@@ -40,6 +41,7 @@ class _Kept:
             self._threads += 1
             if self._threads == 1 and _is_separate():
                 self._failed = False
+                self._file = self._file or tempfile.TemporaryFile()
                 self._place = os.dup(_STDERR)
                 os.dup2(self._file.fileno(), _STDERR)
 
@@ -48,7 +50,7 @@ class _Kept:
         with self._lock:
             self._threads -= 1
             self._failed |= failed
-            if self._threads or self._place is None:
+            if self._threads or self._place is None or self._file is None:
                 return ""
             os.dup2(self._place, _STDERR)
             os.close(self._place)

@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.reading.files import inventory
 log = logging.getLogger(__name__)
 
 #: Suffixes of video files, in lower case.
-VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
+_VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
 
 
 def formats() -> list[str]:
@@ -48,7 +48,7 @@ def find_format(path: Path) -> str:
 def _no_folder(path: Path) -> InputError:
     """What to do about a file that was given in the place of a scene's folder."""
     folder, file = (shlex.quote(str(each)) for each in (path.parent, path))
-    if path.suffix.lower() in VIDEO_SUFFIXES:
+    if path.suffix.lower() in _VIDEO_SUFFIXES:
         makes = f"coliags reconstruct {file} --output FOLDER reconstructs it; coliags poses sfm {file} --output FOLDER"
         return InputError(f"{path} is a video", "a scene's folder", f"{makes} makes a scene with poses")
     if recognised(path.parent):

@@ -18,8 +18,8 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
 
     ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``inner-8th``: 4, 12, 20, ... without the last frame,
     so that every one is between training frames; ``endogslam``: 7, 15, 23, ... (EndoGSLAM, PR-Endo; docs/data.md 3);
-    ``block``: one contiguous block, given by fractions of the video, so that test views are not
-    between neighbouring training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
+    ``block``: one contiguous block, given by fractions of the video, so that test views are not between neighbouring
+    training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
     """
     index = np.arange(count)
     if split == "every-8th":
@@ -31,6 +31,12 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
     if split == "block":
         return np.asarray((index >= round(block[0] * count)) & (index < round(block[1] * count)))
     return np.zeros(count, bool)
+
+
+def split_options(split: str, block: Sequence[float] = (0.4, 0.6)) -> list[str]:
+    """Options of training that choose a split, none for ``every-8th``; ``block``: that of split ``block``."""
+    chosen = [] if split == "every-8th" else [f"datamanager.split={split}"]
+    return [*chosen, f"datamanager.block=[{block[0]:g}, {block[1]:g}]"] if split == "block" else chosen
 
 
 def divide(

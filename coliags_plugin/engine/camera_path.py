@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from pydantic import Field, ValidationError, field_validator
 
+from coliags_plugin.config.yaml_tree import tuples
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
@@ -66,7 +67,7 @@ class CameraPath(Settings):
         """Read a path; InputError where the file is none."""
         found: Any = read_json(file, _EXPECTED, finite=True)
         try:
-            return cls.model_validate(_tuples(found))
+            return cls.model_validate(tuples(found))
         except ValidationError as error:
             key, message, _ = first_error(error)
             raise InputError(f"{file}: {key or 'content'}: {message}", _EXPECTED) from error
@@ -93,10 +94,3 @@ class CameraPath(Settings):
             yield Camera(
                 focal, focal, 0.5 * like.width, 0.5 * like.height, like.width, like.height, matrix, like.near_plane
             )
-
-
-def _tuples(value: Any) -> Any:
-    """JSON's lists as the tuples that settings are made of."""
-    if isinstance(value, dict):
-        return {key: _tuples(child) for key, child in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, Sequence) and not isinstance(value, str) else value

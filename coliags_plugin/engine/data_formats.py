@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
@@ -28,7 +29,7 @@ log = logging.getLogger(__name__)
 #: Median depth of scenes of unknown unit in training: with about the depth that colons have in mm, constants in mm
 #: (docs/methods.md 4.4) have about the effect that they have on a colon.
 UNKNOWN_MEDIAN_DEPTH = 30.0
-#: In the provenance of a run's scene: the factor on its lengths in training; not there: 1.
+#: In the provenance of a scene that was trained on: the factor on its lengths.
 SCALE_KEY = "training_scale"
 #: Seconds of reading after which progress is reported.
 READING_IS_LONG = 2.0
@@ -75,6 +76,11 @@ def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
         log.info("the unit of length of scene '%s' is unknown: trained at %.4g times its size", scene.name, scale)
     provenance = {**scene.provenance, SCALE_KEY: scale}
     return replace(scene.scaled(scale).with_near_plane(near_plane), provenance=provenance)
+
+
+def recorded_scale(provenance: Mapping[str, Any]) -> float:
+    """Factor on the lengths of a scene in training, from its provenance; runs before there was one have 1."""
+    return float(provenance.get(SCALE_KEY, 1.0))
 
 
 def data_manager(component: Component, path: Path) -> DataManager:

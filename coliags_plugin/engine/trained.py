@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
-from coliags_plugin.engine.data_formats import SCALE_KEY, load_scene
+from coliags_plugin.engine.data_formats import load_scene, recorded_scale
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
@@ -67,7 +67,7 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     identity, provenance = run.identity(), run.provenance()
     method, folder = identity.method, data or identity.scene_path
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
-    scale = provenance["scene"]["provenance"].get(SCALE_KEY, 1.0)
+    scale = recorded_scale(provenance["scene"]["provenance"])
     scene = load_scene(config, folder).with_near_plane(config.near_plane / scale)
     if scene.provenance.get("fingerprint") != identity.fingerprint:
         raise InputError(

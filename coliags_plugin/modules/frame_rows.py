@@ -6,6 +6,8 @@ from bisect import bisect_right
 from collections.abc import Mapping
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.scenes import Scene, View
@@ -51,6 +53,17 @@ class FrameRows:
         span = self._sorted_times[after] - self._sorted_times[before]
         share = (view.time - self._sorted_times[before]) / span if span > 0 else 0.0
         return self._rows_by_time[before], self._rows_by_time[after], share
+
+    def interpolated(self, values: Float[Tensor, "F *S"], view: View) -> Float[Tensor, "*S"]:
+        """Of values of the training frames, a training frame's own, or what lies between those around a view in time.
+
+        The neighbours are those of :meth:`neighbours`. [*S]
+        """
+        row = self.row(view)
+        if row is not None:
+            return values[row]
+        before, after, share = self.neighbours(view)
+        return (1.0 - share) * values[before] + share * values[after]
 
     def require(self, name: str, asking: str) -> int:
         """The row of a training frame that settings name."""

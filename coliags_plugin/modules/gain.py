@@ -111,13 +111,9 @@ class FrameGain(GainModule[FrameGainSettings]):
     def gain(self, view: View | None) -> Float[Tensor, "C"]:
         """The gain of a view."""
         log_gains = self.log_gains()
-        row = self.frames.row(view)
-        if row is not None:
-            return log_gains[row].exp()
-        if view is None or self.settings.untrained == "mean":
+        if view is None or (self.frames.row(view) is None and self.settings.untrained == "mean"):
             return log_gains.mean(0).exp()
-        before, after, share = self.frames.neighbours(view)
-        return ((1.0 - share) * log_gains[before] + share * log_gains[after]).exp()
+        return self.frames.interpolated(log_gains, view).exp()
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""

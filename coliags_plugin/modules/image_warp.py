@@ -14,6 +14,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.sampling import bilinear
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
@@ -68,38 +69,20 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Displace the colours."""
-        nodes = self._nodes(view)
-        if nodes is None:
+        if view is None or (self.frames.row(view) is None and self.settings.untrained == "none"):
             return output
+        nodes = self.frames.interpolated(self.displacements(), view)
         height, width = output.rgb.shape[:2]
         shift = nn.functional.interpolate(nodes[None], (height, width), mode="bicubic", align_corners=True)[0]
-        return replace(output, rgb=sample(output.rgb, shift * (width / 100.0)))
+        rows, columns = (torch.arange(size, device=shift.device) + 0.5 for size in (height, width))
+        centers = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+        return replace(output, rgb=bilinear(output.rgb, centers + shift.permute(1, 2, 0) * (width / 100.0)))
 
-    def _nodes(self, view: View | None) -> Float[Tensor, "2 N N"] | None:
-        """Displacements of the grid's nodes for a view; None where there are none."""
-        free = self.displacement - self.displacement.mean(0)
-        row = self.frames.row(view)
-        if row is not None:
-            return free[row]
-        if view is None or self.settings.untrained == "none":
-            return None
-        before, after, share = self.frames.neighbours(view)
-        return torch.lerp(free[before], free[after], share)
+    def displacements(self) -> Float[Tensor, "F 2 N N"]:
+        """Displacements (x, y) of the grid's nodes in the training frames, percent of the width; zero on average."""
+        return self.displacement - self.displacement.mean(0)
 
     @property
     def learned(self) -> JsonObject:
         """Root mean square of the displacements over the training frames, percent of the image's width."""
-        free = self.displacement.detach() - self.displacement.detach().mean(0)
-        return {"displacement": float(free.square().sum(1).mean().sqrt())}
-
-
-def sample(image: Float[Tensor, "H W C"], shift: Float[Tensor, "2 H W"]) -> Float[Tensor, "H W C"]:
-    """The image's values at every pixel moved by a shift (x, y) in pixels, bilinear; at the edge those of the edge."""
-    height, width = image.shape[:2]
-    x = torch.arange(width, device=image.device) + 0.5 + shift[0]
-    y = torch.arange(height, device=image.device)[:, None] + 0.5 + shift[1]
-    grid = torch.stack([2.0 * x / width - 1.0, 2.0 * y / height - 1.0], dim=-1)
-    sampled = nn.functional.grid_sample(
-        image.movedim(-1, 0)[None], grid[None], padding_mode="border", align_corners=False
-    )
-    return sampled[0].movedim(0, -1)
+        return {"displacement": float(self.displacements().detach().square().sum(1).mean().sqrt())}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.datamanagers.splits import held_out
+from coliags_plugin.datamanagers.splits import held_out, split_options
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,15 @@ def test_a_block_is_one_stretch_of_about_its_share(count, start, length):
     held = held_out("block", count, (start, min(start + length, 1.0)))
     assert (np.diff(np.flatnonzero(held)) == 1).all()
     assert abs(held.sum() - (min(start + length, 1.0) - start) * count) <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options"),
+    [
+        (("every-8th",), []),
+        (("inner-8th",), ["datamanager.split=inner-8th"]),
+        (("block", (0.25, 0.5)), ["datamanager.split=block", "datamanager.block=[0.25, 0.5]"]),
+    ],
+)
+def test_options_choose_a_split(arguments, options):
+    assert split_options(*arguments) == options

@@ -83,7 +83,8 @@ def check_scene(
     video = scene.video
     sample = facts.sampled_frames(video)
     pairs = video_pairs(video)
-    known = {(a, b): pair for a, b in pairs if (pair := Pair(a, b)).is_known}
+    stored = [(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
+    known = {(a, b): pair for a, b in stored if (pair := Pair(a, b)).is_known}
     with_depth = list(known.values()) if len(known) >= _JUDGED * len(pairs) else []
     agreements: dict[str, Agreement] = {}
     matches: dict[str, EpipolarAgreement] = {}
@@ -98,22 +99,27 @@ def check_scene(
         pairs = video_pairs(video, farther=3)
         full = video if at_stored_size is None else at_stored_size().video
         place = {frame.name: number for number, frame in enumerate(full)}
+
+        def followed(chosen: list[tuple[Frame, Frame]]) -> list[FrameMatches]:
+            return follow([full[place[source.name] : place[target.name] + 1] for source, target in chosen], progress)
+
         matched_by = "features"
         matched = match([(full[place[source.name]], full[place[target.name]]) for source, target in pairs])
-        few = len(matched) < _MATCHED * len(pairs)
-        if few or any(rules.match_findings(_readings(matched))):
+        readings = _readings(matched)
+        if len(matched) < _MATCHED * len(pairs):
+            matched_by, pairs = "tracks", video_pairs(video)
+            matched = followed(pairs)
+            readings = _readings(matched)
+        elif any(rules.match_findings(readings)):
             # Points are lost over long ways, and short ones tell less of the poses.
-            for chosen in [video_pairs(video)] if few else [pairs, video_pairs(video)]:
-                ways = [full[place[source.name] : place[target.name] + 1] for source, target in chosen]
-                followed = follow(ways, progress)
-                if few or len(followed) >= _JUDGED * len(chosen):
-                    if few or rules.clearly_agrees(_readings(followed), _readings(matched)):
-                        matched_by, pairs, matched = "tracks", chosen, followed
-                    break
+            tried = ((chosen, followed(chosen)) for chosen in (pairs, video_pairs(video)))
+            enough = next((each for each in tried if len(each[1]) >= _JUDGED * len(each[0])), None)
+            if enough is not None and rules.clearly_agrees(others := _readings(enough[1]), readings):
+                matched_by, (pairs, matched), readings = "tracks", enough, others
         if len(matched) < _JUDGED * len(pairs):
             undecided = list(rules.unmatched(len(matched), len(pairs)))
         else:
-            matches = _readings(matched)
+            matches = readings
             undecided = list(rules.undecided(matches))
     scale = best_scale(with_depth) if with_depth else None
     depth, path = facts.depth_facts(sample), facts.path_facts(video)

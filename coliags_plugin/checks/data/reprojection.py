@@ -145,7 +145,7 @@ def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bo
 
 
 def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
-    """Depth that is compared; NaN where it is unknown, masked or estimated with little confidence."""
+    """A frame's z-depth, NaN where it is unknown, masked, or estimated with confidence below the least. [H, W]"""
     depth, confidence = frame.depth, frame.depth_confidence
     if depth is None:
         return torch.full(frame.image.shape[:2], torch.nan, dtype=torch.float64)

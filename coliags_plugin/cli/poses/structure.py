@@ -74,7 +74,7 @@ class PosesTriangulateCommand:
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
     """Test frames kept in the written scene, and the options that restore its split."""
-    from coliags_plugin.datamanagers.splits import held_out
+    from coliags_plugin.datamanagers.splits import held_out, split_options
 
     test = list(scene.test_sets.get("test", ()))
     others = {name: len(frames) for name, frames in scene.test_sets.items() if name != "test"}
@@ -88,18 +88,12 @@ def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
     video = scene.video
     test_indices = {frame.index for frame in test}
     is_test = [frame.index in test_indices for frame in video]
-    options: dict[Split, list[str]] = {
-        "every-8th": [],
-        "inner-8th": ["datamanager.split=inner-8th"],
-        "endogslam": ["datamanager.split=endogslam"],
-        "all-train": ["datamanager.split=all-train"],
-        "block": ["datamanager.split=block", f"datamanager.block=[{block[0]:g}, {block[1]:g}]"],
-    }
-    for split, assignments in options.items():
+    splits: tuple[Split, ...] = ("every-8th", "inner-8th", "endogslam", "all-train", "block")
+    for split in splits:
         if held_out(split, len(video), (block[0], block[1])).tolist() == is_test:
-            return test, assignments
+            return test, split_options(split, block)
     _LOG.warning("left out: the %d test frames, as COLMAP's layout cannot mark test frames", len(test))
-    return [], options["all-train"]
+    return [], split_options("all-train")
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class PosesTrackCommand:
                 self.output,
                 scene.train,
                 tracking.camera_to_world,
-                unit="mm" if scene.is_metric else "unknown",
+                unit=scene.provenance["unit"],
                 overwrite=self.overwrite,
                 progress=progress,
             )

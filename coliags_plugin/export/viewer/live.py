@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from coliags_plugin.contracts import Follower
-from coliags_plugin.engine.data_formats import SCALE_KEY
+from coliags_plugin.engine.data_formats import recorded_scale
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.content import ViewerContent
@@ -25,7 +25,7 @@ class LiveView(Follower):
 
     def __init__(self, trainer: Trainer, port: int = 8080) -> None:
         method, provenance = trainer.method, trainer.provenance()
-        scale = trainer.scene.provenance.get(SCALE_KEY, 1.0)
+        scale = recorded_scale(trainer.scene.provenance)
         scene, model = trainer.scene.scaled(1.0 / scale), trainer.model.with_field(trainer.model.field, scale)
         trained = TrainedRun(
             trainer.run, method.config, method.name, scene, model, trainer.step, trainer.device,

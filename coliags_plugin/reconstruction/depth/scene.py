@@ -18,6 +18,7 @@ from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio.writer import EstimatedSceneWriter
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
+from coliags_plugin.datamanagers.splits import split_options
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
@@ -92,9 +93,7 @@ def estimate_scene(
 def training_options(scene: Scene) -> list[str]:
     """Options of training with which the scene written for a source has its split and its size."""
     split, camera = scene.provenance["split"], scene.train[0].camera
-    options = [] if split["name"] == "every-8th" else [f"datamanager.split={split['name']}"]
-    if split["name"] == "block":
-        options.append(f"datamanager.block=[{split['block'][0]:g}, {split['block'][1]:g}]")
+    options = split_options(split["name"], split.get("block", ()))
     if fitted(camera.width, camera.height, PAPER_SIZE) != (camera.width, camera.height):
         options += [f"datamanager.width={camera.width}", f"datamanager.height={camera.height}"]
     return options

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from coliags_plugin.core.sampling import bilinear
 from coliags_plugin.surface.meshing.views import DepthView
 
 #: Largest difference of z-depth between a place and what a view sees there, as a share of the depth.
@@ -36,18 +37,10 @@ def best_colors(
         seen = (view.depth[row, column] - z[inside]).abs() <= _SAME * z[inside]
         chosen, at = inside[seen], pixels[inside][seen]
         quality = view.quality[row[seen], column[seen]] ** _POWER
-        total[chosen] += quality[:, None] * _sampled(image_of(view), at)
+        total[chosen] += quality[:, None] * bilinear(image_of(view).float(), at[None])[0]
         weight[chosen] += quality
     colors = (total / weight.clamp(min=torch.finfo().tiny)[:, None]).round().clamp(0, 255).to(torch.uint8).numpy()
     known = weight.numpy() > 0
     if known.any() and not known.all():
         colors[~known] = colors[known][cKDTree(points[known]).query(points[~known])[1]]
     return np.asarray(colors)
-
-
-def _sampled(image: UInt8[Tensor, "H W 3"], pixels: Float[Tensor, "K 2"]) -> Float[Tensor, "K 3"]:
-    """Bilinear samples of an image at columns and rows, pixel centres at integers + 0.5. [K, 3]"""
-    size = torch.tensor([image.shape[1], image.shape[0]], dtype=pixels.dtype)
-    grid = (2.0 * pixels / size - 1.0).float()[None, None]
-    planes = image.permute(2, 0, 1)[None].float()
-    return torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)[0, :, 0].T

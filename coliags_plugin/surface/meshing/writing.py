@@ -77,10 +77,8 @@ def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
     path = given or find_true_surface(Path(scene.provenance.get("path", "")))
     if path is None or (given is None and not scene.is_metric):
         return None
-    if not scene.is_metric:
-        surface = replace(read_true_surface(path), unit=_same_world(scene, path).length_unit)
-    else:
-        surface = read_true_surface(path)
+    unit = "mm" if scene.is_metric else _same_world(scene, path).length_unit
+    surface = replace(read_true_surface(path), unit=unit)
     if surface.seen_by:
         return surface
     seen = first_hits(surface.mesh, scene.train)
