@@ -41,6 +41,8 @@ _BESIDE = 0.2
 _SHIFT, _TURN = 0.3, 0.03
 #: Training views, at most, that Gaussians are compared on; and how much larger their squared error may be: 0.2 dB.
 _COMPARED, _MUCH = 8, 1.047
+#: How much larger this error may be, as a multiple of the run's, where a view starts than where it is least: 1 dB.
+_NEARLY = 1.26
 #: Memory for targets of training views.
 _TARGET_BYTES = 1 << 30
 _WANTS = ("rgb", "alpha", "depth_accumulated")
@@ -128,30 +130,36 @@ def _some_frames(frames: list[Frame]) -> list[Frame]:
 
 def needs_distillation(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> bool:
     """Whether Gaussians miss training frames in a light by more than the run does."""
-    errors = _errors(field, trained, light, trained.scene.train[:: -(-len(trained.scene.train) // _COMPARED)])
-    own, baked = errors.mean(0).tolist()
+    compared = _compared(field, trained, light, trained.scene.train[:: -(-len(trained.scene.train) // _COMPARED)])
+    own, baked, _ = compared.mean(0).tolist()
     return bool(baked > _MUCH * own)
 
 
 def best_frame(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> int:
-    """Index of a training frame, of some, that Gaussians show best in comparison with the run."""
+    """Index of the training frame, of some, that a view of Gaussians starts at.
+
+    Of the frames that they show nearly as well as the best one in comparison with the run, it is the one with the
+    largest median depth: not of a wall close to the lens, but along the lumen.
+    """
     every = -(-len(trained.scene.train) // (2 * _COMPARED))
-    own, baked = _errors(field, trained, light, trained.scene.train[::every]).unbind(1)
-    return every * int((baked / own.clamp_min(1e-12)).argmin())
+    own, baked, depths = _compared(field, trained, light, trained.scene.train[::every]).unbind(1)
+    losses = baked / own.clamp_min(1e-12)
+    return every * int(depths.where(losses <= _NEARLY * losses.min(), -1.0).argmax())
 
 
 @torch.no_grad()
-def _errors(
+def _compared(
     field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, frames: Sequence[Frame]
-) -> Float[Tensor, "F 2"]:
-    """Mean squared errors of the run and of Gaussians on training frames brought to a light. [F, 2]"""
+) -> Float[Tensor, "F 3"]:
+    """Mean squared errors of the run and of Gaussians on training frames brought to a light; median depths. [F, 3]"""
     renderer = splatting_of(model_of_gaussians(field, trained))
     rows = []
     for frame in frames:
         target = _target(trained, frame, light)
         held, _ = _held(trained, target.camera, light)
         shown = renderer.draw(field.gaussians(target.camera), target.camera, ("rgb", "alpha")).rgb
-        rows.append(torch.stack([masked_mean((rgb - target.rgb).square(), target.mask) for rgb in (held, shown)]))
+        errors = [masked_mean((rgb - target.rgb).square(), target.mask) for rgb in (held, shown)]
+        rows.append(torch.stack([*errors, target.depth.median()]))
     return torch.stack(rows)
 
 

@@ -61,8 +61,9 @@ def scene_page(
 
     Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction:
     the most visible ones, as many as the page holds, fitted to what the run renders for so many seconds, and compared
-    with the run on its held-out frames. The view starts at the training frame that they show best in comparison with
-    the run. Of a method without Gaussians, the page shows the meshes.
+    with the run on its held-out frames. The view starts at a training frame
+    (:func:`~coliags_plugin.export.baking.distillation.best_frame`). Of a method without Gaussians, the page shows the
+    meshes.
     """
     meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
     if isinstance(trained.model.field, GaussianField):

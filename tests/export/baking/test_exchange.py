@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
-from coliags_plugin.export.splats.cloud import field_of_cloud
+from coliags_plugin.export.splats.cloud import cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import read_splats, write_splats
 from coliags_plugin.export.splats.ply import write_splat_ply
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
@@ -120,6 +120,18 @@ def test_distillation_comes_nearer_to_the_frames(runs, monkeypatch):
     with torch.no_grad():
         baked.sh0 += 1.0
     assert distillation.needs_distillation(baked, trained, light)
+
+
+def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(runs):
+    """Cameras come nearer to the wall; what stands before the first one only is behind the others."""
+    trained = runs("3dgs").load()
+    cloud = cloud_of_field(trained.model.field)
+    assert distillation.best_frame(field_of_cloud(cloud), trained, None) == 0
+    before = trained.scene.train[0].camera.center.numpy().astype(np.float32) + np.float32([0.0, 0.0, 0.3])
+    one = cloud.part(np.arange(len(cloud)) == 0)
+    shape = {"means": before[None], "scales": np.full_like(one.scales, 0.1), "opacities": np.float32([0.9])}
+    blob = replace(one, **shape, harmonics=one.harmonics + np.float32(10.0))
+    assert distillation.best_frame(field_of_cloud(cloud.concat(blob)), trained, None) == 1
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):
