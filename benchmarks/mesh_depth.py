@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
@@ -75,7 +76,7 @@ def main() -> None:
     parser.add_argument("phantom", type=Path)
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
     arguments = parser.parse_args()
-    options = dict(option.split("=", 1) for option in arguments.options)
+    options = parse_assignments(arguments.options, "an option", "NAME=VALUE")
     settings = validated(MeshSettings, options, "mesh option")
     for name, value in errors(open_scene(arguments.scene), arguments.phantom, settings).items():
         print(f"{name:20s} {value:10.4f}")

@@ -85,6 +85,19 @@ class TriangleMesh:
         return self.vertices[self.triangles].mean(axis=1, dtype=np.float64)
 
     @cached_property
+    def border(self) -> Int[np.ndarray, "E 2"]:
+        """Edges of one triangle only, in the direction that it has them. [E, 2]"""
+        edges, count = np.concatenate([self.triangles[:, [a, (a + 1) % 3]] for a in range(3)]), len(self.vertices)
+        return edges[~np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])]
+
+    @cached_property
+    def on_border(self) -> Bool[np.ndarray, "V"]:
+        """Vertices of the border. [V]"""
+        found = np.zeros(len(self.vertices), bool)
+        found[self.border] = True
+        return found
+
+    @cached_property
     def rays(self) -> RayScene:
         """Casts rays at the mesh and measures distances to it; made once."""
         return RayScene(self.to_open3d())

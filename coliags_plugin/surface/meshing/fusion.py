@@ -17,6 +17,7 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.surface.meshing.colors import best_colors
 from coliags_plugin.surface.meshing.settings import MeshSettings, voxel_size_of
+from coliags_plugin.surface.meshing.smoothing import smoothed
 from coliags_plugin.surface.meshing.views import DepthView, rendered_depth
 from coliags_plugin.surface.meshing.volume import Volume
 
@@ -36,14 +37,16 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
         for view in rendered_depth(trained, settings):
             views.append(view)
             progress.update(len(views))
-    mesh = Volume(views, size, settings.truncation).mesh(min(settings.min_views, len(frames)), settings.min_support)
+    volume, least = Volume(views, size, settings.truncation), min(settings.min_views, len(frames))
+    mesh = volume.mesh(least, settings.min_support, settings.max_conflict)
     if not len(mesh):
         raise InputError(
             f"no surface in the depth of {len(frames)} views in voxels of {size:.3g} {trained.scene.length_unit}",
             f"opaque surface that {settings.min_views} views agree on",
-            "Look at `coliags render RUN`; perhaps train longer, or lower min_views, min_support or min_alpha",
+            "Look at `coliags render RUN`; perhaps train longer, lower min_views, min_support or min_alpha, or raise "
+            "max_conflict",
         )
-    mesh = mesh.without_small_parts(settings.min_part)
+    mesh = smoothed(mesh.without_small_parts(settings.min_part), settings.smoothing)
     return replace(mesh, colors=best_colors(mesh.vertices, views, images_of(trained, settings)))
 
 

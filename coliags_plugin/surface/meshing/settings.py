@@ -27,8 +27,12 @@ class MeshSettings(Settings):
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer
     # Least sum of the squared qualities of the views of a place: 1 for one view, head-on from the median distance.
-    min_support: float = Option(default=0.25, ge=0)
+    min_support: float = Option(default=0.1, ge=0)
+    # Most of the variance of the signed distance between the views of a place, in truncations squared, over that sum.
+    max_conflict: float = Option(default=0.2, gt=0)
     min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
+    # Strength of smoothing by as much as the mesh is noisy; 0 leaves it as it was fused.
+    smoothing: float = Option(default=1.0, ge=0)
 
 
 def voxel_size_of(settings: MeshSettings, scene: Scene) -> float:

@@ -22,7 +22,7 @@ _BLOCK = 8
 _VOXELS = _BLOCK**3
 #: Places of the voxels in a block, x changing first. [512, 3]
 _PLACES = np.stack(np.unravel_index(np.arange(_VOXELS), (_BLOCK,) * 3)[::-1], axis=1).astype(np.float64)
-#: A block of nine numbers a voxel, float32, four of them here and five in open3d, is 18 kB: at most 5.5 GB.
+#: A block of ten numbers a voxel, float32, five of them here and five in open3d, is 20 kB: at most 6.1 GB.
 _MAX_BLOCKS = 300_000
 #: Blocks whose voxels are projected at once.
 _AT_ONCE = 2_000
@@ -56,7 +56,7 @@ class Volume:
             )
         self._blocks = np.stack(np.unravel_index(found, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE
         size = len(found) * _VOXELS
-        self._distance, self._weight = torch.zeros(size), torch.zeros(size)
+        self._distance, self._square, self._weight = torch.zeros(size), torch.zeros(size), torch.zeros(size)
         self._support, self._seen = torch.zeros(size), torch.zeros(size)
         for view in views:
             self._add(view)
@@ -84,6 +84,7 @@ class Volume:
             good = (quality[pixels] > 0) & (distance > -1.0)
             squared = torch.where(good, quality[pixels] ** 2, 0.0)
             self._distance[voxels] += squared**2 * distance
+            self._square[voxels] += squared**2 * distance**2
             self._weight[voxels] += squared**2
             near = good & (distance < 1.0)
             self._support[voxels] += squared * near
@@ -103,9 +104,11 @@ class Volume:
             voxels = (part[:, None] * _VOXELS + torch.arange(_VOXELS)).flatten()[inside]
             yield voxels, z[inside], row[inside].long() * size[0] + column[inside].long()
 
-    def mesh(self, min_views: int, min_support: float) -> TriangleMesh:
-        """The zero level of the distance, where so many views show it and their squared qualities add up to so much.
+    def mesh(self, min_views: int, min_support: float, max_conflict: float = math.inf) -> TriangleMesh:
+        """The zero level of the distance, where enough views show it and agree on it.
 
+        At least so many views show it, and the sum of their squared qualities, the support, is at least so much. The
+        variance of the distance between the views, in truncations squared, over the support is at most the conflict.
         Triangles are counter-clockwise seen from the side of the cameras; vertices between neighbouring voxels are
         shared.
         """
@@ -113,7 +116,10 @@ class Volume:
             return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
         # open3d takes voxels of no weight for known where the threshold is 0.
         least = max(min_support, float(np.finfo(np.float32).tiny))
-        made = self._grid(torch.where(self._seen >= min_views, self._support, 0.0)).extract_triangle_mesh(least)
+        weight = self._weight.clamp(min=torch.finfo().tiny)
+        variance = (self._square / weight - (self._distance / weight) ** 2).clamp(min=0.0)
+        agreed = (self._seen >= min_views) & (variance <= max_conflict * self._support)
+        made = self._grid(torch.where(agreed, self._support, 0.0)).extract_triangle_mesh(least)
         vertices, triangles = made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64)
         mesh = TriangleMesh(vertices.copy(), triangles)
         return mesh.part(mesh.areas > 0.0)
