@@ -52,7 +52,7 @@ def errors(scene: Scene, phantom: Path, settings: MeshSettings) -> dict[str, flo
     config: Any = SimpleNamespace()
     run = TrainedRun(RunFolder(Path("none")), config, "depth", scene, model, 0, torch.device("cpu"), 0, {})
     start = time.perf_counter()
-    mesh = fuse_run(run, settings)
+    mesh = fuse_run(run, settings).mesh
     seconds = time.perf_counter() - start
     compared = compare_meshes(mesh, read_true_surface(phantom))
     at = next(score for score in compared.scores if score.threshold == 1.0)

@@ -330,7 +330,7 @@ class Run:
             from coliags_plugin.surface.meshing.fusion import fuse_run
 
             trained = self.load()
-            wall, scene = fuse_run(trained), trained.scene
+            wall, scene = fuse_run(trained).mesh, trained.scene
         return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:

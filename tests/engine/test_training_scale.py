@@ -117,7 +117,7 @@ def test_evaluations_are_in_its_own_unit(runs, factor):
 
 
 def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
-    meshes = [fuse_run(run, MeshSettings(min_views=1, min_alpha=0.5, voxel_pixels=1.0)) for run in runs]
+    meshes = [fuse_run(run, MeshSettings(min_views=1, min_alpha=0.5, voxel_pixels=1.0)).mesh for run in runs]
     bounds = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in meshes]
     np.testing.assert_allclose(factor * bounds[0], bounds[1], atol=1.0)
     assert factor**2 * meshes[0].areas.sum() == pytest.approx(meshes[1].areas.sum(), rel=0.05)

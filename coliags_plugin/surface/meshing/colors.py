@@ -11,10 +11,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from coliags_plugin.core.sampling import bilinear
-from coliags_plugin.surface.meshing.views import DepthView
+from coliags_plugin.surface.meshing.views import DepthView, looked_at
 
-#: Largest difference of z-depth between a place and what a view sees there, as a share of the depth.
-_SAME = 0.03
 #: Quality counts by this power: of two views, one twice as near has nearly all of the weight.
 _POWER = 4
 
@@ -31,12 +29,10 @@ def best_colors(
     places = torch.from_numpy(points).double()
     total, weight = torch.zeros(len(places), 3), torch.zeros(len(places))
     for view in views:
-        pixels, z = view.camera.project(places)
-        inside = torch.nonzero(view.camera.is_inside(pixels, z))[:, 0]
-        column, row = pixels[inside].long().unbind(1)
-        seen = (view.depth[row, column] - z[inside]).abs() <= _SAME * z[inside]
-        chosen, at = inside[seen], pixels[inside][seen]
-        quality = view.quality[row[seen], column[seen]] ** _POWER
+        inside, pixels, seen, _ = looked_at(view, places)
+        chosen, at = inside[seen], pixels[seen]
+        column, row = at.long().unbind(1)
+        quality = view.quality[row, column] ** _POWER
         total[chosen] += quality[:, None] * bilinear(image_of(view).float(), at[None])[0]
         weight[chosen] += quality
     colors = (total / weight.clamp(min=torch.finfo().tiny)[:, None]).round().clamp(0, 255).to(torch.uint8).numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import UInt8
@@ -16,13 +16,22 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.surface.meshing.colors import best_colors
+from coliags_plugin.surface.meshing.holes import close_holes
 from coliags_plugin.surface.meshing.settings import MeshSettings, voxel_size_of
 from coliags_plugin.surface.meshing.smoothing import smoothed
 from coliags_plugin.surface.meshing.views import DepthView, rendered_depth
 from coliags_plugin.surface.meshing.volume import Volume
 
 
-def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> TriangleMesh:
+@dataclass(frozen=True, eq=False)
+class FusedRun:
+    """The surface of a run."""
+
+    mesh: TriangleMesh
+    holes: int  # that were closed
+
+
+def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> FusedRun:
     """The surface of a run: a truncated signed distance field of the depth rendered from all training poses.
 
     The mesh is in the world of the poses, scene units, coloured by the best views of each place, its triangles
@@ -46,8 +55,9 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
             "Look at `coliags render RUN`; perhaps train longer, lower min_views, min_support or min_alpha, or raise "
             "max_conflict",
         )
-    mesh = smoothed(mesh.without_small_parts(settings.min_part), settings.smoothing)
-    return replace(mesh, colors=best_colors(mesh.vertices, views, images_of(trained, settings)))
+    mesh, holes = close_holes(mesh.without_small_parts(settings.min_part), settings.max_hole * size, views)
+    mesh = smoothed(mesh, settings.smoothing)
+    return FusedRun(replace(mesh, colors=best_colors(mesh.vertices, views, images_of(trained, settings))), holes)
 
 
 def images_of(trained: TrainedRun, settings: MeshSettings) -> Callable[[DepthView], UInt8[Tensor, "H W 3"]]:

@@ -31,6 +31,8 @@ class MeshSettings(Settings):
     # Most of the variance of the signed distance between the views of a place, in truncations squared, over that sum.
     max_conflict: float = Option(default=0.2, gt=0)
     min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
+    # Holes up to this perimeter, in voxels, are closed where views see wall.
+    max_hole: float = Option(default=20.0, ge=0)
     # Strength of smoothing by as much as the mesh is noisy; 0 leaves it as it was fused.
     smoothing: float = Option(default=1.0, ge=0)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
@@ -18,6 +18,8 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights, image_and_mask
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of
 
+#: Largest difference of z-depth between a place and what a view sees there, as a share of the depth.
+_SAME = 0.03
 #: Share of its weight that a pixel keeps at a highlight, and the pixels about one that belong to it.
 _GLINT, _MARGIN = 0.1, 2
 
@@ -38,6 +40,17 @@ class DepthView:
     camera: Camera
     depth: Float[Tensor, "H W"]
     quality: Float[Tensor, "H W"]
+
+
+def looked_at(
+    view: DepthView, places: Float[Tensor, "N 3"]
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 2"], Bool[Tensor, "M"], Bool[Tensor, "M"]]:
+    """Places inside the image of a view, their pixels, whether it sees wall there, and whether it sees through them."""
+    pixels, z = view.camera.project(places)
+    inside = torch.nonzero(view.camera.is_inside(pixels, z))[:, 0]
+    column, row = pixels[inside].long().unbind(1)
+    behind = view.depth[row, column] / z[inside] - 1.0  # -1 where nothing is fused
+    return inside, pixels[inside], behind.abs() <= _SAME, behind > _SAME
 
 
 def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[DepthView]:

@@ -28,7 +28,7 @@ from coliags_plugin.geometry.meshes.truth import (
 )
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
-from coliags_plugin.surface.meshing.fusion import fuse_run
+from coliags_plugin.surface.meshing.fusion import FusedRun, fuse_run
 from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 
@@ -63,13 +63,14 @@ def mesh_run(
     settings = settings or MeshSettings()
     with atomic_folder(output, overwrite) as folder:
         surface = _true_surface(scene, truth)
-        mesh = fuse_run(trained, settings)
+        fused = fuse_run(trained, settings)
+        mesh = fused.mesh
         compared = None if surface is None else compare_meshes(mesh, surface)
         for name in formats:
             write_mesh(folder / f"mesh.{name}", mesh)
         if surface is not None:
             _write_comparison(folder, mesh, surface, scene)
-        write_json(folder / "mesh.json", _summary(trained, mesh, settings, surface, compared))
+        write_json(folder / "mesh.json", _summary(trained, fused, settings, surface, compared))
     return MeshedRun(output, mesh, compared)
 
 
@@ -126,13 +127,13 @@ def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scen
 
 def _summary(
     trained: TrainedRun,
-    mesh: TriangleMesh,
+    fused: FusedRun,
     settings: MeshSettings,
     truth: TrueSurface | None,
     compared: SurfaceComparison | None,
 ) -> dict[str, Any]:
     """Contents of mesh.json."""
-    scene, reach = trained.scene, max_depth_of(settings, trained.scene)
+    scene, mesh, reach = trained.scene, fused.mesh, max_depth_of(settings, trained.scene)
     used = {"voxel_size": voxel_size_of(settings, scene), "max_depth": reach if np.isfinite(reach) else None}
     return {
         "format": FORMAT,
@@ -144,6 +145,7 @@ def _summary(
         "settings": settings.model_dump() | used,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh),
+        "holes_closed": fused.holes,
         "area": float(mesh.areas.sum()),
         "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
         "truth": None if truth is None else _relative_path(truth.path, scene),

@@ -21,7 +21,7 @@ from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run
 
 
 def test_a_wall():
-    mesh = fuse_run(exact_run(scene=wall_scene(17, 160, 120, lamp=False)))
+    mesh = fuse_run(exact_run(scene=wall_scene(17, 160, 120, lamp=False))).mesh
     assert np.abs(mesh.vertices[:, 2] - WALL).max() < 0.01
     # Seen from the cameras, which look along +z, triangles are counter-clockwise.
     assert (mesh.normals[:, 2] < -0.99).all()
@@ -31,7 +31,7 @@ def test_a_wall():
 
 def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
     settings = MeshSettings(voxel_size=0.3)
-    mesh = fuse_run(exact_run(square=True), settings)
+    mesh = fuse_run(exact_run(square=True), settings).mesh
     z = mesh.vertices[:, 2]
     # At its edges, the square is as thick as the truncation.
     assert np.minimum(np.abs(z - SQUARE), np.abs(z - WALL)).max() < 0.3 * settings.truncation
@@ -44,7 +44,7 @@ def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
 def test_small_parts_go_and_large_ones_stay():
     run = exact_run(square=True)
     settings = MeshSettings(voxel_size=0.3, min_part=0.5)
-    assert fuse_run(run, settings).vertices[:, 2].min() > 16
+    assert fuse_run(run, settings).mesh.vertices[:, 2].min() > 16
 
 
 @pytest.mark.parametrize("what", ["mask", "depth_at_least"])
@@ -54,21 +54,21 @@ def test_what_is_masked_or_clipped_by_the_sensor_is_not_fused(what):
     value = ~left if what == "mask" else torch.where(left, 15.0, torch.nan)
     spoilt = replace(scene, train=[replace(frame, **{what: value}) for frame in scene.train])
     settings = MeshSettings(voxel_size=0.3)
-    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (spoilt, scene))
+    half, whole = (fuse_run(exact_run(scene=s), settings).mesh.areas.sum() for s in (spoilt, scene))
     assert 0.4 < half / whole < 0.65
 
 
 def test_what_lies_too_far_is_not_fused():
     with pytest.raises(InputError, match="no surface"):
         fuse_run(exact_run(), MeshSettings(max_depth=10.0))
-    mesh = fuse_run(exact_run(square=True), MeshSettings(voxel_size=0.3, max_depth=11.5))
+    mesh = fuse_run(exact_run(square=True), MeshSettings(voxel_size=0.3, max_depth=11.5)).mesh
     assert mesh.vertices[:, 2].max() < 16
 
 
 def test_transparent_views_have_no_surface():
     with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
         fuse_run(exact_run(alpha=0.7))
-    assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)))
+    assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)).mesh)
 
 
 def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
@@ -86,20 +86,20 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
 
     monkeypatch.setattr(fusion, "held_light", held)
     monkeypatch.setattr(fusion, "render_held", dark)
-    mesh = fuse_run(run, MeshSettings(color="flattened"))
+    mesh = fuse_run(run, MeshSettings(color="flattened")).mesh
     assert asked == [("flattened", len(run.scene.train))]
     assert set(np.unique(mesh.colors)) == {51}
-    plain = fuse_run(run)
+    plain = fuse_run(run).mesh
     # open3d's threads leave the order of vertices open.
     assert mesh.areas.sum() == pytest.approx(plain.areas.sum()) and len(np.unique(plain.colors)) > 1
 
 
 def test_too_few_views_and_methods_without_depth_are_refused():
-    assert len(fuse_run(exact_run(frames=9), MeshSettings(depth="expected")))
+    assert len(fuse_run(exact_run(frames=9), MeshSettings(depth="expected")).mesh)
     scene = wall_scene(9, 160, 120)
     with pytest.raises(InputError, match="1 training view"):
         fuse_run(exact_run(scene=replace(scene, train=scene.train[:1])))
-    assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))))
+    assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))).mesh)
     with pytest.raises(InputError, match="meshing with median depth"):
         fuse_run(exact_run(depth=False))
 

@@ -42,6 +42,7 @@ def test_files_and_figures(truth, tmp_path):
     assert {path.name for path in made.folder.iterdir()} == names
     summary = json.loads((made.folder / "mesh.json").read_text())
     assert (summary["method"], summary["unit"], summary["views"], summary["step"]) == ("exact", "mm", 14, 100)
+    assert summary["holes_closed"] == 0
     assert summary["triangles"] == len(made.mesh) == len(read_mesh(made.folder / "mesh.ply"))
     assert summary["settings"]["voxel_size"] == 0.4
     assert summary["area"] == pytest.approx(made.mesh.areas.sum())

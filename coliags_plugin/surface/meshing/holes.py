@@ -1,0 +1,101 @@
+"""Closing of the small holes of a mesh where views see wall."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse.linalg import spsolve
+
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.meshing.smoothing import bending
+from coliags_plugin.surface.meshing.views import DepthView, looked_at
+
+
+def close_holes(mesh: TriangleMesh, perimeter: float, views: Sequence[DepthView]) -> tuple[TriangleMesh, int]:
+    """The mesh, without colours, with its holes up to a perimeter, scene units, closed; and how many those were.
+
+    A hole is closed by rings of triangles about its centre, as wide as its edges are long, that go on smoothly from the
+    triangles around it. It stays open unless, counted over the new vertices, more views see wall there, from its front,
+    than see through it: where no view looked, and at ends, there is no surface.
+    """
+    holes = [hole for hole in loops(mesh) if _length(mesh.vertices[hole]) <= perimeter]
+    if not holes:
+        return mesh, 0
+    vertices, triangles, count = [mesh.vertices], [mesh.triangles], len(mesh.vertices)
+    for hole in holes:
+        rings = max(1, round(len(hole) / (2.0 * np.pi)))
+        edge, inward = mesh.vertices[hole], np.arange(1, rings)[:, None, None] / rings
+        added = np.concatenate([*(edge + inward * (edge.mean(axis=0) - edge)), edge.mean(axis=0, keepdims=True)])
+        corners = np.concatenate([hole, count + np.arange(len(added))])
+        triangles.append(corners[_disk(len(hole), rings)])
+        vertices.append(added.astype(np.float32))
+        count += len(added)
+    closed = _bent_least(TriangleMesh(np.concatenate(vertices), np.concatenate(triangles)), len(mesh.vertices))
+    of_vertex = np.repeat(np.arange(len(holes) + 1), [len(part) for part in vertices])
+    of_triangle = np.repeat(np.arange(len(holes) + 1), [len(part) for part in triangles])
+    agreed = np.bincount(of_vertex, _sightings(closed, views)) > 0.0
+    agreed[0] = True
+    return closed.part(agreed[of_triangle]), int(agreed[1:].sum())
+
+
+def loops(mesh: TriangleMesh) -> Iterator[Int[np.ndarray, "L"]]:
+    """The closed loops of the border, each as its vertices in order, none of them twice. [L]"""
+    follows: dict[int, list[int]] = {}
+    for first, second in mesh.border.tolist():
+        follows.setdefault(first, []).append(second)
+    while follows:
+        path = [next(iter(follows))]
+        while path[-1] in follows:
+            ahead = follows[path[-1]]
+            following = ahead.pop()
+            if not ahead:
+                del follows[path[-1]]
+            if following in path:
+                start = path.index(following)
+                yield np.array(path[start:])
+                del path[start + 1 :]
+            else:
+                path.append(following)
+
+
+def _length(loop: Float[np.ndarray, "L 3"]) -> float:
+    """Length of a closed loop of points."""
+    return float(np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum())
+
+
+def _disk(sides: int, rings: int) -> Int[np.ndarray, "F 3"]:
+    """Triangles that close a loop: between rings of vertices, the outermost first, and the centre, the last. [F, 3]"""
+    here = np.arange(sides)
+    there = np.roll(here, -1)
+    inner = sides * (rings - 1)
+    faces = [np.stack([there + inner, here + inner, np.full(sides, inner + sides)], axis=1)]
+    for outer in sides * np.arange(rings - 1):
+        faces.append(outer + np.stack([there, here, here + sides], axis=1))
+        faces.append(outer + np.stack([there, here + sides, there + sides], axis=1))
+    return np.concatenate(faces)
+
+
+def _bent_least(mesh: TriangleMesh, known: int) -> TriangleMesh:
+    """The mesh with all vertices but the first ``known`` where they and those about them bend least."""
+    new = np.arange(len(mesh.vertices)) >= known
+    bent = np.zeros(len(new), bool)
+    bent[mesh.triangles[new[mesh.triangles].any(axis=1)]] = True
+    bends, places = bending(mesh, bent), mesh.vertices.astype(np.float64)
+    free, fixed = bends[:, known:], bends[:, :known] @ places[:known]
+    places[known:] = spsolve((free.T @ free).tocsc(), -(free.T @ fixed))
+    return TriangleMesh(places.astype(np.float32), mesh.triangles)
+
+
+def _sightings(mesh: TriangleMesh, views: Sequence[DepthView]) -> Float[np.ndarray, "V"]:
+    """Of each vertex, views that see wall there, from its front, less those that see through it. [V]"""
+    places = torch.from_numpy(mesh.vertices).double()
+    normals = torch.from_numpy(mesh.to_open3d().compute_vertex_normals().vertex.normals.numpy()).double()
+    total = torch.zeros(len(places))
+    for view in views:
+        chosen, _, seen, through = looked_at(view, places)
+        front = ((view.camera.center - places[chosen]) * normals[chosen]).sum(dim=1) > 0.0
+        total[chosen] += (seen & front).float() - through.float()
+    return np.asarray(total)
