@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reconstruction.structure import joining, sfm
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays, adjust, held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
@@ -177,6 +178,21 @@ def test_places_between_models_are_told(tmp_path):
     (link,) = atlas.refused
     assert link.after == first[-1] == second[0] - 1
     assert link.points > 30
+
+
+def test_a_wall_that_moves_is_split(tmp_path, monkeypatch, caplog):
+    """Into stretches of 12 images at least."""
+    images = list_images(write_tube(tmp_path / "scene", 25, 1.0) / "images")
+    for module in (sfm, joining):
+        monkeypatch.setattr(module, "rigid_frames", lambda model, tracks: 10)
+    atlas = reconstruct(images, TRACKED)
+    assert [model.registered for model in atlas.models] == [tuple(range(13)), tuple(range(13, 25))]
+    assert atlas.lost == {}
+    (link,) = atlas.refused
+    assert link.after == 12
+    assert link.again.agreeing >= 10
+    assert link.reason.startswith("what is seen moves too far for one rigid model; ")
+    assert "what is seen moves, as rigid for 10 frames: split in 2 models" in caplog.text
 
 
 def test_the_atlas_is_written(tracked, tmp_path):

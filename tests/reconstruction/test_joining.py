@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.images import write_image
 from coliags_plugin.reconstruction.libraries import quiet_colmap
+from coliags_plugin.reconstruction.structure import joining
 from coliags_plugin.reconstruction.structure.atlas import part_of
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis
 from coliags_plugin.reconstruction.structure.image_files import list_images
@@ -70,9 +71,14 @@ def test_models_of_the_same_wall_become_one(halves):
         assert len(more) == len(light) == len(np.unique(ids))
 
 
-def test_models_that_are_too_long_together_are_related(halves):
+@pytest.mark.parametrize("moves", [False, True])
+def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatch):
     video, _, parts = halves
-    short = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=COUNT - 1)})
+    short = TRACKED
+    if moves:
+        monkeypatch.setattr(joining, "rigid_frames", lambda model, tracks: COUNT - 1)
+    else:
+        short = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=COUNT - 1)})
     with quiet_colmap(0):
         same, kept, apart = join_models(video, parts, short)
     assert same is video

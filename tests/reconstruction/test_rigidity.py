@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pycolmap
 import pytest
 
-from coliags_plugin.reconstruction.structure.rigidity import rigidity
+from coliags_plugin.reconstruction.structure import rigidity as structure_rigidity
+from coliags_plugin.reconstruction.structure.rigidity import rigid_frames, rigidity
 from tests.reconstruction.seen_points import frame_points, seen_points
 
 
@@ -34,3 +38,21 @@ def test_a_moving_scene_is_farther_off_the_longer_it_moves():
     moving = measured(speed=1.0)
     assert moving[1] > 0.3
     assert moving[2] > 1.4 * moving[1]
+
+
+@pytest.mark.parametrize(
+    ("residuals", "frames"),
+    [
+        ({}, None),
+        ({1: 0.4, 2: 0.8, 4: 1.0, 8: 1.19}, None),
+        # 1.2 px, three times that of neighbours, are reached at 10 frames, which lie on either side of the middle one.
+        ({1: 0.4, 4: 0.9, 8: 1.0, 12: 1.4, 16: 1.0}, 21),
+        ({1: 0.1, 4: 0.3, 8: 0.69}, None),  # below 0.7 px, 0.007 of the focal length, whatever neighbours have
+        ({2: 0.1, 4: 0.6, 8: 0.8}, 13),
+        ({2: 2.0, 4: 9.0}, 7),
+    ],
+)
+def test_a_model_is_as_long_as_what_it_shows_is_rigid(residuals, frames, monkeypatch):
+    monkeypatch.setattr(structure_rigidity, "rigidity", lambda model, tracks: residuals)
+    camera = pycolmap.Camera(model="PINHOLE", width=160, height=128, params=[100.0, 100.0, 80.0, 64.0])
+    assert rigid_frames(SimpleNamespace(cameras={1: camera}), ()) == frames

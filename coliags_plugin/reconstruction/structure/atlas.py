@@ -56,7 +56,7 @@ class Again:
 
 @dataclass(frozen=True)
 class Link:
-    """A place of a model at which few points are seen from both sides of two frames, or at which models were joined.
+    """A place at which few points link the sides of a model, models were joined, or a model of what moves was split.
 
     ``log_scale`` is the natural logarithm of the ratio of the depths that either side gives by itself to the same
     points, and ``uncertainty`` its standard error; None where too few points can be compared.
@@ -68,6 +68,7 @@ class Link:
     uncertainty: float | None
     spanning: int | None = None  # of them seen from three frames or farther on both sides; None: not mapped together
     again: Again | None = None
+    moves: bool = False  # what is seen moves too far for one rigid model of both sides
 
     @property
     def holds(self) -> bool:
@@ -81,6 +82,8 @@ class Link:
     @property
     def reason(self) -> str:
         """Why it holds, or not, in words."""
+        if self.moves:
+            return f"what is seen moves too far for one rigid model; {self.points} points are seen from both sides"
         if self.again is not None:
             return (
                 f"the wall is seen again from frame {self.again.before}: {self.again.agreeing} comparisons of frames "

@@ -28,6 +28,7 @@ from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, 
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.outliers import median_of_points
 from coliags_plugin.reconstruction.structure.point_tracks import PointFinder, View
+from coliags_plugin.reconstruction.structure.rigidity import rigid_frames
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
@@ -326,10 +327,16 @@ def _joined(
         model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
     result = adjusted(model, video)
     kept = result.images >= (1.0 - _MOST_LOST) * (len(one.frames) + len(other.frames))
-    held = kept and link_at(result.model, after).holds
+    held = kept and link_at(result.model, after).holds and _is_rigid(result, video)
     if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
         return None
     return Part(result, {**one.joins, **other.joins, after: _again(sightings, before)})
+
+
+def _is_rigid(joined: Hypothesis, video: MatchedVideo) -> bool:
+    """Whether what a model shows hardly moves while it is seen."""
+    longest = rigid_frames(joined.model, video.tracks)
+    return longest is None or joined.images <= longest
 
 
 def _is_worse(joined: Hypothesis, parts: Sequence[Part], video: MatchedVideo) -> bool:

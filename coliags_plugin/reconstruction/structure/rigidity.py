@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +20,9 @@ _APART, _MOST_PAIRS, _FEWEST_PAIRS = (1, 2, 4, 8, 12, 16, 24, 32), 24, 4
 _FEWEST, _WIDEST = 40, 1.2
 #: RANSAC inlier threshold, radians, and each so many of the tracks is kept from the fit and measured.
 _MAX_ERROR, _TESTED = 0.01, 3
-#: Times the residual of neighbours beyond which a rigid model averages motion (docs/poses.md 9.4).
-LIMIT = 3.0
+#: Residual beyond which a rigid model averages motion, times that of neighbours, and at least, radians: on a rigid
+#: wall that is hard to track it stays below the second (docs/poses.md 9.4).
+_LIMIT, _LEAST_LIMIT = 3.0, 0.007
 
 
 def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> dict[int, float]:
@@ -47,6 +49,21 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
         if len(values) >= _FEWEST_PAIRS:
             measured[apart] = float(np.median(values)) * camera.mean_focal_length()
     return measured
+
+
+def rigid_frames(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> int | None:
+    """Largest number of frames over which what a model shows is rigid; None: its :func:`rigidity` sets no limit.
+
+    No frame is farther from the middle one than residuals take to reach three times that of neighbours and 0.007 of
+    the focal length.
+    """
+    residuals = sorted(rigidity(model, tracks).items())
+    for (near, below), (far, value) in pairwise(residuals):
+        focal_length = next(iter(model.cameras.values())).mean_focal_length()
+        limit = max(_LIMIT * residuals[0][1], _LEAST_LIMIT * focal_length)
+        if value > limit:
+            return 1 + 2 * int(near + (far - near) * max(0.0, limit - below) / (value - below))
+    return None
 
 
 def _residual(first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"]) -> float | None:

@@ -33,7 +33,7 @@ from coliags_plugin.reconstruction.structure.hypotheses import (
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
 from coliags_plugin.reconstruction.structure.joining import Part, join_models, stretches_of
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
-from coliags_plugin.reconstruction.structure.rigidity import LIMIT, rigidity
+from coliags_plugin.reconstruction.structure.rigidity import rigid_frames, rigidity
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     field_of_view,
     has_known_camera,
@@ -201,6 +201,12 @@ def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction
         camera.params = other.cameras[number].params
 
 
+#: Images of a model below which it is not believed if its error is so many times that of the largest, and below which
+#: none is split as what it shows moves; and the fineness of its images, in the median, below which none is believed:
+#: that of a blur by 3.5 px of 384.
+_SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
+
+
 def _atlas(
     video: MatchedVideo,
     chosen: Sequence[Hypothesis],
@@ -223,7 +229,9 @@ def _atlas(
             if broken and len(part) >= settings.min_model_size:
                 one = adjusted(part_of(hypothesis.model, part.tolist()), video)
             if min(one.images, len(part)) >= settings.min_model_size:
-                kept.append(one)
+                pieces, moving = _rigid_stretches(one, video)
+                kept += pieces
+                refused += moving
     apart: dict[int, Again] = {}
     parts = [Part(one, {}) for one in kept]
     if video.tracks:
@@ -250,6 +258,22 @@ def _atlas(
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
 
 
+def _rigid_stretches(one: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothesis], list[Link]]:
+    """The model, or stretches of it as short as the motion of what they show demands, and the places between these."""
+    longest = rigid_frames(one.model, video.tracks) if video.tracks else None
+    count = 1 if longest is None else min(-(-one.images // longest), one.images // _SHORT)
+    if longest is None or count < 2:
+        return [one], []
+    frames = sorted(number - 1 for number in one.model.reg_image_ids())
+    stretches = [stretch.tolist() for stretch in np.array_split(frames, count)]
+    log.warning(
+        "images %s to %s: what is seen moves, as rigid for %d frames: split in %d models",
+        *(video.images[frames[0]].name, video.images[frames[-1]].name, longest, len(stretches)),
+    )
+    links = [replace(link_at(one.model, stretch[-1]), moves=True) for stretch in stretches[:-1]]
+    return [adjusted(part_of(one.model, stretch), video) for stretch in stretches], links
+
+
 def _apart(links: Sequence[Link], least: int) -> list[Link]:
     """Places in order; of those between which ``least`` frames would not be left, the one that fewest points link."""
     groups: list[list[Link]] = []
@@ -266,11 +290,6 @@ def _links(part: Part) -> tuple[Link, ...]:
     weak = {link.after: link for link in weak_links(model) if link.holds}
     joined = {after: replace(link_at(model, after), again=again) for after, again in part.joins.items()}
     return tuple(link for _, link in sorted({**weak, **joined}.items()))
-
-
-#: Images of a model below which it is not believed if its error is so many times that of the largest; and the fineness
-#: of its images, in the median, below which none is: that of a blur by 3.5 px of 384.
-_SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
 
 
 def _refusal(video: MatchedVideo, one: Reconstruction, largest: Reconstruction) -> str | None:
@@ -326,7 +345,7 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
     error = held_out_error(model, video.tracks) if video.tracks else None
-    moves = rigidity(model, video.tracks) if video.tracks else {}
+    residuals = rigidity(model, video.tracks) if video.tracks else {}
     poses = inverse(world_to_camera)
     if video.picture is not None:
         video.picture.to_frame(model)
@@ -341,15 +360,8 @@ def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) ->
         links,
         error,
         None if video.picture is None else max(video.picture.size),
-        moves,
+        residuals,
     )
-    if moves and (last := max(moves)) > 1 and moves[last] > LIMIT * moves[min(moves)]:
-        log.warning(
-            "images %s to %s: what is seen moves: points are %.1f px from the best rigid motion over %d frames, "
-            "%.1f px over %d. Poses and surface are those of its mean",
-            *(images[registered[0]].name, images[registered[-1]].name),
-            *(moves[last], last, moves[min(moves)], min(moves)),
-        )
     if chosen.correlation is None or chosen.correlation > _LIT:
         log.warning(
             "images %s to %s: nearer points are hardly brighter (correlation of brightness with depth %s): the model "
