@@ -144,6 +144,9 @@ class MeshCommand:
     color: Literal["plain", "flattened"] = "plain"
     """Colours: as the views show them, each under its lamp; or under one distance and angle to the lamp everywhere, the
     medians of what the training views see, for methods of Gaussians."""
+    texture: bool = False
+    """OBJ, with MTL and PNG, and GLB with a texture in place of colours at vertices: four texels along the edge of a
+    voxel."""
     truth: arguments.OptionalPath = None
     """True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with one; default:
     that of the scene, where there is one."""
@@ -165,6 +168,8 @@ class MeshCommand:
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance depth=median")
         settings.setdefault("color", self.color)
+        if self.texture:
+            settings.setdefault("texture", 4.0)
         if self.voxel is not None:
             settings["voxel_size"] = self.voxel
         run = load_run(self.path, data=self.data, device=self.device)

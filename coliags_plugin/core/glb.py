@@ -16,7 +16,7 @@ from coliags_plugin.core.json_files import JsonObject
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 #: glTF's numbers of types, and names of shapes by their channels.
 _COMPONENTS = {"|u1": 5121, "<u4": 5125, "<f4": 5126}
-_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 #: What a part of the buffer is for.
 _VERTICES, _INDICES = 34962, 34963
 
@@ -53,10 +53,12 @@ class GlbArray:
         return made
 
 
-def encode_glb(document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "") -> bytes:
+def encode_glb(
+    document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "", png: bytes | None = None
+) -> bytes:
     """The bytes of a GLB file of a glTF document without asset, buffers, views and accessors; accessor i is array i.
 
-    Rows of arrays have a multiple of four bytes; ``extras`` is a comment.
+    Rows of arrays have a multiple of four bytes; ``extras`` is a comment, ``png`` a file that becomes image 0.
     """
     views, chunks, offset = [], [], 0
     for array in arrays:
@@ -65,6 +67,11 @@ def encode_glb(document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: 
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
         chunks.append(data)
         offset += len(data)
+    if png is not None:
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(png)})
+        chunks.append(_padded(png, b"\0"))
+        offset += len(chunks[-1])
+        document = {**document, "images": [{"bufferView": len(arrays), "mimeType": "image/png"}]}
     asset: JsonObject = {"version": "2.0", "generator": "coliags_plugin"}
     if extras:
         asset["extras"] = {"comment": extras}

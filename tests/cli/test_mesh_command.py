@@ -24,11 +24,13 @@ def run_folder(tmp_path, monkeypatch):
 
 
 def test_the_mesh_of_a_run(run_folder, capsys):
-    assert run("mesh", run_folder, "--voxel", 0.4, "--format", "ply", "glb", "--set", "depth=expected") == 0
+    assert (
+        run("mesh", run_folder, "--voxel", 0.4, "--format", "ply", "glb", "--set", "depth=expected", "--texture") == 0
+    )
     assert f"written: {run_folder / 'mesh'}\n" in capsys.readouterr().out
     assert {path.name for path in (run_folder / "mesh").iterdir()} == {"mesh.ply", "mesh.glb", "mesh.json"}
     text = (run_folder / "mesh/mesh.json").read_text()
-    assert '"voxel_size": 0.4' in text and '"depth": "expected"' in text
+    assert '"voxel_size": 0.4' in text and '"depth": "expected"' in text and '"texture": 4.0' in text
 
 
 def test_options_are_refused_before_anything_is_made(run_folder, capsys):
@@ -43,7 +45,7 @@ def test_the_command_is_refused_without_a_run(tmp_path, capsys):
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
-    def full(path: Path, mesh) -> None:
+    def full(path: Path, mesh, texture) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("coliags_plugin.surface.meshing.writing.write_mesh", full)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -18,9 +19,10 @@ from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.glb import GlbArray, encode_glb
+from coliags_plugin.core.images import encode_image, write_image
 from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.ply import point_properties, read_triangles, write_ply
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 
 #: Suffixes of the formats.
 MESH_FORMATS = ("ply", "obj", "glb")
@@ -54,18 +56,26 @@ def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | 
     return mesh, textures
 
 
-def write_mesh(path: Path, mesh: TriangleMesh) -> None:
+def write_mesh(path: Path, mesh: TriangleMesh, texture: Texture | None = None) -> None:
     """Write a mesh as PLY, OBJ or GLB, told apart by the suffix, atomically; the folder is made.
 
     Vertex colours are written as they are: in PLY as uchar, in OBJ as three numbers in [0, 1] behind the position (an
     extension that MeshLab, Blender and open3d read), in GLB as linear light, as glTF demands. GLB has the same axes and
-    lengths as the mesh; glTF's own are y up, metres.
+    lengths as the mesh; glTF's own are y up, metres. A texture is written in place of colours: into GLB, beside OBJ as
+    MTL and PNG; PLY has none.
     """
     suffix = _suffix(path)
     if suffix == "ply":
         write_ply(path, point_properties(mesh.vertices, mesh.colors), mesh.triangles)
+    elif suffix == "glb":
+        atomic_write(path, encode_mesh(mesh, texture))
+    elif texture is None:
+        atomic_write(path, encode_obj(mesh))
     else:
-        atomic_write(path, encode_obj(mesh) if suffix == "obj" else encode_mesh(mesh))
+        png, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+        write_image(png, texture.image)
+        atomic_write(material, f"newmtl wall\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n".encode())
+        atomic_write(path, f"mtllib {material.name}\nusemtl wall\n".encode() + encode_obj(mesh, texture))
 
 
 def _suffix(path: Path) -> str:
@@ -95,11 +105,15 @@ def _read_glb(path: Path) -> TriangleMesh:
     return TriangleMesh(vertices, triangles.astype(np.int64), _encoded(linear) if len(linear) else None)
 
 
-def encode_mesh(mesh: TriangleMesh) -> bytes:
-    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours.
+def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
+    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours or a texture.
 
     By hand: open3d 0.20 writes 16-bit indices at an offset that its own reader then refuses.
     """
+    places, material = None, dict[str, Any](metallicFactor=0.0, roughnessFactor=1.0)
+    if texture is not None:
+        mesh, places = _split(mesh, texture)
+        material["baseColorTexture"] = {"index": 0}
     arrays = [
         GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
         GlbArray(mesh.vertices.astype(np.float32), bounds=True),
@@ -111,14 +125,27 @@ def encode_mesh(mesh: TriangleMesh) -> bytes:
         rgba = np.full((len(mesh.vertices), 4), 255, np.uint8)
         rgba[:, :3] = np.rint(_linear(mesh.colors) * 255.0)
         arrays.append(GlbArray(rgba, normalized=True))
+    if places is not None:
+        attributes["TEXCOORD_0"] = 2
+        arrays.append(GlbArray(np.stack([places[:, 0], 1.0 - places[:, 1]], axis=1).astype(np.float32)))
     document = {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": _TRIANGLES}]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": material}],
     }
-    return encode_glb(document, arrays)
+    if texture is None:
+        return encode_glb(document, arrays)
+    return encode_glb({**document, "textures": [{"source": 0}]}, arrays, png=encode_image(texture.image))
+
+
+def _split(mesh: TriangleMesh, texture: Texture) -> tuple[TriangleMesh, Float[np.ndarray, "V 2"]]:
+    """The mesh, without colours, with a vertex for each of its places in the texture, and these places. [V, 2]"""
+    places, of_corner = np.unique(texture.corners.reshape(-1, 2), axis=0, return_inverse=True)
+    keys, corners = np.unique(mesh.triangles.ravel() * len(places) + of_corner.ravel(), return_inverse=True)
+    vertices, used = np.divmod(keys, len(places))
+    return TriangleMesh(mesh.vertices[vertices], corners.reshape(-1, 3)), places[used]
 
 
 def _linear(colors: UInt8[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
@@ -164,14 +191,20 @@ def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     return TriangleMesh(vertices[:, :3].astype(np.float32), corners, colors), textures
 
 
-def encode_obj(mesh: TriangleMesh) -> bytes:
-    """OBJ text of a mesh, colours in [0, 1] behind the positions."""
+def encode_obj(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
+    """OBJ text of a mesh, colours in [0, 1] behind the positions; or places in a texture (``vt``) without colours."""
     text = io.BytesIO()
     rows, form = mesh.vertices.astype(np.float64), "v %.5f %.5f %.5f"
-    if mesh.colors is not None:
+    if mesh.colors is not None and texture is None:
         rows, form = np.concatenate([rows, mesh.colors / 255.0], axis=1), form + " %.4f %.4f %.4f"
     np.savetxt(text, rows, form)
-    np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
+    if texture is None:
+        np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
+    else:
+        places, of_corner = np.unique(texture.corners.reshape(-1, 2), axis=0, return_inverse=True)
+        np.savetxt(text, places, "vt %.6f %.6f")
+        corners = np.stack([mesh.triangles, of_corner.reshape(-1, 3)], axis=-1).reshape(-1, 6)
+        np.savetxt(text, corners + 1, "f %d/%d %d/%d %d/%d")
     return text.getvalue()
 
 

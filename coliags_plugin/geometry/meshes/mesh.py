@@ -53,6 +53,14 @@ class RayScene:
 
 
 @dataclass(frozen=True, eq=False)
+class Texture:
+    """An image that covers a mesh, and where its triangles lie in it."""
+
+    image: UInt8[np.ndarray, "H W 3"]
+    corners: Float[np.ndarray, "F 3 2"]  # of the triangles, from 0 to 1: to the right, and upwards from the last row
+
+
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A triangle mesh in the world frame, scene units (mm for C3VD)."""
 
@@ -125,7 +133,7 @@ class TriangleMesh:
         open3d = import_open3d("casts rays at meshes")
         made = open3d.t.geometry.TriangleMesh(
             open3d.core.Tensor(np.ascontiguousarray(self.vertices, np.float32)),
-            open3d.core.Tensor(np.ascontiguousarray(self.triangles, np.int32)),
+            open3d.core.Tensor(np.ascontiguousarray(self.triangles, np.int64)),
         )
         if self.colors is not None:
             made.vertex.colors = open3d.core.Tensor(np.ascontiguousarray(self.colors))

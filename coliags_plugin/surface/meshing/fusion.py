@@ -13,12 +13,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.surface.meshing.colors import best_colors
 from coliags_plugin.surface.meshing.holes import close_holes
 from coliags_plugin.surface.meshing.settings import MeshSettings, voxel_size_of
 from coliags_plugin.surface.meshing.smoothing import smoothed
+from coliags_plugin.surface.meshing.texturing import best_texture
 from coliags_plugin.surface.meshing.views import DepthView, rendered_depth
 from coliags_plugin.surface.meshing.volume import Volume
 
@@ -29,6 +30,7 @@ class FusedRun:
 
     mesh: TriangleMesh
     holes: int  # that were closed
+    texture: Texture | None  # of the mesh, where one was asked for
 
 
 def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> FusedRun:
@@ -57,7 +59,9 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Fused
         )
     mesh, holes = close_holes(mesh.without_small_parts(settings.min_part), settings.max_hole * size, views)
     mesh = smoothed(mesh, settings.smoothing)
-    return FusedRun(replace(mesh, colors=best_colors(mesh.vertices, views, images_of(trained, settings))), holes)
+    image_of = images_of(trained, settings)
+    texture = best_texture(mesh, size / settings.texture, views, image_of) if settings.texture else None
+    return FusedRun(replace(mesh, colors=best_colors(mesh.vertices, views, image_of)), holes, texture)
 
 
 def images_of(trained: TrainedRun, settings: MeshSettings) -> Callable[[DepthView], UInt8[Tensor, "H W 3"]]:

@@ -23,6 +23,8 @@ class MeshSettings(Settings):
     max_depth: float | None = Option(default=None, gt=0)
     # Colours as recorded, under the lamp of each view; or rendered, at one distance and angle to the lamp everywhere.
     color: Literal["plain", "flattened"] = "plain"
+    # OBJ and GLB get a texture of this many texels along the edge of a voxel in place of colours at vertices; 0: none.
+    texture: float = Option(default=0.0, ge=0, le=64)
     min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer

@@ -40,7 +40,7 @@ FORMAT = 1
 class MeshedRun:
     """The mesh of a run and the folder it was written to."""
 
-    folder: Path  # with ``mesh.ply`` and so on, and ``mesh.json``
+    folder: Path  # with ``mesh.ply`` and so on, the texture where there is one, and ``mesh.json``
     mesh: TriangleMesh  # world of the poses, scene units
     comparison: SurfaceComparison | None  # with the true surface, where there is one
 
@@ -67,7 +67,7 @@ def mesh_run(
         mesh = fused.mesh
         compared = None if surface is None else compare_meshes(mesh, surface)
         for name in formats:
-            write_mesh(folder / f"mesh.{name}", mesh)
+            write_mesh(folder / f"mesh.{name}", mesh, fused.texture)
         if surface is not None:
             _write_comparison(folder, mesh, surface, scene)
         write_json(folder / "mesh.json", _summary(trained, fused, settings, surface, compared))
@@ -146,6 +146,7 @@ def _summary(
         "vertices": len(mesh.vertices),
         "triangles": len(mesh),
         "holes_closed": fused.holes,
+        "texture": None if fused.texture is None else fused.texture.image.shape[0],
         "area": float(mesh.areas.sum()),
         "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
         "truth": None if truth is None else _relative_path(truth.path, scene),

@@ -10,7 +10,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS, read_mesh, write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 
 
 @pytest.fixture(params=[True, False], ids=["coloured", "plain"])
@@ -35,6 +35,28 @@ def test_a_mesh_is_read_as_it_was_written(mesh, suffix, tmp_path):
         apart = np.abs(read.colors[read.triangles].astype(int) - mesh.colors[mesh.triangles])
         assert apart.max() <= (13 if suffix == "glb" else 0)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_others_find_the_colours_of_a_texture(mesh, suffix, tmp_path):
+    """Each corner at a texel of its own."""
+    trimesh = pytest.importorskip("trimesh")
+    generator = np.random.default_rng(5)
+    image = generator.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    column, row = generator.integers(0, 30, (len(mesh), 3)), generator.integers(0, 20, (len(mesh), 3))
+    corners = np.stack([(column + 0.5) / 30.0, 1.0 - (row + 0.5) / 20.0], axis=-1)
+    write_mesh(tmp_path / f"mesh.{suffix}", mesh, Texture(image, corners))
+    files = {"obj": {"mesh.obj", "mesh.mtl", "mesh.png"}, "glb": {"mesh.glb"}}[suffix]
+    assert {file.name for file in tmp_path.iterdir()} == files
+    read = trimesh.load_mesh(tmp_path / f"mesh.{suffix}", process=False)
+    material = read.visual.material
+    found = np.asarray((material.baseColorTexture if suffix == "glb" else material.image).convert("RGB"))
+    assert np.array_equal(found, image)
+    assert read.vertices[read.faces] == pytest.approx(mesh.vertices[mesh.triangles], abs=1e-5)
+    u, v = np.moveaxis(read.visual.uv[read.faces], -1, 0)
+    colors = found[(20 * (1.0 - v)).astype(int), (30 * u).astype(int)]
+    assert np.array_equal(colors, image[row, column])
+    assert read_mesh(tmp_path / f"mesh.{suffix}").colors is None
 
 
 def test_glb_is_gltf_2(mesh, tmp_path):

@@ -12,9 +12,11 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.settings import validated
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.meshing import fusion
 from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
+from coliags_plugin.surface.meshing.texturing import best_texture
 from coliags_plugin.surface.meshing.views import incidence_cosines, rendered_depth
 from tests.scenes import camera_at, wall_color, wall_scene
 from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run
@@ -27,6 +29,27 @@ def test_a_wall():
     assert (mesh.normals[:, 2] < -0.99).all()
     expected = wall_color(torch.from_numpy(mesh.vertices)).numpy()
     assert np.abs(mesh.colors / 255.0 - expected).max() < 0.01
+
+
+def test_a_texture_of_a_wall():
+    """At the centres of triangles, between vertices, it has the colour of the wall."""
+    run = exact_run(scene=wall_scene(17, 160, 120, lamp=False))
+    fused = fuse_run(run, MeshSettings(voxel_size=1.0, texture=4.0))
+    image, corners = fused.texture.image, fused.texture.corners
+    size = np.sqrt(fused.mesh.areas.sum() / 0.6) / 0.25
+    assert image.shape == (int(np.ceil(size)), int(np.ceil(size)), 3)
+    u, v = corners.mean(axis=1).T
+    found = image[(len(image) * (1.0 - v)).astype(int), (len(image) * u).astype(int)] / 255.0
+    apart = np.abs(found - wall_color(torch.from_numpy(fused.mesh.centers)).numpy())
+    assert apart.mean() < 0.02 and np.quantile(apart, 0.999) < 0.06
+    assert fuse_run(run, MeshSettings(voxel_size=1.0)).texture is None
+
+
+def test_edges_of_three_triangles_cannot_be_textured():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+    fan = TriangleMesh(vertices, np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
+    with pytest.raises(InputError, match="1 edges of the mesh have more than two triangles"):
+        best_texture(fan, 0.1, [], lambda view: view.frame.image)
 
 
 def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():

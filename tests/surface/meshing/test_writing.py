@@ -65,6 +65,15 @@ def test_without_truth(tmp_path):
     assert json.loads((made.folder / "mesh.json").read_text())["comparison"] is None
 
 
+def test_with_a_texture(tmp_path):
+    made = mesh_run(exact_run(frames=9), tmp_path / "mesh", MeshSettings(voxel_size=1.0, texture=2.0))
+    names = {"mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.glb", "mesh.json"}
+    assert {path.name for path in made.folder.iterdir()} == names
+    size = json.loads((made.folder / "mesh.json").read_text())["texture"]
+    assert read_rgb(made.folder / "mesh.png").shape == (size, size, 3)
+    assert read_mesh(made.folder / "mesh.ply").colors is not None, "PLY keeps colours at vertices"
+
+
 def test_truth_beside_the_scene_is_found(tmp_path):
     (tmp_path / "scene/truth").mkdir(parents=True)
     write_mesh(tmp_path / "scene/truth/mesh.ply", wall_mesh())
