@@ -48,17 +48,21 @@ def loops(mesh: TriangleMesh) -> Iterator[Int[np.ndarray, "L"]]:
         follows.setdefault(first, []).append(second)
     while follows:
         path = [next(iter(follows))]
+        places = {path[0]: 0}
         while path[-1] in follows:
             ahead = follows[path[-1]]
             following = ahead.pop()
             if not ahead:
                 del follows[path[-1]]
-            if following in path:
-                start = path.index(following)
-                yield np.array(path[start:])
-                del path[start + 1 :]
-            else:
+            if following not in places:
+                places[following] = len(path)
                 path.append(following)
+                continue
+            start = places[following]
+            yield np.array(path[start:])
+            for vertex in path[start + 1 :]:
+                del places[vertex]
+            del path[start + 1 :]
 
 
 def _length(loop: Float[np.ndarray, "L 3"]) -> float:
