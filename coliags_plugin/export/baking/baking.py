@@ -169,7 +169,7 @@ def bake(
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
     that are others in every view, or where only ``most`` of them may be kept, those with the largest blending weights
     are fitted to what the run renders, for so many seconds at most
-    (:mod:`~coliags_plugin.export.baking.distillation`).
+    (:mod:`~coliags_plugin.export.baking.distillation`): 80 % of the weights, as fewer Gaussians allow more steps.
     """
     scale, light = trained.model.scale, None if light is None else light.scaled(trained.model.scale)
     trained = trained.in_model_units
@@ -185,9 +185,8 @@ def bake(
         kept = averages.heaviest(most)
     made = field()
     if needs_distillation(made, trained, light):
-        if most is None:
-            kept = averages.heaviest(visible, _FITTED_SHARE)
-            made = field()
+        kept = averages.heaviest(len(kept), _FITTED_SHARE)
+        made = field()
         steps = distil(made, trained, light, seconds)
     facts = {"views": len(views), "visible": visible, "steps": steps, "seconds": seconds}
     return cloud_of_field(made).scaled(1.0 / scale), facts

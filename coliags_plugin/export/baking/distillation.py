@@ -30,7 +30,7 @@ from coliags_plugin.renderers.choice import choose_renderer
 STEPS = 3000
 #: Adam's rates by parameter group at the first step; centres' in pixels on the surface. At the last step they are
 #: _LAST of that.
-_RATES = {"means": 0.06, "scales": 0.03, "quats": 0.015, "opacities": 0.15, "sh0": 0.015, "shN": 0.00075}
+_RATES = {"means": 0.2, "scales": 0.08, "quats": 0.04, "opacities": 0.15, "sh0": 0.04, "shN": 0.00075}
 _LAST = 0.06
 #: Weights of squared colour errors, and of depth errors in pixels on the surface, beside absolute colour errors.
 _SQUARED, _DEPTH = 200.0, 0.004
@@ -43,7 +43,7 @@ _SHIFT, _TURN = 0.3, 0.03
 _COMPARED, _MUCH = 8, 1.047
 #: How much larger this error may be, as a multiple of the run's, where a view starts than where it is least: 1 dB.
 _NEARLY = 1.26
-#: Memory for targets of training views.
+#: Memory for targets.
 _TARGET_BYTES = 1 << 30
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
@@ -63,8 +63,8 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
 
     Most of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
     the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
-    renders beside them: between neighbouring cameras, moved and turned a little. It ends after so many seconds, or
-    :data:`STEPS`.
+    renders beside them, from as many cameras: between neighbouring ones, moved and turned a little. It ends after so
+    many seconds, or :data:`STEPS`.
     """
     renderer = splatting_of(model_of_gaussians(field, trained))
     unit = trained.scene.pixel_footprint
@@ -73,24 +73,27 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
     groups = [{"params": [getattr(field, name)], "name": name} for name in rates]
     adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
     frames = _some_frames(trained.scene.train)
-    cameras = [adjusted_camera(trained, frame) for frame in trained.scene.train]
-    targets: dict[int, _Target] = {}
-    order: list[int] = []
     chance = generators(trained.seed)["frame_order"]
+    cameras = [adjusted_camera(trained, frame) for frame in trained.scene.train]
+    nearby = [beside(cameras, chance) for _ in frames]
+    targets: dict[int, _Target] = {}  # of frames, then of cameras beside them
+    order: list[int] = []
     start, step = time.monotonic(), 0
     with ProgressReport("fit to what the run renders", STEPS) as progress:
         while (done := max(step / STEPS, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
             step += 1
             if float(torch.rand((), generator=chance)) < _BESIDE:
-                camera = beside(cameras, chance)
-                held = _held(trained, camera, light)
-                target = _Target(camera, held[0], held[1])
+                index = len(frames) + int(torch.randint(len(nearby), (), generator=chance))
             else:
                 order = order or torch.randperm(len(frames), generator=chance).tolist()
                 index = order.pop()
-                if index not in targets:
+            if index not in targets:
+                if index < len(frames):
                     targets[index] = _target(trained, frames[index], light)
-                target = targets[index]
+                else:
+                    camera = nearby[index - len(frames)]
+                    targets[index] = _Target(camera, *_held(trained, camera, light))
+            target = targets[index]
             output = renderer.draw(field.gaussians(target.camera), target.camera, _WANTS)
             errors = output.rgb - target.rgb
             colors = masked_mean(errors.abs() + _SQUARED * errors.square(), target.mask)
@@ -122,9 +125,9 @@ def beside(cameras: Sequence[Camera], generator: torch.Generator) -> Camera:
 
 
 def _some_frames(frames: list[Frame]) -> list[Frame]:
-    """Evenly spaced frames, so many that their targets fit into memory."""
+    """Evenly spaced frames, so many that their targets, and as many beside them, fit into memory."""
     height, width = frames[0].camera.height, frames[0].camera.width
-    count = max(1, _TARGET_BYTES // (16 * height * width))
+    count = max(1, _TARGET_BYTES // (32 * height * width))
     return frames[:: -(-len(frames) // count)]
 
 
