@@ -42,6 +42,7 @@ class Layer:
     name: str  # what the reader chooses
     about: str  # one line of text that the page shows with it
     packed: Mapping[str, Any]  # JSON values that ``scene.js`` reads
+    legend: Sequence[tuple[str, tuple[int, int, int]]] = ()  # what its colours (RGB) mean
 
     @classmethod
     def of_cloud(cls, name: str, cloud: SplatCloud) -> tuple[Self, SplatCloud]:
@@ -119,7 +120,7 @@ def page_html(
     """
     camera = path.cameras[0]
     scene = {
-        "layers": [{"about": layer.about, **layer.packed} for layer in layers],
+        "layers": [{"about": layer.about, "legend": layer.legend, **layer.packed} for layer in layers],
         "camera": {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
         "frames": path.packed,
         "start": start,

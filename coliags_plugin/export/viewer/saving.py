@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from coliags_plugin.contracts import GaussianField, knows_lamp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
@@ -24,6 +26,7 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
 from coliags_plugin.reporting.html_page import refuse_folder
 from coliags_plugin.reporting.numbers import counted
+from coliags_plugin.surface.coverage.visibility import MAP_LEGEND
 
 #: Largest page, bytes.
 LARGEST_PAGE = 5_000_000
@@ -85,7 +88,9 @@ def _mesh_layer(name: str, mesh: TriangleMesh) -> Layer:
     about = counted(len(mesh), "triangle")
     if name == "mesh":
         return Layer.of_mesh("surface", about, mesh, _SHADE_OF_SURFACE)
-    return Layer.of_mesh(name, f"{about}, for research use only", mesh, _SHADE_OF_MAP)
+    layer = Layer.of_mesh(name, f"{about}, for research use only", mesh, _SHADE_OF_MAP)
+    there = set() if mesh.colors is None else set(map(tuple, np.unique(mesh.colors, axis=0).tolist()))
+    return replace(layer, legend=[entry for entry in MAP_LEGEND if entry[1] in there])
 
 
 def _page_of_gaussians(

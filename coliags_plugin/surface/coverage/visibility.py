@@ -217,6 +217,8 @@ _COLORS = ((213, 62, 0), (95, 75, 139), (240, 200, 66), (150, 200, 190))
 #: Not seen and not reconstructed either: a guess of where the surface is.
 GUESS_LABEL = "not seen, place guessed"
 GUESS_COLOR = (122, 20, 20)
+#: Labels and colours (RGB) of maps, what was seen first.
+MAP_LEGEND = [*((level.label, level.color) for level in reversed(Level)), (GUESS_LABEL, GUESS_COLOR)]
 
 
 def classify(views: FaceViews, settings: CoverageSettings) -> UInt8[np.ndarray, "F"]:

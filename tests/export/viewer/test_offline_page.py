@@ -162,7 +162,8 @@ def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree):
 def test_layers_path_and_looking_around(browser, tmp_path, width):
     page = tmp_path / "page.html"
     flat = replace(CUBE, colors=np.full((8, 3), (250, 10, 30), np.uint8))
-    layers = gaussians(cloud_of(50, 0), "many"), Layer.of_mesh("surface", "6 triangles", flat, 0.0)
+    surface = replace(Layer.of_mesh("surface", "6 triangles", flat, 0.0), legend=[("red wall", (250, 10, 30))])
+    layers = gaussians(cloud_of(50, 0), "many"), surface
     page.write_text(page_of(*layers), encoding="utf-8")
     browser.open(page, width, 600, phone=width < 500)
     drawn(browser, tmp_path / "seen.png")
@@ -170,6 +171,8 @@ def test_layers_path_and_looking_around(browser, tmp_path, width):
     browser.run("(s => (s.value = 0, s.dispatchEvent(new Event('input'))))(byId('frame'))")
     seen = drawn(browser, tmp_path / "seen.png") if width >= 500 else None
     assert browser.run("byId('about').textContent") == "6 triangles"
+    assert browser.run("byId('legend').textContent") == "red wall"
+    assert browser.run("byId('legend').querySelector('i').style.background") == "rgb(250, 10, 30)"
     if seen is not None:
         _, camera = as_canvas(FRAMES[0].camera, seen.shape)
         pixels, _ = camera.project(torch.tensor([[1.0, 1.0, 8.0]]))

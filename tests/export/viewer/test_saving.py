@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from html import unescape
 
 import numpy as np
@@ -15,6 +16,7 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.saving import scene_page
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.visibility import Level
 from tests.commands import refused, run
 
 
@@ -102,4 +104,14 @@ def test_meshes_of_the_run_are_layers_of_the_page(run_of):
     write_mesh(run.path / "mesh" / "mesh.ply", mesh)
     text = scene_page(run.load()).html
     assert re.findall(r'value="\d"[^>]*>([\w ]+)</label>', text) == ["Gaussians", "surface"]
-    assert '"about":"1 triangle"' in text
+    assert '"about":"1 triangle","legend":[]' in text
+
+
+def test_maps_of_coverage_have_a_legend_of_the_colours_that_they_have(run_of):
+    run = run_of("2dgs")
+    colors = np.array([Level.SEEN.color, Level.SEEN.color, Level.UNSEEN.color], np.uint8)
+    file = run.path / "coverage" / "coverage.ply"
+    write_mesh(file, TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), colors))
+    text = scene_page(run.load()).html
+    shutil.rmtree(file.parent)
+    assert '"legend":[["seen",[150,200,190]],["not seen",[213,62,0]]]' in text

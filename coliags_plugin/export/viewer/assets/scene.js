@@ -347,6 +347,14 @@ function nearestFrame({ center, axes }) {
 
 // ---- Page
 
+/** A colour (RGB) and what it means. */
+function legendItem([label, color]) {
+  const item = document.createElement("li"), swatch = document.createElement("i");
+  swatch.style.background = `rgb(${color})`;
+  item.append(swatch, label);
+  return item;
+}
+
 async function start() {
   const canvas = byId("canvas"), slider = byId("frame"), play = byId("play");
   const gl = canvas.getContext("webgl2", { alpha: false });
@@ -400,6 +408,13 @@ async function start() {
     changed();
   }
 
+  function choose(index) {
+    chosen = index;
+    byId("about").textContent = scene.layers[index].about;
+    byId("legend").replaceChildren(...scene.layers[index].legend.map(legendItem));
+    changed();
+  }
+
   function pause() {
     isPlaying = false;
     play.textContent = "Play";
@@ -425,11 +440,7 @@ async function start() {
   });
   slider.addEventListener("input", () => { pause(); goTo(Number(slider.value)); });
   for (const radio of document.querySelectorAll("input[name=layer]"))
-    radio.addEventListener("change", () => {
-      chosen = Number(radio.value);
-      byId("about").textContent = scene.layers[chosen].about;
-      changed();
-    });
+    radio.addEventListener("change", () => choose(Number(radio.value)));
 
   const pointers = new Map();
   canvas.addEventListener("pointerdown", (event) => {
@@ -461,6 +472,7 @@ async function start() {
   }, { passive: false });
 
   new ResizeObserver(changed).observe(canvas);
+  choose(0);
   goTo(scene.start);
 }
 
