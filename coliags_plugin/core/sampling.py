@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def bilinear(image: Float[Tensor, "H W C"], pixels: Float[Tensor, "A B 2"]) -> Float[Tensor, "A B C"]:
-    """The image at columns and rows, bilinearly; beyond the edge what is at the edge. Pixel centres: integers + 0.5."""
+    """Sample an image bilinearly at columns and rows, clamped at its edges; pixel centres are at integers + 0.5."""
     size = torch.tensor([image.shape[1], image.shape[0]], dtype=pixels.dtype, device=pixels.device)
     grid = (2.0 * pixels / size - 1.0).to(image)[None]
     planes = image.permute(2, 0, 1)[None]

@@ -55,9 +55,9 @@ class FrameRows:
         return self._rows_by_time[before], self._rows_by_time[after], share
 
     def interpolated(self, values: Float[Tensor, "F *S"], view: View) -> Float[Tensor, "*S"]:
-        """Of values of the training frames, a training frame's own, or what lies between those around a view in time.
+        """Per-frame values at a view: its own, or interpolated in time where it is no training frame.
 
-        The neighbours are those of :meth:`neighbours`. [*S]
+        Linearly between those of its :meth:`neighbours`. [*S]
         """
         row = self.row(view)
         if row is not None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.images import write_image
 from coliags_plugin.reconstruction.libraries import quiet_colmap
-from coliags_plugin.reconstruction.structure import joining
+from coliags_plugin.reconstruction.structure import joining, sfm
 from coliags_plugin.reconstruction.structure.atlas import part_of
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis
 from coliags_plugin.reconstruction.structure.image_files import list_images
@@ -92,6 +92,14 @@ def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatc
         (np.array(cameras) - MOVE) @ TURN / SCALE,
         atol=0.03 * np.ptp(cameras, axis=0).max() / SCALE,
     )
+
+
+def test_what_is_split_and_joined_again_is_told_as_joined(tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm, "rigid_frames", lambda model, tracks: HALF)
+    atlas = reconstruct(images_of(tmp_path, tube_frames(COUNT, 1.0)), TRACKED)
+    assert [model.registered for model in atlas.models] == [tuple(range(COUNT))]
+    assert [(link.after, link.again.before) for link in atlas.largest.links if link.again] == [(HALF - 1, HALF)]
+    assert atlas.refused == ()
 
 
 def test_unrelated_walls_are_not_joined(tmp_path):

@@ -141,8 +141,8 @@ def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
 
 
 def _split(mesh: TriangleMesh, texture: Texture) -> tuple[TriangleMesh, Float[np.ndarray, "V 2"]]:
-    """The mesh, without colours, with a vertex for each of its places in the texture, and these places. [V, 2]"""
-    places, of_corner = np.unique(texture.corners.reshape(-1, 2), axis=0, return_inverse=True)
+    """The mesh, without colours, with a vertex for each of its texture coordinates, and these. [V, 2]"""
+    places, of_corner = texture.coordinates
     keys, corners = np.unique(mesh.triangles.ravel() * len(places) + of_corner.ravel(), return_inverse=True)
     vertices, used = np.divmod(keys, len(places))
     return TriangleMesh(mesh.vertices[vertices], corners.reshape(-1, 3)), places[used]
@@ -201,9 +201,9 @@ def encode_obj(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
     if texture is None:
         np.savetxt(text, mesh.triangles + 1, "f %d %d %d")
     else:
-        places, of_corner = np.unique(texture.corners.reshape(-1, 2), axis=0, return_inverse=True)
+        places, of_corner = texture.coordinates
         np.savetxt(text, places, "vt %.6f %.6f")
-        corners = np.stack([mesh.triangles, of_corner.reshape(-1, 3)], axis=-1).reshape(-1, 6)
+        corners = np.stack([mesh.triangles, of_corner], axis=-1).reshape(-1, 6)
         np.savetxt(text, corners + 1, "f %d/%d %d/%d %d/%d")
     return text.getvalue()
 

@@ -54,10 +54,16 @@ class RayScene:
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """An image that covers a mesh, and where its triangles lie in it."""
+    """Texture image of a mesh, and the texture coordinates of its triangles' corners."""
 
     image: UInt8[np.ndarray, "H W 3"]
     corners: Float[np.ndarray, "F 3 2"]  # of the triangles, from 0 to 1: to the right, and upwards from the last row
+
+    @cached_property
+    def coordinates(self) -> tuple[Float[np.ndarray, "P 2"], Int[np.ndarray, "F 3"]]:
+        """The different texture coordinates, and for each triangle the indices of those of its corners."""
+        places, of_corner = np.unique(self.corners.reshape(-1, 2), axis=0, return_inverse=True)
+        return places, of_corner.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +100,13 @@ class TriangleMesh:
 
     @cached_property
     def border(self) -> Int[np.ndarray, "E 2"]:
-        """Edges of one triangle only, in the direction that it has them. [E, 2]"""
+        """Boundary edges, those of one triangle only, as its directed pairs of vertices. [E, 2]"""
         edges, count = np.concatenate([self.triangles[:, [a, (a + 1) % 3]] for a in range(3)]), len(self.vertices)
         return edges[~np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])]
 
     @cached_property
     def on_border(self) -> Bool[np.ndarray, "V"]:
-        """Vertices of the border. [V]"""
+        """Whether vertices are on the border. [V]"""
         found = np.zeros(len(self.vertices), bool)
         found[self.border] = True
         return found

@@ -56,7 +56,7 @@ class Again:
 
 @dataclass(frozen=True)
 class Link:
-    """A place at which few points link the sides of a model, models were joined, or a model of what moves was split.
+    """Link between the frames before and after a weak, joined or split place of a model.
 
     ``log_scale`` is the natural logarithm of the ratio of the depths that either side gives by itself to the same
     points, and ``uncertainty`` its standard error; None where too few points can be compared.

@@ -334,7 +334,7 @@ def _joined(
 
 
 def _is_rigid(joined: Hypothesis, video: MatchedVideo) -> bool:
-    """Whether what a model shows hardly moves while it is seen."""
+    """Whether a model has no more frames than its scene is rigid for (:func:`rigid_frames`)."""
     longest = rigid_frames(joined.model, video.tracks)
     return longest is None or joined.images <= longest
 

@@ -52,7 +52,7 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
 
 
 def rigid_frames(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> int | None:
-    """Largest number of frames over which what a model shows is rigid; None: its :func:`rigidity` sets no limit.
+    """Maximum number of frames of a model for its scene to count as rigid; None: no limit by its :func:`rigidity`.
 
     No frame is farther from the middle one than residuals take to reach three times that of neighbours and 0.007 of
     the focal length.

@@ -236,6 +236,7 @@ def _atlas(
     parts = [Part(one, {}) for one in kept]
     if video.tracks:
         video, parts, apart = join_models(video, kept, settings, masks, progress)
+    refused = [link for link in refused if not any(link.after in part.joins for part in parts)]  # not joined again
     found = [_result(video, part.hypothesis, _links(part) if video.tracks else ()) for part in parts]
     found.sort(key=lambda one: -len(one.registered))
     posed = {index for one in found for index in one.registered}
@@ -259,7 +260,7 @@ def _atlas(
 
 
 def _rigid_stretches(one: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothesis], list[Link]]:
-    """The model, or stretches of it as short as the motion of what they show demands, and the places between these."""
+    """Split a model into stretches no longer than its scene is rigid (:func:`rigid_frames`), and link these."""
     longest = rigid_frames(one.model, video.tracks) if video.tracks else None
     count = 1 if longest is None else min(-(-one.images // longest), one.images // _SHORT)
     if longest is None or count < 2:

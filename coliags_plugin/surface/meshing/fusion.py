@@ -26,7 +26,7 @@ from coliags_plugin.surface.meshing.volume import Volume
 
 @dataclass(frozen=True, eq=False)
 class FusedRun:
-    """The surface of a run."""
+    """Mesh fused from the depth of a run, the number of holes closed in it, and its texture."""
 
     mesh: TriangleMesh
     holes: int  # that were closed

@@ -1,4 +1,4 @@
-"""Smoothing of meshes by as much as they are noisy."""
+"""Laplacian smoothing of meshes, its strength set by their noise."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TOLERANCE, _STEPS = 1e-3, 300
 
 
 def smoothed(mesh: TriangleMesh, strength: float = 1.0) -> TriangleMesh:
-    """The mesh smoothed as a plate drawn to its vertices, by as much as it is noisy, but not where it really bends.
+    """Smooth a mesh by least squares of its Laplacian, weighted by its noise and less at creases.
 
     The vertices x minimise the sum of |x - x_0|^2 and, with a weight, of the squared bending |x - mean of the
     neighbours|^2. The weight is in proportion to ``strength`` and to the variance of the bending of x_0, most of which
@@ -56,7 +56,7 @@ def _along_normals(mesh: TriangleMesh, bends: csr_array) -> Float[np.ndarray, "V
 
 
 def bending(mesh: TriangleMesh, bent: Bool[np.ndarray, "V"]) -> csr_array:
-    """Matrix that takes vertices to their differences from the mean of their neighbours; 0 where not bent. [V, V]"""
+    """Uniform Laplacian of a mesh, each vertex minus the mean of its neighbours; rows not ``bent`` are 0. [V, V]"""
     count, corners = len(mesh.vertices), mesh.triangles
     pairs = np.concatenate([corners[:, pair] for pair in permutations(range(3), 2)])
     neighbours = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
