@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from jaxtyping import Float, Int
 from pydantic import Field as Option
 from torch import Tensor, nn
 from typing_extensions import Self
@@ -16,6 +17,11 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+
+#: Ratio of distances to the lamp, and its inverse, beyond which :class:`AttenuatedGaussians` change no further.
+FARTHEST = 2.0
+#: Exponent of the fall of display values, of gamma 2.2, under a lamp whose light falls with the squared distance.
+INVERSE_SQUARE = 2.0 / 2.2
 
 
 class ExplicitGaussiansSettings(ExplicitFieldSettings):
@@ -59,19 +65,47 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
         """The Gaussians in the camera's view with their colours from there."""
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
-        means, scales, quats, opacities, sh0, rest = (
-            self.get_parameter(name).index_select(0, visible) for name in self.row_parameters
+        means, scales, quats, opacities = (
+            self.get_parameter(name).index_select(0, visible) for name in ExplicitField.row_parameters
         )
-        directions = nn.functional.normalize(means - camera.center, dim=1)
         return Gaussians(
             means=means,
             quats_wxyz=quats,
             scales=scales.exp(),
             opacities=opacities.sigmoid(),
-            colors=spherical_harmonics.colors(torch.cat([sh0, rest], dim=1), directions, int(self.degree)),
+            colors=self._colors(visible, means - camera.center),
             source_index=visible,
             visible_sources=visible,
         )
+
+    def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        """Colours of some Gaussians, seen along vectors from the camera's centre to theirs. [V, 3]"""
+        degree = int(self.degree)
+        higher = self.shN[:, : (degree + 1) ** 2 - 1].index_select(0, rows)  # the active ones alone
+        harmonics = torch.cat([self.sh0.index_select(0, rows), higher], dim=1)
+        return spherical_harmonics.colors(harmonics, nn.functional.normalize(sight, dim=1), degree)
+
+
+class AttenuatedGaussians(ExplicitGaussians):
+    """Explicit Gaussians whose colours fall with the distance to a lamp at the camera's centre, each by its own power.
+
+    At a distance d they are (d / D)^-a times what the spherical harmonics give, with d / D no further than
+    :data:`FARTHEST` from 1.
+    """
+
+    row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitGaussians.row_parameters, "exponents")
+
+    distances: Tensor
+
+    def __init__(self, settings: ExplicitGaussiansSettings, count: int) -> None:
+        super().__init__(settings, count)
+        self.exponents = nn.Parameter(torch.full((count, 1), INVERSE_SQUARE))  # a
+        self.register_buffer("distances", torch.ones(count, 1))  # D, scene units
+
+    def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        ratios = sight.detach().norm(dim=1, keepdim=True) / self.distances.index_select(0, rows)
+        factors = ratios.clamp(1.0 / FARTHEST, FARTHEST).pow(-self.exponents.index_select(0, rows))
+        return super()._colors(rows, sight) * factors
 
 
 class Surfels(ExplicitGaussians):

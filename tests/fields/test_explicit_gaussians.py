@@ -11,6 +11,7 @@ import torch
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians
 from coliags_plugin.fields.spherical_harmonics import basis
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
@@ -98,6 +99,29 @@ def test_gradients_of_colours_are_the_basis_and_zero_where_colours_are_cut():
     torch.testing.assert_close(field.shN.grad[rows][:, :8], expected[:, 1:])
     assert not field.shN.grad[:, 8:].any()  # of degree 3, not yet active
     assert not field.sh0.grad[rows[rows % 2 == 0], 0, 1].any()
+
+
+def test_colours_fall_with_the_distance_to_the_lamp():
+    """To the power of each Gaussian's exponent, and no further than at half and twice its own distance."""
+    plain = make()
+    field = AttenuatedGaussians(plain.settings, plain.element_count)
+    zero = torch.zeros_like(field.exponents)
+    field.load_state_dict({**plain.state_dict(), "distances": field.distances, "exponents": zero})
+    camera = camera_at(0.3, -0.2, 1.0)
+    before, distances = plain.gaussians(camera), (plain.means - camera.center.float()).norm(dim=1, keepdim=True)
+    torch.testing.assert_close(field.gaussians(camera).colors, before.colors)
+    rows = before.source_index
+    for ratio, bound in ((1.5, 1.5), (0.8, 0.8), (0.2, 0.5), (9.0, 2.0)):
+        with torch.no_grad():
+            field.exponents.copy_(torch.linspace(-1.0, 3.0, len(distances))[:, None])
+            field.distances.copy_(distances / ratio)
+        seen = field.gaussians(camera)
+        torch.testing.assert_close(seen.colors, before.colors * bound ** -field.exponents[rows])
+        upstream = torch.linspace(0.5, 2.0, seen.colors.numel()).reshape(seen.colors.shape)
+        field.zero_grad()
+        (seen.colors * upstream).sum().backward()
+        expected = -math.log(bound) * (seen.colors * upstream).sum(dim=1, keepdim=True)
+        torch.testing.assert_close(field.exponents.grad[rows], expected)
 
 
 def test_gradients_of_logarithms_and_logits():

@@ -20,9 +20,9 @@ from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import THICKNESS_SHARE
-from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
+from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -62,9 +62,9 @@ class GaussianAverages:
 
         self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
         self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, scales), zeros(slots, 4, 4)
-        self._colors = zeros(slots, 3)
+        self._colors, self._log_distances = zeros(slots, 3), zeros(slots, 1)
 
-    def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
+    def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"], camera: Camera) -> None:
         """Add a view's Gaussians by their :func:`blending_weights`, or other weights."""
         slots = gaussians.source_index
         elements = slots // self._per_element
@@ -76,6 +76,8 @@ class GaussianAverages:
         self._weights.index_add_(0, slots, weights)
         self._means.index_add_(0, slots, weights[:, None] * gaussians.means)
         self._colors.index_add_(0, slots, weights[:, None] * gaussians.colors)
+        distances = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1, keepdim=True)
+        self._log_distances.index_add_(0, slots, weights[:, None] * distances.clamp_min(_NONE).log())
         self._log_scales.index_add_(0, slots, weights[:, None] * gaussians.scales.log())
         self._rotations.index_add_(0, slots, weights[:, None, None] * products)
 
@@ -115,12 +117,19 @@ class GaussianAverages:
         shown = self._element_weights.repeat_interleave(self._per_element)
         return self._opacities / shown.clamp_min(_NONE)
 
-    def field(self, kept: Int[Tensor, "N"], harmonics: Float[Tensor, "N B 3"]) -> ExplicitGaussians:
-        """The averages of some slots as an explicit field, with colours to degree D, B = (D + 1)^2."""
+    def field(
+        self,
+        kept: Int[Tensor, "N"],
+        harmonics: Float[Tensor, "N B 3"],
+        kind: type[ExplicitGaussians] = ExplicitGaussians,
+    ) -> ExplicitGaussians:
+        """The averages of some slots as an explicit field of a kind, with colours to degree D, B = (D + 1)^2."""
         degree = round(harmonics.shape[1] ** 0.5) - 1
-        made = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
+        made = kind(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
         mean = self.gaussians(kept)
         with torch.no_grad():
+            if isinstance(made, AttenuatedGaussians):
+                made.distances.copy_((self._log_distances[kept] / self._weights[kept][:, None]).exp())
             made.means.copy_(mean.means)
             log_scales = self._log_scales[kept] / self._weights[kept][:, None]
             thickness = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)  # of surfels, as in files
@@ -143,8 +152,8 @@ def mean_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Gaussians
     slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
     per_element, scales = field.slots_per_element, views[0].scales.shape[1]
     averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
-    for view in views:
-        averages.add(view, view.opacities)
+    for view, camera in zip(views, cameras, strict=True):
+        averages.add(view, view.opacities, camera)
     return averages.gaussians(averages.visible())
 
 
@@ -153,7 +162,7 @@ _VIEWS, _COLOR_VIEWS = 120, 30
 #: Time for fitting Gaussians to what the run renders, seconds, unless another is given.
 SECONDS = 180.0
 #: Share of all blending weights that the Gaussians hold which are fitted to what the run renders.
-_FITTED_SHARE = 0.8
+_FITTED_SHARE = 0.7
 
 
 def bake(
@@ -162,24 +171,32 @@ def bake(
     seconds: float = SECONDS,
     most: int | None = None,
     degree: int = MAX_DEGREE,
+    kind: type[ExplicitGaussians] = ExplicitGaussians,
 ) -> tuple[SplatCloud, dict[str, Any]]:
-    """One cloud of Gaussians for all views, under a held light, if any, and facts for its record.
+    """One cloud of Gaussians for all views, under a held light, if any, and facts for its record, if it is changed.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
     that are others in every view, or where only ``most`` of them may be kept, those with the largest blending weights
     are fitted to what the run renders, for so many seconds at most
-    (:mod:`~coliags_plugin.export.baking.distillation`): 80 % of the weights, as fewer Gaussians allow more steps.
+    (:mod:`~coliags_plugin.export.baking.distillation`): 70 % of the weights, as fewer Gaussians allow more steps.
+    Explicit Gaussians of which all may be kept are as they are, and surfels, made thin Gaussians that viewers draw with
+    another filter, are fitted so, all of them.
     """
     scale, light = trained.model.scale, None if light is None else light.scaled(trained.model.scale)
     trained = trained.in_model_units
+    if most is None and isinstance(trained.model.field, ExplicitGaussians):
+        made = field_of_cloud(cloud_of_field(trained.model.field).with_thickness(THICKNESS_SHARE))
+        needs = needs_distillation(made, trained, light)
+        facts = {"steps": distil(made, trained, light, seconds), "seconds": seconds} if needs else {}
+        return cloud_of_field(made).scaled(1.0 / scale), facts
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     averages, seen = _averaged(trained, views, light)
     kept = averages.kept()
     visible, steps = len(kept), 0
 
     def field() -> ExplicitGaussians:
-        return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, degree))
+        return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, degree), kind)
 
     if most is not None:
         kept = averages.heaviest(most)
@@ -188,7 +205,7 @@ def bake(
         kept = averages.heaviest(len(kept), _FITTED_SHARE)
         made = field()
         steps = distil(made, trained, light, seconds)
-    facts = {"views": len(views), "visible": visible, "steps": steps, "seconds": seconds}
+    facts = {"steps": steps, "seconds": seconds, "views": len(views), "visible": visible}
     return cloud_of_field(made).scaled(1.0 / scale), facts
 
 
@@ -209,7 +226,7 @@ def _averaged(
             if averages is None:
                 sizes = field.element_count, field.slots_per_element, gaussians.scales.shape[1]
                 averages = GaussianAverages(*sizes, trained.device)
-            averages.add(gaussians, weights)
+            averages.add(gaussians, weights, camera)
             if index % every == 0:
                 seen.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)

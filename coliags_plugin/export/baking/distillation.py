@@ -1,4 +1,4 @@
-"""Distillation of a run into explicit Gaussians: a fit to its renderings along and around the camera path."""
+"""Distillation of a run into explicit Gaussians: a fit to its frames and to its renderings between them."""
 
 from __future__ import annotations
 
@@ -27,17 +27,23 @@ from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.renderers.choice import choose_renderer
 
 #: Steps, one view each, that are taken where the time allows.
-STEPS = 3000
+STEPS = 6000
 #: Adam's rates by parameter group at the first step; centres' in pixels on the surface. At the last step they are
 #: _LAST of that.
-_RATES = {"means": 0.2, "scales": 0.08, "quats": 0.04, "opacities": 0.15, "sh0": 0.04, "shN": 0.00075}
+_RATES = {
+    "means": 0.04,
+    "scales": 0.03,
+    "quats": 0.016,
+    "opacities": 0.1,
+    "sh0": 0.02,
+    "shN": 0.005,
+    "exponents": 0.01,
+}
 _LAST = 0.06
 #: Weights of squared colour errors, and of depth errors in pixels on the surface, beside absolute colour errors.
 _SQUARED, _DEPTH = 200.0, 0.004
-#: Share of the steps on views beside the training views.
-_BESIDE = 0.2
-#: Of such a view: standard deviation of its place, median distances between neighbouring cameras, and of its rotation,
-#: radians.
+#: Of a view beside the training views: standard deviation of its place, median distances between neighbouring cameras,
+#: and of its rotation, radians.
 _SHIFT, _TURN = 0.3, 0.03
 #: Training views, at most, that Gaussians are compared on; and how much larger their squared error may be: 0.2 dB.
 _COMPARED, _MUCH = 8, 1.047
@@ -48,51 +54,49 @@ _TARGET_BYTES = 1 << 30
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
+#: A camera, and the training frame that it took, if any.
+_View = tuple[Camera, Frame | None]
+
+
 @dataclass(frozen=True)
 class _Target:
-    """A view in the held light."""
+    """What Gaussians are fitted to in a view, in the held light."""
 
     camera: Camera
     rgb: Float[Tensor, "H W 3"]
-    depth: Float[Tensor, "H W"]  # accumulated depth that the run renders
-    mask: Bool[Tensor, "H W"] | None = None
+    depth: Float[Tensor, "H W"]  # accumulated, as the run renders it
+    mask: Bool[Tensor, "H W"] | None
+    error: Float[Tensor, ""]  # mean squared error of the run: 0 between training frames
 
 
 def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float) -> int:
     """Fit explicit Gaussians, in place, to renderings of a run in a held light; returns the number of steps.
 
-    Most of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
+    Half of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
     the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
-    renders beside them, from as many cameras: between neighbouring ones, moved and turned a little. It ends after so
-    many seconds, or :data:`STEPS`.
+    renders beside them: between neighbouring ones, moved and turned a little. It ends after so many seconds, or
+    :data:`STEPS`.
     """
     renderer = splatting_of(model_of_gaussians(field, trained))
     unit = trained.scene.pixel_footprint
     unit = unit if unit > 0 else 1.0  # without points it is NaN
-    rates = {**_RATES, "means": _RATES["means"] * unit}
+    rates = {name: _RATES[name] * (unit if name == "means" else 1.0) for name in field.row_parameters}
     groups = [{"params": [getattr(field, name)], "name": name} for name in rates]
     adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
-    frames = _some_frames(trained.scene.train)
     chance = generators(trained.seed)["frame_order"]
     cameras = [adjusted_camera(trained, frame) for frame in trained.scene.train]
-    nearby = [beside(cameras, chance) for _ in frames]
-    targets: dict[int, _Target] = {}  # of frames, then of cameras beside them
+    views: list[_View] = [*_some([*zip(cameras, trained.scene.train, strict=True)])]
+    views += _some([(camera, None) for camera in beside(cameras, chance)])
+    targets: dict[int, _Target] = {}
     order: list[int] = []
     start, step = time.monotonic(), 0
     with ProgressReport("fit to what the run renders", STEPS) as progress:
         while (done := max(step / STEPS, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
             step += 1
-            if float(torch.rand((), generator=chance)) < _BESIDE:
-                index = len(frames) + int(torch.randint(len(nearby), (), generator=chance))
-            else:
-                order = order or torch.randperm(len(frames), generator=chance).tolist()
-                index = order.pop()
+            order = order or torch.randperm(len(views), generator=chance).tolist()
+            index = order.pop()
             if index not in targets:
-                if index < len(frames):
-                    targets[index] = _target(trained, frames[index], light)
-                else:
-                    camera = nearby[index - len(frames)]
-                    targets[index] = _Target(camera, *_held(trained, camera, light))
+                targets[index] = _target(trained, *views[index], light)
             target = targets[index]
             output = renderer.draw(field.gaussians(target.camera), target.camera, _WANTS)
             errors = output.rgb - target.rgb
@@ -110,25 +114,23 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
     return step
 
 
-def beside(cameras: Sequence[Camera], generator: torch.Generator) -> Camera:
-    """A random camera between two neighbours of a path, moved and turned a little; of a single camera, beside it."""
-    index = int(torch.randint(max(1, len(cameras) - 1), (), generator=generator))
-    pair = cameras[index : index + 2]
-    share = float(torch.rand((), generator=generator))
-    steps = [float((a.center - b.center).norm()) for a, b in pairwise(cameras)]
-    length = sorted(steps)[len(steps) // 2] if steps else 0.0
-    between = mean_camera(pair, (1.0 - share, share)[: len(pair)])
-    turn, shift = (size * torch.randn(3, generator=generator) for size in (_TURN, _SHIFT * length))
-    like = cameras[0].camera_to_world
-    moved = between.moved(turn, shift, 0.0)
-    return replace(moved, camera_to_world=moved.camera_to_world.to(like))
+def beside(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera]:
+    """A random camera between each two neighbours of a path, moved and turned a little; one beside a single camera."""
+    pairs = list(pairwise(cameras)) or [(cameras[0], cameras[0])]
+    steps = sorted(float((a.center - b.center).norm()) for a, b in pairs)
+    made = []
+    for pair in pairs:
+        share = float(torch.rand((), generator=generator))
+        turn, shift = (size * torch.randn(3, generator=generator) for size in (_TURN, _SHIFT * steps[len(steps) // 2]))
+        moved = mean_camera(pair, (1.0 - share, share)).moved(turn, shift, 0.0)
+        made.append(replace(moved, camera_to_world=moved.camera_to_world.to(pair[0].camera_to_world)))
+    return made
 
 
-def _some_frames(frames: list[Frame]) -> list[Frame]:
-    """Evenly spaced frames, so many that their targets, and as many beside them, fit into memory."""
-    height, width = frames[0].camera.height, frames[0].camera.width
-    count = max(1, _TARGET_BYTES // (32 * height * width))
-    return frames[:: -(-len(frames) // count)]
+def _some(views: list[_View]) -> list[_View]:
+    """Evenly spaced views, so many that the targets of twice as many fit into memory."""
+    count = max(1, _TARGET_BYTES // (32 * views[0][0].height * views[0][0].width))
+    return views[:: -(-len(views) // count)]
 
 
 def needs_distillation(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> bool:
@@ -158,30 +160,22 @@ def _compared(
     renderer = splatting_of(model_of_gaussians(field, trained))
     rows = []
     for frame in frames:
-        target = _target(trained, frame, light)
-        held, _ = _held(trained, target.camera, light)
+        target = _target(trained, adjusted_camera(trained, frame), frame, light)
         shown = renderer.draw(field.gaussians(target.camera), target.camera, ("rgb", "alpha")).rgb
-        errors = [masked_mean((rgb - target.rgb).square(), target.mask) for rgb in (held, shown)]
-        rows.append(torch.stack([*errors, target.depth.median()]))
+        error = masked_mean((shown - target.rgb).square(), target.mask)
+        rows.append(torch.stack([target.error, error, target.depth.median()]))
     return torch.stack(rows)
 
 
 @torch.no_grad()
-def _target(trained: TrainedRun, frame: Frame, light: HeldLight | None) -> _Target:
-    placed = frame.to(trained.device)
-    camera = adjusted_camera(trained, frame)
-    rgb, depth = _held(trained, camera, light)
-    missed = placed.rgb - render_view(trained, placed, ("rgb", "alpha")).rgb
-    return _Target(camera, rgb + missed, depth, placed.mask)
-
-
-@torch.no_grad()
-def _held(
-    trained: TrainedRun, camera: Camera, light: HeldLight | None
-) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
-    """Colours and accumulated depth that a run renders in the held light."""
+def _target(trained: TrainedRun, camera: Camera, frame: Frame | None, light: HeldLight | None) -> _Target:
     output = render_held(trained.model, camera, light, _WANTS)
-    return output.rgb, output["depth_accumulated"]
+    rgb, depth = output.rgb, output["depth_accumulated"]
+    if frame is None:
+        return _Target(camera, rgb, depth, None, rgb.new_zeros(()))
+    placed = frame.to(trained.device)
+    missed = placed.rgb - render_view(trained, placed, ("rgb", "alpha")).rgb
+    return _Target(camera, rgb + missed, depth, placed.mask, masked_mean(missed.square(), placed.mask))
 
 
 def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:

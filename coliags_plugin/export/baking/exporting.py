@@ -23,10 +23,9 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import SECONDS, bake
-from coliags_plugin.export.baking.distillation import model_of_gaussians
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
+from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
+from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, write_splats
-from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.reporting.numbers import counted
 
@@ -62,9 +61,10 @@ def export_run(
 ) -> list[Exported]:
     """Write the Gaussians of a run to files by their formats, and ``FILE.json`` beside each.
 
-    Explicit fields are written as they are. Fields that decode Gaussians for each view, or light them, are baked
-    (:func:`~coliags_plugin.export.baking.baking.bake`) once, under a light that is held, given by its name; it has no
-    effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out views.
+    Explicit Gaussians are written as they are. Surfels, and Gaussians that a field decodes for each view, or lights,
+    are baked (:func:`~coliags_plugin.export.baking.baking.bake`) once, under a light that is held, given by its name;
+    it has no effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out
+    views.
     """
     for form, output in outputs.items():
         check_format(form)
@@ -74,15 +74,10 @@ def export_run(
                     f"{target} already exists", "a new file", "Choose another --output, or pass --overwrite"
                 )
     field = _gaussian_field(trained)
-    held: HeldLight | None = None
-    baking: dict[str, Any] | None = None
-    if isinstance(field, ExplicitGaussians):
-        cloud = cloud_of_field(field).scaled(1.0 / trained.model.scale)
-    else:
-        baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-        held = baked_in if knows_lamp(field) else None
-        cloud, facts = bake(trained, baked_in, seconds)
-        baking = {"light": light_facts(light, field, baked_in), **facts}
+    baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
+    held = baked_in if knows_lamp(field) else None
+    cloud, facts = bake(trained, baked_in, seconds)
+    baking = {"light": light_facts(light, field, baked_in), **facts} if facts else None
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
     return [_written(trained, cloud, form, output, baking, held, measure) for form, output in outputs.items()]
 
@@ -177,6 +172,8 @@ _METRICS = ("psnr", "depth_mse")
 def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> dict[str, dict[str, Any]]:
     """Compare a cloud with its run on every held-out view, by the run's protocol; means per test set.
 
+    Views are where the run's view modules place them.
+
     Where a lamp moves with the camera, no cloud can show recorded frames: it is compared under the held light, with the
     frames brought to that light: the run's own render there, plus what the run's render misses of the frame. By that
     the run's PSNR is that of its evaluation, and the cloud's differs by baking alone.
@@ -213,6 +210,7 @@ def _scores(
 ) -> dict[str, dict[str, float]]:
     """Values by metric, of ``run``, ``export``, ``between`` and ``recorded``."""
     run = scorer.protocol.compare(scorer.render(trained.model, frame), frame)
+    frame = replace(frame, camera=adjusted_camera(trained, frame))
     export = scorer.protocol.compare(scorer.render(baked, frame), frame)
     held = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
     at_light = held.rgb + (run.true_rgb - run.rgb)

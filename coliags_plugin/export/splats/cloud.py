@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32
 from coliags_plugin.core import bounds
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import rotation_matrices
-from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
+from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
 #: Opacities are kept this far from 0 and 1, where their logits would be infinite.
@@ -32,6 +32,9 @@ class SplatCloud:
     scales: Float32[np.ndarray, "N S"]  # standard deviations along the local axes, three; two for surfels
     opacities: Float32[np.ndarray, "N"]  # in [0, 1]
     harmonics: Float32[np.ndarray, "N B 3"]  # coefficients of spherical harmonics to degree D, B = (D + 1)^2
+    # of colours that follow a lamp at the camera: distances where they are as given, scene units, and the exponents of
+    # their fall (:class:`~coliags_plugin.fields.explicit_gaussians.AttenuatedGaussians`); no file format keeps them
+    attenuation: Float32[np.ndarray, "N 2"] | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -80,20 +83,29 @@ class SplatCloud:
 
     def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
         """Some of the Gaussians."""
-        return SplatCloud(*(values[kept] for values in vars(self).values()))
+        return SplatCloud(**{name: values[kept] for name, values in self._arrays().items()})
 
     def scaled(self, factor: float) -> SplatCloud:
         """The Gaussians in a world whose lengths are ``factor`` times as large."""
-        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
+        lengths = {"means": self.means, "scales": self.scales}
+        scaled = {name: values * np.float32(factor) for name, values in lengths.items()}
+        if self.attenuation is not None:
+            scaled["attenuation"] = self.attenuation * np.array([factor, 1.0], np.float32)
+        return replace(self, **scaled)
 
     def concat(self, others: SplatCloud) -> SplatCloud:
         """These Gaussians and others, of as many scales and harmonics."""
-        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
-        return SplatCloud(*(np.concatenate(pair) for pair in pairs))
+        return SplatCloud(
+            **{name: np.concatenate([values, getattr(others, name)]) for name, values in self._arrays().items()}
+        )
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """The arrays that it has, by the names of their fields."""
+        return {name: values for name, values in vars(self).items() if values is not None}
 
     def _finite(self) -> Bool[np.ndarray, "N"]:
         """Which have a rotation and finite numbers only. [N]"""
-        finite = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in vars(self).values()]
+        finite = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in self._arrays().values()]
         with np.errstate(over="ignore", invalid="ignore"):
             turned = np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24
         return np.all([*finite, turned], axis=0)
@@ -128,11 +140,10 @@ def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:
     """The Gaussians, or surfels, of a field, with the harmonics that are active."""
     active = (int(field.degree) + 1) ** 2
     harmonics = torch.cat([field.sh0, field.shN], dim=1)[:, :active]
-    parts = (field.means, field.quats, field.scales.exp(), field.opacities.sigmoid(), harmonics)
-    means, quats, scales, opacities, coefficients = (
-        np.ascontiguousarray(part.detach().cpu().float().numpy()) for part in parts
-    )
-    return SplatCloud(means, quats, scales, opacities, coefficients)
+    parts = [field.means, field.quats, field.scales.exp(), field.opacities.sigmoid(), harmonics]
+    if isinstance(field, AttenuatedGaussians):
+        parts.append(torch.cat([field.distances, field.exponents], dim=1))
+    return SplatCloud(*(np.ascontiguousarray(part.detach().cpu().float().numpy()) for part in parts))
 
 
 def load_cloud(field: ExplicitGaussians, cloud: SplatCloud) -> None:
@@ -150,6 +161,13 @@ def load_cloud(field: ExplicitGaussians, cloud: SplatCloud) -> None:
 
 def field_of_cloud(cloud: SplatCloud) -> ExplicitGaussians:
     """A cloud of Gaussians with three scales each as a field."""
-    field = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=cloud.degree), len(cloud))
+    settings = ExplicitGaussiansSettings(sh_degree=cloud.degree)
+    if cloud.attenuation is None:
+        field = ExplicitGaussians(settings, len(cloud))
+    else:
+        field = AttenuatedGaussians(settings, len(cloud))
+        with torch.no_grad():
+            for column, values in enumerate((field.distances, field.exponents)):
+                values.copy_(torch.from_numpy(cloud.attenuation[:, column : column + 1]))
     load_cloud(field, cloud)
     return field

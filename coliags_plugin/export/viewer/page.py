@@ -8,13 +8,14 @@ import tempfile
 import zlib
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float32
 from markupsafe import Markup
 from typing_extensions import Self
 
@@ -22,6 +23,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.splats.packed import read_splat_spz, write_spz
+from coliags_plugin.fields.explicit_gaussians import FARTHEST
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array, encode_jpeg
 from coliags_plugin.reporting.html_page import environment
@@ -32,6 +34,8 @@ _PICTURES, _WIDTH, _QUALITY = 240, 256, 80
 _RATE = 10.0
 #: Reach of a cloud in SPZ, whose positions are multiples of 1/4096 up to 2048.
 _REACH = 1024.0
+#: Share of the Gaussians, at either end, whose distance to the lamp, or exponent, is brought to those of the others.
+_RARE = 0.001
 _ASSETS = Path(__file__).with_name("assets")
 
 
@@ -56,7 +60,11 @@ class Layer:
             file = Path(folder) / "cloud.spz"
             write_spz(file, cloud.scaled(1.0 / unit))
             data, drawn = file.read_bytes(), read_splat_spz(file).scaled(unit)
-        return cls(name, "", {"kind": "gaussians", "unit": unit, "data": b64encode(data).decode("ascii")}), drawn
+        packed = {"kind": "gaussians", "unit": unit, "data": b64encode(data).decode("ascii")}
+        if cloud.attenuation is not None:
+            packed["attenuation"], attenuation = _packed_attenuation(cloud.attenuation)
+            drawn = replace(drawn, attenuation=attenuation)
+        return cls(name, "", packed), drawn
 
     @classmethod
     def of_mesh(cls, name: str, about: str, mesh: TriangleMesh, shade: float) -> Self:
@@ -133,6 +141,21 @@ def page_html(
     style, script = (Markup((_ASSETS / f"scene.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
     values = {"title": title, "layers": layers, "frames": len(path.frames), "scene": text}
     return environment(_ASSETS).get_template("scene.html").render(**values, style=style, script=script)
+
+
+def _packed_attenuation(
+    attenuation: Float32[np.ndarray, "N 2"],
+) -> tuple[dict[str, Any], Float32[np.ndarray, "N 2"]]:
+    """Logarithms of distances, and exponents, as bytes between bounds for the page, and what these stand for."""
+    values = np.stack([np.log(attenuation[:, 0]), attenuation[:, 1]])
+    low, high = np.quantile(values, (_RARE, 1.0 - _RARE), axis=1)
+    span = np.maximum(high - low, np.finfo(np.float32).tiny)
+    levels = np.rint((np.clip((values.T - low) / span, 0.0, 1.0)) * 255.0)
+    logs, exponents = (low + span / 255.0 * levels).T
+    data = b64encode(zlib.compress(levels.T.astype(np.uint8).tobytes(), 9)).decode("ascii")
+    rounded = np.stack([np.exp(logs), exponents], axis=1).astype(np.float32)
+    packed = {"low": low.tolist(), "span": span.tolist(), "farthest": math.log(FARTHEST), "data": data}
+    return packed, rounded
 
 
 def _picture(frame: Frame) -> str:

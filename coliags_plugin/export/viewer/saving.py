@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.viewer.content import NOTHING, ViewerContent, mesh_files
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.export.viewer.splats import most_visible
+from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -30,8 +32,8 @@ from coliags_plugin.surface.coverage.visibility import MAP_LEGEND
 
 #: Largest page, bytes.
 LARGEST_PAGE = 5_000_000
-#: Bytes of a page that a Gaussian takes, about: 20, compressed and in base 64.
-_BYTES = 22
+#: Bytes of a page that a Gaussian takes, about: 22, compressed and in base 64.
+_BYTES = 24
 #: Room for the line about the Gaussians.
 _LINE_BYTES = 2000
 #: How much of the room found in one attempt the next one uses.
@@ -62,9 +64,10 @@ def scene_page(
 ) -> ScenePage:
     """A run as an HTML page of at most so many bytes: its Gaussians, and the meshes in its folder.
 
-    Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction:
-    the most visible ones, as many as the page holds, fitted to what the run renders for so many seconds, and compared
-    with the run on its held-out frames. The view starts at a training frame
+    Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction,
+    but, in the recorded light, on the distance to the lamp that moves with the camera: the most visible ones, as many
+    as the page holds, fitted to what the run renders for so many seconds, and compared with the run on its held-out
+    frames. The view starts at a training frame
     (:func:`~coliags_plugin.export.baking.distillation.best_frame`). Of a method without Gaussians, the page shows the
     meshes.
     """
@@ -100,10 +103,11 @@ def _page_of_gaussians(
     empty = len(page.html(meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
-    splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0)
+    kind = AttenuatedGaussians if held is None and knows_lamp(field) else ExplicitGaussians
+    splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0, kind)
     first = best_frame(field_of_cloud(splats), trained, held)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
-    while empty + (size := len(layer.packed["data"])) > largest:
+    while empty + (size := len(json.dumps(layer.packed))) > largest:
         splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / size))
         layer, drawn = Layer.of_cloud("Gaussians", splats)
     cost = export_cost(trained, drawn, held if knows_lamp(field) else None)

@@ -20,6 +20,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.splats.packed import read_splat_spz
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
+from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
@@ -50,6 +51,14 @@ def cloud_of(count, degree, seed=0):
     generator = np.random.default_rng(seed)
     higher = generator.uniform(-0.4, 0.4, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
     return replace(cloud, harmonics=np.concatenate([cloud.harmonics, higher], axis=1))
+
+
+def attenuated(cloud):
+    """The cloud, half as bright, with colours that fall, or rise, with the distance to the camera."""
+    random, harmonics = np.random.default_rng(1), 0.5 * cloud.harmonics
+    harmonics[:, 0] -= 0.25 / Y0
+    columns = [random.uniform(12.0, 30.0, len(cloud)), random.uniform(-0.5, 1.0, len(cloud))]
+    return replace(cloud, harmonics=harmonics, attenuation=np.stack(columns, axis=1).astype(np.float32))
 
 
 def page_of(*layers):
@@ -90,6 +99,22 @@ def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
     np.testing.assert_allclose(drawn.scales, read.scales * layer["unit"], rtol=1e-6)
     np.testing.assert_allclose(read.means * layer["unit"], cloud.means, atol=2e-5 * 10 * size)
     np.testing.assert_allclose(read.scales * layer["unit"], cloud.scales, rtol=0.033)
+
+
+def test_attenuation_is_bytes_between_bounds_that_rare_values_do_not_move():
+    cloud = attenuated(cloud_of(2000, 0))
+    cloud.attenuation[7] = 20.0, 900.0
+    layer, drawn = Layer.of_cloud("Gaussians", cloud)
+    packed = layer.packed["attenuation"]
+    levels = np.frombuffer(zlib.decompress(b64decode(packed["data"])), np.uint8).reshape(2, -1)
+    read = np.array(packed["low"])[:, None] + np.array(packed["span"])[:, None] * levels / 255.0
+    np.testing.assert_allclose(np.exp(read[0]), drawn.attenuation[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(read[1], drawn.attenuation[:, 1], atol=1e-5)
+    usual = np.arange(2000) != 7
+    np.testing.assert_allclose(drawn.attenuation[usual, 0], cloud.attenuation[usual, 0], rtol=0.01)
+    np.testing.assert_allclose(drawn.attenuation[usual, 1], cloud.attenuation[usual, 1], atol=0.02)
+    assert drawn.attenuation[7, 1] == pytest.approx(1.0, abs=0.02)
+    assert "attenuation" not in Layer.of_cloud("Gaussians", cloud_of(10, 0))[0].packed
 
 
 def test_a_mesh_is_quantised_in_its_box():
@@ -137,9 +162,9 @@ def as_canvas(camera, shape):
 
 @pytest.mark.thorough
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree):
-    cloud = cloud_of(400, degree, seed=degree)
+@pytest.mark.parametrize(("degree", "light"), [(0, replace), (1, replace), (2, attenuated), (3, attenuated)])
+def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree, light):
+    cloud = light(cloud_of(400, degree, seed=degree))
     page = tmp_path / "page.html"
     page.write_text(page_of(gaussians(cloud)), encoding="utf-8")
     browser.open(page, 700, 400)

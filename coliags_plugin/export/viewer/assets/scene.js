@@ -13,8 +13,10 @@ async function unpacked(text, form) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Gaussians of an SPZ file of version 3, in the scene's axes and unit: what the shader reads, three texels each. */
-function gaussiansOf(bytes, unit) {
+/** Gaussians of a layer, whose data are an SPZ file of version 3, in the scene's axes and unit: what the shader reads, three texels each. */
+async function gaussiansOf(layer) {
+  const bytes = await unpacked(layer.data, "gzip"), unit = layer.unit;
+  const { low, span, farthest, data } = layer.attenuation ?? { low: [0, 0], span: [0, 0], farthest: 0 }, fall = data && (await unpacked(data, "deflate"));
   const header = new DataView(bytes.buffer, bytes.byteOffset, 16);
   const count = header.getUint32(8, true), degree = header.getUint8(12), step = unit / 2 ** header.getUint8(13);
   let place = 16;
@@ -51,8 +53,9 @@ function gaussiansOf(bytes, unit) {
     const dot = (a, b) => axes[3 * a] * axes[3 * b] + axes[3 * a + 1] * axes[3 * b + 1] + axes[3 * a + 2] * axes[3 * b + 2];
     const color = colors[3 * index] + 256 * colors[3 * index + 1] + 65536 * colors[3 * index + 2];
     texels.set([alphas[index] / 255, dot(0, 0), dot(0, 1), dot(0, 2), dot(1, 1), dot(1, 2), dot(2, 2), color], 12 * index + 3);
+    if (fall) texels[12 * index + 11] = fall[index] + 256 * fall[count + index];
   }
-  return { count, centers, texels, bands, harmonics };
+  return { centers, texels, bands, harmonics, low, span, farthest };
 }
 
 /** A mesh: corners as 16-bit shares of its box, colours, triangles. */
@@ -83,6 +86,8 @@ uniform sampler2D uTexels;
 uniform highp usampler2D uHarmonics;
 uniform int uWidth, uBands;
 uniform float uBlur;  // variance added, square pixels
+uniform vec2 uLow, uSpan;  // of the logarithm of the distance to the lamp where colours are as given, and of the exponent
+uniform float uFarthest;  // largest difference of such logarithms
 layout(location = 0) in uint aIndex;
 out vec2 vAway;
 out vec4 vColor;
@@ -132,7 +137,10 @@ void main() {
   vec3 base = (vec3(color & 255u, (color >> 8u) & 255u, (color >> 16u) & 255u) / 255.0 - 0.5) / 0.15;
   vec3 rgb = 0.5 + 0.2820947918 * base;
   if (uBands > 0) rgb += shaded(index, normalize(away));
-  vColor = vec4(max(rgb, 0.0), alpha);
+  uint bits = uint(third.w);
+  vec2 fall = uLow + uSpan * vec2(bits & 255u, bits >> 8u) / 255.0;
+  rgb = max(rgb, 0.0) * exp(-fall.y * clamp(log(length(away)) - fall.x, -uFarthest, uFarthest));
+  vColor = vec4(rgb, alpha);
   gl_Position = placed(pixel, local.z);
 }`;
 
@@ -236,6 +244,9 @@ function splatLayer(gl, cloud, changed) {
       gl.uniform1i(at.uHarmonics, 1);
       gl.uniform1i(at.uWidth, width);
       gl.uniform1i(at.uBands, cloud.bands);
+      gl.uniform2fv(at.uLow, cloud.low);
+      gl.uniform2fv(at.uSpan, cloud.span);
+      gl.uniform1f(at.uFarthest, cloud.farthest);
       gl.uniform1f(at.uBlur, scene.blur * Math.max(1, view.magnified ** 2));
       gl.disable(gl.DEPTH_TEST);
       gl.enable(gl.BLEND);
@@ -366,7 +377,7 @@ async function start() {
   };
   const layers = [];
   for (const layer of scene.layers)
-    layers.push(layer.kind === "gaussians" ? splatLayer(gl, gaussiansOf(await unpacked(layer.data, "gzip"), layer.unit), changed) : meshLayer(gl, await meshOf(layer)));
+    layers.push(layer.kind === "gaussians" ? splatLayer(gl, await gaussiansOf(layer), changed) : meshLayer(gl, await meshOf(layer)));
 
   function view() {
     const [width, height] = [canvas.width, canvas.height], k = scene.camera;
