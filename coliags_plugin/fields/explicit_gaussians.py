@@ -87,7 +87,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
 
 
 class AttenuatedGaussians(ExplicitGaussians):
-    """Explicit Gaussians whose colours fall with the distance to a lamp at the camera's centre, each by its own power.
+    """Explicit Gaussians whose colours are attenuated by a power of the distance to the camera, where the lamp is.
 
     At a distance d they are (d / D)^-a times what the spherical harmonics give, with d / D no further than
     :data:`FARTHEST` from 1.

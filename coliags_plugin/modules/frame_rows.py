@@ -55,7 +55,7 @@ class FrameRows:
         return self._rows_by_time[before], self._rows_by_time[after], share
 
     def interpolated(self, values: Float[Tensor, "F *S"], view: View) -> Float[Tensor, "*S"]:
-        """Per-frame values at a view: its own, or interpolated in time where it is no training frame.
+        """Look up a training frame's values, or interpolate between those around another view in time.
 
         Linearly between those of its :meth:`neighbours`. [*S]
         """

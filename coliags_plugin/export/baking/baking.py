@@ -185,9 +185,10 @@ def bake(
     """
     scale, light = trained.model.scale, None if light is None else light.scaled(trained.model.scale)
     trained = trained.in_model_units
-    if most is None and isinstance(trained.model.field, ExplicitGaussians):
-        made = field_of_cloud(cloud_of_field(trained.model.field).with_thickness(THICKNESS_SHARE))
-        needs = needs_distillation(made, trained, light)
+    explicit = trained.model.field
+    if most is None and isinstance(explicit, ExplicitGaussians):
+        made = field_of_cloud(cloud_of_field(explicit).with_thickness(THICKNESS_SHARE))
+        needs = explicit.scale_count < 3 and needs_distillation(made, trained, light)
         facts = {"steps": distil(made, trained, light, seconds), "seconds": seconds} if needs else {}
         return cloud_of_field(made).scaled(1.0 / scale), facts
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]

@@ -60,7 +60,7 @@ _View = tuple[Camera, Frame | None]
 
 @dataclass(frozen=True)
 class _Target:
-    """What Gaussians are fitted to in a view, in the held light."""
+    """Target image and depth of a view that Gaussians are fitted to, in the held light."""
 
     camera: Camera
     rgb: Float[Tensor, "H W 3"]
@@ -85,8 +85,8 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
     adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
     chance = generators(trained.seed)["frame_order"]
     cameras = [adjusted_camera(trained, frame) for frame in trained.scene.train]
-    views: list[_View] = [*_some([*zip(cameras, trained.scene.train, strict=True)])]
-    views += _some([(camera, None) for camera in beside(cameras, chance)])
+    frames: list[_View] = list(zip(cameras, trained.scene.train, strict=True))
+    views = _some(frames) + _some([(camera, None) for camera in beside(cameras, chance)])
     targets: dict[int, _Target] = {}
     order: list[int] = []
     start, step = time.monotonic(), 0

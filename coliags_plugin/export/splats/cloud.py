@@ -87,11 +87,9 @@ class SplatCloud:
 
     def scaled(self, factor: float) -> SplatCloud:
         """The Gaussians in a world whose lengths are ``factor`` times as large."""
-        lengths = {"means": self.means, "scales": self.scales}
-        scaled = {name: values * np.float32(factor) for name, values in lengths.items()}
-        if self.attenuation is not None:
-            scaled["attenuation"] = self.attenuation * np.array([factor, 1.0], np.float32)
-        return replace(self, **scaled)
+        length = np.float32(factor)
+        attenuation = None if self.attenuation is None else self.attenuation * np.array([factor, 1.0], np.float32)
+        return replace(self, means=self.means * length, scales=self.scales * length, attenuation=attenuation)
 
     def concat(self, others: SplatCloud) -> SplatCloud:
         """These Gaussians and others, of as many scales and harmonics."""

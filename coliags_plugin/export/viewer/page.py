@@ -146,11 +146,11 @@ def page_html(
 def _packed_attenuation(
     attenuation: Float32[np.ndarray, "N 2"],
 ) -> tuple[dict[str, Any], Float32[np.ndarray, "N 2"]]:
-    """Logarithms of distances, and exponents, as bytes between bounds for the page, and what these stand for."""
-    values = np.stack([np.log(attenuation[:, 0]), attenuation[:, 1]])
-    low, high = np.quantile(values, (_RARE, 1.0 - _RARE), axis=1)
+    """Quantise log distances and exponents to 8 bits each: JSON values for the page, and the rounded attenuation."""
+    values = np.stack([np.log(attenuation[:, 0]), attenuation[:, 1]], axis=1)
+    low, high = np.quantile(values, (_RARE, 1.0 - _RARE), axis=0)
     span = np.maximum(high - low, np.finfo(np.float32).tiny)
-    levels = np.rint((np.clip((values.T - low) / span, 0.0, 1.0)) * 255.0)
+    levels = np.rint(np.clip((values - low) / span, 0.0, 1.0) * 255.0)
     logs, exponents = (low + span / 255.0 * levels).T
     data = b64encode(zlib.compress(levels.T.astype(np.uint8).tobytes(), 9)).decode("ascii")
     rounded = np.stack([np.exp(logs), exponents], axis=1).astype(np.float32)

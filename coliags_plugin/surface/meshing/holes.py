@@ -1,4 +1,4 @@
-"""Filling of small holes of a mesh where views see surface."""
+"""Hole filling of meshes: small holes where the depth of views shows surface."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _disk(sides: int, rings: int) -> Int[np.ndarray, "F 3"]:
 
 
 def _bent_least(mesh: TriangleMesh, known: int) -> TriangleMesh:
-    """Move all vertices but the first ``known`` to where the Laplacian about them is least (:func:`bending`)."""
+    """Fair the vertices after the first ``known``: minimise their squared Laplacian (:func:`bending`)."""
     new = np.arange(len(mesh.vertices)) >= known
     bent = np.zeros(len(new), bool)
     bent[mesh.triangles[new[mesh.triangles].any(axis=1)]] = True

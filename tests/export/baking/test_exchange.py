@@ -158,7 +158,6 @@ def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(runs):
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):
-    """As they are where the time is none; else they are fitted to what 2DGS renders of them."""
     trained = runs("2dgs")
     record = trained.export(tmp_path / "wall.ply", seconds=0.0)[0].record
     assert record["cost"]["test"]["psnr_between"] > 25
@@ -177,6 +176,11 @@ def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_pat
     again = cp.import_splats(tmp_path / "discs.ply", scene, tmp_path / "discs")
     assert again.method == "2dgs"
     np.testing.assert_allclose(again.load().model.field.scales.detach().numpy(), scales, atol=1e-5)
+
+
+def test_surfels_alone_of_explicit_gaussians_are_fitted(runs, few_steps):
+    assert bake(runs("2dgs").load(), None)[1]["steps"] == 3
+    assert bake(runs("3dgs").load(), None)[1] == {}
 
 
 @pytest.mark.parametrize("method", ["coliags", "pr-endo"])
