@@ -105,7 +105,7 @@ def test_heavy_libraries_are_imported_late():
     for name in components():
         path = SOURCES[name]
         loaded = {imported.split(".")[0] for imported in imports(path, top_level_only=True)}
-        allowed = {"numba"} if "numba_kernels" in path.parts or path.stem == "numba_compilation" else set()
+        allowed = {"numba"} if "numba_kernels" in path.parts else set()
         early += [f"{name} imports {library}" for library in loaded & (LAZY - allowed)]
     assert early == []
 

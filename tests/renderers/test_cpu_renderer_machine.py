@@ -15,7 +15,7 @@ import torch
 from numba import types
 from numba.core.registry import cpu_target
 
-from coliags_plugin.core import numba_compilation as compilation
+from coliags_plugin.core.numba_kernels import compilation
 from coliags_plugin.renderers import cpu_renderer
 from coliags_plugin.renderers.numba_kernels import (
     surfel_layout,

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
-from coliags_plugin.core.numba_compilation import Array
+from coliags_plugin.core.numba_kernels.compilation import Array
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.pipeline import Pipeline
 

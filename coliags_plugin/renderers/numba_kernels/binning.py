@@ -7,13 +7,13 @@ threads handle on their own; the result is the same however many there are.
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show
-from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
 #: Prefetch distance, Gaussians.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from coliags_plugin.core.numba_compilation import Array
+from coliags_plugin.core.numba_kernels.compilation import Array
 
 #: Edge of a tile, pixels.
 TILE = 16

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import torch
 
-from coliags_plugin.core.numba_compilation import Array
+from coliags_plugin.core.numba_kernels.compilation import Array
+from coliags_plugin.core.numba_kernels.threads import Runner, workers
 from coliags_plugin.renderers.numba_kernels import (
     binning,
     layout,
@@ -27,7 +26,6 @@ from coliags_plugin.renderers.numba_kernels.projection import project
 from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
 from coliags_plugin.renderers.numba_kernels.surfel_projection import project_surfels
 from coliags_plugin.renderers.numba_kernels.surfel_projection_backward import gather_surfels, project_surfels_backward
-from coliags_plugin.renderers.numba_kernels.threads import Crew
 
 #: Pieces of work per thread where their costs differ.
 _PIECES = 8
@@ -36,7 +34,6 @@ _WORTH_SHARING_SORT = 1 << 17
 #: Largest number of pairs of the lists.
 _MOST_PAIRS = 2**31 - 1
 
-_crew = Crew()
 _arenas = ArenaPool()
 _results = Results()
 
@@ -167,7 +164,7 @@ class Pipeline(ABC):
         )
         means2d, radii = _results.take(filled, 2), _results.take(filled)
         written = (self._projections, means2d.reshape(-1), radii)
-        with _workers() as run:
+        with workers() as run:
             run(self.kernels.project, count, gaussians, self._tail, self._view, self._main_layer().own, *written)
         if count and self._projections.parcels[::2].min() < 0:
             raise UnusableGaussianError
@@ -177,7 +174,7 @@ class Pipeline(ABC):
         """Draw the Gaussians projected: [H, W, 3] or [H, W], None where not wanted. May raise TooManyPairsError."""
         layer = self._main_layer()
         images = self._images(self._wanted, _results.take)
-        with _workers() as run:
+        with workers() as run:
             self._bin(run)
             self._composited = self._arena.take("composited", self._composited_size(layer))
             self._sweep(run, self.kernels.sweep_forward, layer, self._composited, _flat_images(images))
@@ -193,7 +190,7 @@ class Pipeline(ABC):
         size = self._composited_size(self._features_layer(features, 0))
         result = np.empty((grid.height, grid.width, width * sweeps), np.float32)
         self._feature_composited = self._arena.take("feature_composited", sweeps * size)
-        with _workers() as run:
+        with workers() as run:
             for sweep in range(sweeps):
                 layer, images = self._features_layer(features, sweep), self._feature_images()
                 composited = self._feature_composited[sweep * size : (sweep + 1) * size]
@@ -212,7 +209,7 @@ class Pipeline(ABC):
         part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
         total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
         result = np.empty_like(features)
-        with _workers() as run:
+        with workers() as run:
             for first in range(0, features.shape[1], width):
                 sweep = first // width
                 given = self._feature_images()
@@ -238,7 +235,7 @@ class Pipeline(ABC):
         layer, filled = self._main_layer(), self._filled
         gaussian_sums = self._arena.take("gaussian_sums", self._sums_size(layer, filled))
         of_means2d = _results.take(filled, 2)
-        with _workers() as run:
+        with workers() as run:
             self._sweep_backward(run, layer, self._composited, of_images, gaussian_sums, of_means2d)
         return of_means2d[: self._count], gaussian_sums
 
@@ -259,7 +256,7 @@ class Pipeline(ABC):
         results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self.scales, 1, 3)))
         flat = layout.Parameters(*(result.reshape(-1) for result in results))
         tables = (layer.channels, layer.own, self._projections, gaussian_sums, given, flat, of_pose)
-        with _workers() as run:
+        with workers() as run:
             run(self.kernels.project_backward, self._count, gaussians, self._tail, self._view, *tables)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
         return layout.Parameters(*(result[: self._count] for result in results)), columns.T
@@ -414,24 +411,6 @@ class SurfelPipeline(Pipeline):
         measures = layer.own
         of_measures = len(measures.depth) + len(measures.inverse_depth) + 2 * len(measures.distortion)
         return super()._composited_vectors(layer) + of_measures
-
-
-class Runner:
-    """Runs kernels on a given number of threads."""
-
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
-
-    def __call__(self, kernel: Callable[..., Any], *arguments: Any) -> None:
-        """Run a kernel, which gets four work counters first."""
-        _crew.run(self.workers, kernel, np.zeros(4, np.int64), *arguments)
-
-
-@contextmanager
-def _workers() -> Iterator[Runner]:
-    """Lock the thread pool, as one view uses all cores; with as many threads as torch uses."""
-    with _crew.turn:
-        yield Runner(torch.get_num_threads())
 
 
 def _flat_images(images: layout.Images) -> layout.Images:

@@ -5,8 +5,9 @@ The formulas are those of ``docs/rendering.md``, section "Projection", for sixte
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import (
     camera_axes,
@@ -16,7 +17,6 @@ from coliags_plugin.renderers.numba_kernels.geometry import (
     shortest_column,
     squared_distance_to_box,
 )
-from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Shorter quaternions (squared) have no direction.
 SMALLEST_SQUARED_NORM = 1e-24

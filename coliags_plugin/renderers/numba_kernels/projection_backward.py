@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, project_axes, shortest_axes, shortest_column
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
-from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Turn products of two (or four) factors of the scaled U into those of the plain one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED

@@ -6,10 +6,10 @@ counts are summed in order, so the result does not depend on their number.
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import kernel
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import kernel
+from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Largest number of bits of a digit.
 DIGIT_BITS = 11

@@ -5,13 +5,13 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.projection import are_usable, store_extents, tile_at
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show, place_surfels
-from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Added to the squared distance to the rim, in standard deviations, and to the squared half-axes of its image, square
 #: pixels: more than rounding, which is how discs seen edge-on stay ellipses.

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes
 from coliags_plugin.renderers.numba_kernels.projection_backward import gathering, quaternion_derivative
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
-from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Turns products of two of the scaled e and f into those of standard deviations; and of one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     FETCHED,
@@ -18,7 +19,6 @@ from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     intersect,
     scaled_pixels,
 )
-from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import CHUNK, image_copies, inside, tile_corner, tile_sweep_backward
 
 # A block's vectors: x and y of its pixels, transmittance, what is still to be shown, and the derivatives with respect to

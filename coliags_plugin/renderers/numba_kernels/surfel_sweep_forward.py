@@ -6,8 +6,9 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     FETCHED,
@@ -16,7 +17,6 @@ from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     intersect,
     scaled_pixels,
 )
-from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import ALPHA, CHUNK, TRANSMITTANCE, image_copies, tile_sweep
 
 # A block's vectors: transmittance, alpha, channels, sums of the measures and the median; of the reciprocal depths 1/z

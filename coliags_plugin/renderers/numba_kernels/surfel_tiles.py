@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import inline, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, part
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.tiles import block_pixels
 

@@ -8,10 +8,10 @@ it composited.
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import (
     CHUNK,
     OFFSET_E,

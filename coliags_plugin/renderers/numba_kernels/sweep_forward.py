@@ -6,10 +6,10 @@ formulas are those of ``docs/rendering.md``, section "Compositing".
 
 from __future__ import annotations
 
-from coliags_plugin.core.numba_compilation import kernel, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import kernel, part
+from coliags_plugin.core.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import (
     ALPHA,
     CHUNK,

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import inline, part
-from coliags_plugin.renderers.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels import lanes as vec
+from coliags_plugin.core.numba_kernels.compilation import inline, part
 from coliags_plugin.renderers.numba_kernels import layout
 
 #: Entries of a tile fetched at a time: their rows fit into the first-level cache beside the blocks' state.

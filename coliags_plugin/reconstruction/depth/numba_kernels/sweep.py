@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import Array, kernel, part
+from coliags_plugin.core.numba_kernels.compilation import Array, kernel, part
 
 
 @part

@@ -60,7 +60,7 @@ def kernel(function: _Function) -> _Function:
 class _KernelCache(FunctionCache):
     """numba's on-disk cache with three changes.
 
-    - A kernel is invalidated when any file of its folder or this one changes (numba checks the kernel's own file only).
+    - A kernel is invalidated when any file of its folder or of this one changes (numba checks its own file only).
     - A cache that cannot be read or written causes a compilation, never an error.
     - A message is logged before compilation.
     """
@@ -93,8 +93,8 @@ def _announce(where: str) -> None:
 
 @cache
 def _fingerprint(folder: Path) -> str:
-    """Hash of this file and of the sources of all kernels of a folder."""
+    """Hash of the sources of all kernels of a folder and of this one."""
     digest = hashlib.sha256()
-    for path in [Path(__file__), *sorted(folder.glob("*.py"))]:
+    for path in sorted({*Path(__file__).parent.glob("*.py"), *folder.glob("*.py")}):
         digest.update(path.read_bytes())
     return digest.hexdigest()

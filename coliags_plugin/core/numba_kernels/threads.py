@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from coliags_plugin.core.numba_compilation import part
-from coliags_plugin.renderers.numba_kernels.lanes import Intrinsic, Values
+from coliags_plugin.core.numba_kernels.compilation import part
+from coliags_plugin.core.numba_kernels.lanes import Intrinsic, Values
 
 if TYPE_CHECKING:
     from numba.core.base import BaseContext
@@ -63,7 +66,7 @@ class Crew:
 
     def _assemble(self) -> None:
         self.turn = threading.Lock()
-        self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="splatting")
+        self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="numba-kernels")
 
     def run(self, size: int, kernel: Callable[..., None], *arguments: object) -> None:
         """Run a kernel on ``size`` threads, including the calling one."""
@@ -74,3 +77,24 @@ class Crew:
             for helper in helpers:
                 if not helper.cancel():
                     helper.result()
+
+
+_crew = Crew()
+
+
+class Runner:
+    """Runs kernels on a given number of threads."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+
+    def __call__(self, kernel: Callable[..., Any], *arguments: Any) -> None:
+        """Run a kernel, which gets four work counters first."""
+        _crew.run(self.workers, kernel, np.zeros(4, np.int64), *arguments)
+
+
+@contextmanager
+def workers() -> Iterator[Runner]:
+    """Lock the thread pool, whose callers each use all cores; with as many threads as torch uses."""
+    with _crew.turn:
+        yield Runner(torch.get_num_threads())

@@ -1,0 +1,1 @@
+"""Compilation, vectors and threads of the numba kernels. Importing any of them imports numba."""
