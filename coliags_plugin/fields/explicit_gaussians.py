@@ -17,6 +17,7 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+from coliags_plugin.fields.rows import unique_rows
 
 #: Ratio of distances to the lamp, and its inverse, beyond which :class:`AttenuatedGaussians` change no further.
 FARTHEST = 2.0
@@ -66,7 +67,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
         means, scales, quats, opacities = (
-            self.get_parameter(name).index_select(0, visible) for name in ExplicitField.row_parameters
+            unique_rows(self.get_parameter(name), visible) for name in ExplicitField.row_parameters
         )
         return Gaussians(
             means=means,
@@ -81,8 +82,8 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
         """Colours of some Gaussians, seen along vectors from the camera's centre to theirs. [V, 3]"""
         degree = int(self.degree)
-        higher = self.shN[:, : (degree + 1) ** 2 - 1].index_select(0, rows)  # the active ones alone
-        harmonics = torch.cat([self.sh0.index_select(0, rows), higher], dim=1)
+        higher = unique_rows(self.shN[:, : (degree + 1) ** 2 - 1], rows)  # the active ones alone
+        harmonics = torch.cat([unique_rows(self.sh0, rows), higher], dim=1)
         return spherical_harmonics.colors(harmonics, nn.functional.normalize(sight, dim=1), degree)
 
 
@@ -104,7 +105,7 @@ class AttenuatedGaussians(ExplicitGaussians):
 
     def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
         ratios = sight.detach().norm(dim=1, keepdim=True) / self.distances.index_select(0, rows)
-        factors = ratios.clamp(1.0 / FARTHEST, FARTHEST).pow(-self.exponents.index_select(0, rows))
+        factors = ratios.clamp(1.0 / FARTHEST, FARTHEST).pow(-unique_rows(self.exponents, rows))
         return super()._colors(rows, sight) * factors
 
 

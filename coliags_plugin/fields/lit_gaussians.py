@@ -23,6 +23,7 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.diffuse_network import DiffuseNetwork, Precision
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+from coliags_plugin.fields.rows import unique_rows
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
 
 logger = logging.getLogger(__name__)
@@ -168,7 +169,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         visible = self._visible(camera)
         visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
         means, log_scales, quats, logits, albedos, roughness, f0 = (
-            self.get_parameter(name).index_select(0, visible) for name in self.row_parameters
+            unique_rows(self.get_parameter(name), visible) for name in self.row_parameters
         )
         scales = log_scales.clamp_max(self._max_log_scale()).exp()
         albedos = albedos.clamp_min(0.0)
