@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Generic
+from typing import Any, ClassVar, Generic, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -201,6 +201,23 @@ class RadianceField(Field[SettingsT], RadianceLevel):
         return None
 
 
+class HeadNetworks(NamedTuple):
+    """Networks of a head, of one hidden layer each (Linear, ReLU, Linear), with the same inputs.
+
+    Attributes:
+        inputs: What they see besides the anchors' features. [V, R]
+        embedded: How many of the last inputs are embedded by gamma (docs/methods.md 3.2).
+        frequencies: Of gamma.
+        mlps: The networks: those of opacity, before tanh, and covariance; or that of colour, before the sigmoid. They
+            see the features, then the inputs with the embedded ones extended.
+    """
+
+    inputs: Tensor
+    embedded: int
+    frequencies: int
+    mlps: tuple[nn.Sequential, ...]
+
+
 class Head(nn.Module, ABC, Generic[SettingsT]):
     """Exchangeable decoder within a field, with parameter groups of its own.
 
@@ -209,6 +226,19 @@ class Head(nn.Module, ABC, Generic[SettingsT]):
 
     Settings: ClassVar[type[Settings]]
     settings: SettingsT
+
+    #: Whether ``forward`` may consist of :meth:`networks`: not so where a class defines the former alone.
+    has_networks: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **options: object) -> None:
+        """Set :attr:`has_networks`: a ``forward`` alone may decode in any way."""
+        super().__init_subclass__(**options)
+        if "forward" in vars(cls):
+            cls.has_networks = "networks" in vars(cls)
+
+    def networks(self, *inputs: Any) -> HeadNetworks | None:
+        """The networks that ``forward`` consists of, for the same inputs; None where it does other things."""
+        return None
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

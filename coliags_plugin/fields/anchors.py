@@ -21,7 +21,9 @@ from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
+from coliags_plugin.fields.children import AnchorRows, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+from coliags_plugin.fields.rows import unique_rows
 from coliags_plugin.lighting.lamps import HeldLight
 
 logger = logging.getLogger(__name__)
@@ -157,9 +159,20 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Int[Tensor, "V"]:
         """Indices of anchors of which any child may overlap the image."""
+        if self._on_kernels:
+            return visible_anchors(self._rows, camera)
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
         return spheres_in_frustum(self.anchors, reach + size, camera).nonzero().squeeze(1)
+
+    @property
+    def _rows(self) -> AnchorRows:
+        return AnchorRows(self.anchors, self.offsets, self.scalings, self.features)
+
+    @property
+    def _on_kernels(self) -> bool:
+        """Whether the kernels of the CPU can compute."""
+        return self.anchors.device.type == "cpu" and self.anchors.dtype == torch.float32
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
         camera = camera.to(self.anchors.device, self.anchors.dtype)
@@ -176,10 +189,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:
         camera = camera.to(self.anchors.device, self.anchors.dtype)
         visible = self.visible_anchors(camera)
-        # index_select throughout: half the time of indexing, forward and backward.
-        anchors, features, offsets, scalings = (
-            rows.index_select(0, visible) for rows in (self.anchors, self.features, self.offsets, self.scalings)
-        )
+        anchors, features = (unique_rows(rows, visible) for rows in (self.anchors, self.features))
         sight = anchors - camera.center
         distances = sight.norm(dim=1, keepdim=True)
         directions = sight / distances
@@ -188,25 +198,18 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         if light is not None:
             distances, cosines = (values[:, None] for values in light.incidence(anchors))
 
-        opacities, covariances = self.geometry_head(features, directions)
         normals = None if self.normals is None else self.normals.index_select(0, visible)
-        colors = self.appearance_head(features, directions, distances, cosines, normals)
-
-        slots = (opacities.reshape(-1) > 0.0).nonzero().squeeze(1)
-        parents = slots // self.settings.children
-        covariances = covariances.reshape(-1, 7).index_select(0, slots)
-        scales = scalings.exp().index_select(0, parents)
-        shifts = offsets.reshape(-1, 3).index_select(0, slots)
-        means = anchors.index_select(0, parents) + shifts * scales[:, :3]
-        drawn = colors.reshape(-1, 3).index_select(0, slots)
-        if normals is not None:
-            normals = normals.index_select(0, parents)
-        return Gaussians(
-            means=means,
-            quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),
-            scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
-            opacities=opacities.reshape(-1).index_select(0, slots),
-            colors=self.appearance_head.apply_light(drawn, means, normals, camera, light),
-            source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
-            visible_sources=visible,
+        seen = (features, directions, distances, cosines, normals)
+        geometry, appearance = (
+            head.networks(*inputs) if self._on_kernels and head.has_networks else None
+            for head, inputs in ((self.geometry_head, seen[:2]), (self.appearance_head, seen))
         )
+        if geometry is not None and appearance is not None:
+            drawn = fused_children(self._rows, visible, geometry, appearance)
+        else:
+            opacities, covariances = self.geometry_head(*seen[:2])
+            drawn = drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(*seen))
+        if self.normals is not None:
+            normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
+        lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
+        return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)

@@ -11,9 +11,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import TypeVar
 
-from coliags_plugin.contracts import AppearanceHead
+from coliags_plugin.contracts import AppearanceHead, HeadNetworks
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.fields.mlp import cosine_embedding, first_layer, mlp
+from coliags_plugin.fields.mlp import mlp, outputs
 
 #: Widths of the lobes of glints: sines of the angle at which each has fallen to 1 / e. The first is narrower than the
 #: lobe of a wet film, the last knows no more than the side from which the wall is seen.
@@ -42,15 +42,22 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
 
     #: Channels of :meth:`embed_direction`, which lie between the feature and the distance.
     direction_channels: ClassVar[int] = 3
+    #: How many of the last inputs are embedded by gamma.
+    embedded: ClassVar[int] = 0
 
     def __init__(self, settings: AppearanceT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
         self.features = features
-        seen = torch.zeros(1, self.direction_channels)
-        embedded = self.embed(seen, torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
-        self.color_mlp = mlp(features + embedded, settings.hidden, 3 * children, generator)
+        inputs = self.inputs(torch.zeros(1, self.direction_channels), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
+        inputs += 2 * self.embedded * self.frequencies
+        self.color_mlp = mlp(features + inputs, settings.hidden, 3 * children, generator)
+
+    @property
+    def frequencies(self) -> int:
+        """Those of gamma."""
+        return 0
 
     def embed_direction(
         self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
@@ -59,10 +66,10 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         return directions
 
     @abstractmethod
-    def embed(
+    def inputs(
         self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V E"]:
-        """Inputs of the MLP besides the feature: the embedded direction, then the distance if :attr:`knows_lamp`."""
+    ) -> Float[Tensor, "V R"]:
+        """Inputs of the MLP besides the feature: the direction as encoded, then the distance if :attr:`knows_lamp`."""
 
     @torch.no_grad()
     def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
@@ -83,6 +90,18 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """The MLP."""
         return {"color_mlp": list(self.color_mlp.parameters())}
 
+    def networks(
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
+    ) -> HeadNetworks:
+        """The MLP."""
+        inputs = self.inputs(self.embed_direction(features, directions, normals), distances, cosines)
+        return HeadNetworks(inputs, self.embedded, self.frequencies, (self.color_mlp,))
+
     def forward(
         self,
         features: Float[Tensor, "V F"],
@@ -92,10 +111,8 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours."""
-        embedded = self.embed(self.embed_direction(features, directions, normals), distances, cosines)
-        weight, bias = self.color_mlp.get_parameter("0.weight"), self.color_mlp.get_parameter("0.bias")
-        hidden = first_layer(features, embedded, weight, bias).relu()
-        return self.color_mlp[2](hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
+        (colors,) = outputs(features, self.networks(features, directions, distances, cosines, normals))
+        return colors.view(len(features), self.children_per_anchor, 3).sigmoid()
 
 
 class PlainAppearanceSettings(AppearanceSettings):
@@ -114,9 +131,9 @@ class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
         """True where the distance to the lamp is an input of the MLP."""
         return self.settings.distance
 
-    def embed(
+    def inputs(
         self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V E"]:
+    ) -> Float[Tensor, "V R"]:
         """v, and d if that is an input."""
         return torch.cat([seen, distances], dim=1) if self.settings.distance else seen
 
@@ -135,12 +152,18 @@ class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
     """
 
     Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
+    embedded: ClassVar[int] = 1
 
-    def embed(
+    @property
+    def frequencies(self) -> int:
+        """As set: gamma(cos theta) has 11 numbers at five."""
+        return self.settings.frequencies
+
+    def inputs(
         self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V E"]:
-        """v, d and gamma(cos theta): 3 + 1 + 11 numbers with five frequencies."""
-        return torch.cat([seen, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)
+    ) -> Float[Tensor, "V R"]:
+        """v, d and cos theta."""
+        return torch.cat([seen, distances, cosines], dim=1)
 
 
 class GlintAppearanceHead(IMIAAppearanceHead):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.config.components import AppearanceHeadNode
-from coliags_plugin.contracts import AppearanceHead
+from coliags_plugin.contracts import AppearanceHead, HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
@@ -97,6 +97,18 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
         return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
+
+    def networks(
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
+    ) -> HeadNetworks | None:
+        """Those of the head below, if it has some."""
+        seen = (features, directions, distances, cosines, normals)
+        return self.head.networks(*seen) if self.head.has_networks else None
 
     def forward(
         self,

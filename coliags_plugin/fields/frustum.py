@@ -14,21 +14,21 @@ from coliags_plugin.core.cameras import Camera
 DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 
 
+def frustum_planes(camera: Camera) -> Float[Tensor, "5 3"]:
+    """Inward unit normals, world frame: of the near plane, then of the four sides, which go through the centre."""
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    # Each side plane goes through one image border; f and the distance of the border from the principal point are the
+    # components of its normal up to length.
+    sides = ((fx, 0, cx), (-fx, 0, camera.width - cx), (0, fy, cy), (0, -fy, camera.height - cy))
+    local = camera.camera_to_world.new_tensor([(0, 0, 1), *sides])
+    return torch.nn.functional.normalize(local, dim=1) @ camera.camera_to_world[:3, :3].T
+
+
 def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera) -> Bool[Tensor, "M"]:
     """Whether any part of a sphere may lie inside the viewing pyramid beyond the camera's near plane.
 
     Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused. World frame, scene units.
     """
-    x, y, z = ((centers - camera.center) @ camera.camera_to_world[:3, :3]).unbind(-1)
-    inside = z + radii > camera.near_plane
-    # Each side plane goes through the camera and one image border; its inward normal is (f, distance of the border
-    # from the principal point) up to length.
-    sides = (
-        (x, camera.fx, camera.cx),
-        (-x, camera.fx, camera.width - camera.cx),
-        (y, camera.fy, camera.cy),
-        (-y, camera.fy, camera.height - camera.cy),
-    )
-    for across, focal, border in sides:
-        inside &= (focal * across + border * z) / math.hypot(focal, border) > -radii
-    return torch.as_tensor(inside)
+    along = (centers - camera.center) @ frustum_planes(camera).T
+    along[:, 0] -= camera.near_plane
+    return (along.amin(dim=1) > -radii) if len(along) else along.new_zeros(0, dtype=torch.bool)

@@ -10,9 +10,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import TypeVar
 
-from coliags_plugin.contracts import GeometryHead
+from coliags_plugin.contracts import GeometryHead, HeadNetworks
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.fields.mlp import cosine_embedding, first_layer, mlp
+from coliags_plugin.fields.mlp import mlp, outputs
 
 
 class PlainGeometrySettings(Settings):
@@ -34,13 +34,14 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
-        inputs = features + self.embed(torch.zeros(1, 3)).shape[1]
+        inputs = features + 3 * (1 + 2 * self.frequencies)
         self.opacity_mlp = mlp(inputs, settings.hidden, children, generator)
         self.covariance_mlp = mlp(inputs, settings.hidden, 7 * children, generator)
 
-    def embed(self, directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V E"]:
-        """Encoding of the viewing direction."""
-        return directions
+    @property
+    def frequencies(self) -> int:
+        """Those of gamma, by which the viewing direction is embedded; 0: as it is."""
+        return 0
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The two MLPs."""
@@ -49,18 +50,16 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
             "covariance_mlp": list(self.covariance_mlp.parameters()),
         }
 
+    def networks(self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]) -> HeadNetworks:
+        """The two MLPs."""
+        return HeadNetworks(directions, 3, self.frequencies, (self.opacity_mlp, self.covariance_mlp))
+
     def forward(
         self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
     ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors."""
-        # Both MLPs read the same input: one product for both first layers.
-        mlps = (self.opacity_mlp, self.covariance_mlp)
-        weight, bias = (torch.cat([mlp.get_parameter(name) for mlp in mlps]) for name in ("0.weight", "0.bias"))
-        opacity_hidden, covariance_hidden = (
-            first_layer(features, self.embed(directions), weight, bias).relu().chunk(2, dim=1)
-        )
-        covariances = self.covariance_mlp[2](covariance_hidden).view(len(features), self.children_per_anchor, 7)
-        return self.opacity_mlp[2](opacity_hidden).tanh(), covariances
+        opacities, covariances = outputs(features, self.networks(features, directions))
+        return opacities.tanh(), covariances.view(len(features), self.children_per_anchor, 7)
 
 
 class IMVEGeometrySettings(PlainGeometrySettings):
@@ -74,6 +73,7 @@ class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
 
     Settings: ClassVar[type[Settings]] = IMVEGeometrySettings
 
-    def embed(self, directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V E"]:
-        """gamma(v), 63 numbers at ten frequencies."""
-        return cosine_embedding(directions, self.settings.frequencies)
+    @property
+    def frequencies(self) -> int:
+        """As set: gamma(v) has 63 numbers at ten."""
+        return self.settings.frequencies

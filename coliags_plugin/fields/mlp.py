@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from coliags_plugin.contracts import HeadNetworks
 
 
 def mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
@@ -53,6 +56,21 @@ def first_layer(
     """
     split = features.shape[1]
     return torch.addmm(nn.functional.linear(embedded, weight[:, split:], bias), features, weight[:, :split].t())
+
+
+def embedded_inputs(networks: HeadNetworks) -> Float[Tensor, "V E"]:
+    """What the networks see besides the features."""
+    plain = networks.inputs.shape[1] - networks.embedded
+    waves = cosine_embedding(networks.inputs[:, plain:], networks.frequencies)
+    return torch.cat([networks.inputs[:, :plain], waves], dim=1)
+
+
+def outputs(features: Float[Tensor, "V F"], networks: HeadNetworks) -> list[Tensor]:
+    """Results of the networks, one product for all first layers."""
+    weight, bias = (torch.cat([mlp.get_parameter(name) for mlp in networks.mlps]) for name in ("0.weight", "0.bias"))
+    hidden = first_layer(features, embedded_inputs(networks), weight, bias).relu()
+    parts: Any = torch.split(hidden, [len(mlp.get_parameter("0.bias")) for mlp in networks.mlps], dim=1)
+    return [mlp[2](part) for mlp, part in zip(networks.mlps, parts, strict=True)]
 
 
 def cosine_embedding(x: Float[Tensor, "... D"], frequencies: int) -> Float[Tensor, "... E"]:

@@ -16,6 +16,7 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
 from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead, IMIAAppearanceSettings
 from coliags_plugin.fields.frustum import spheres_in_frustum
+from coliags_plugin.fields.mlp import embedded_inputs
 from tests.fields.made import make_field
 from tests.scenes import camera_at, wall_scene
 
@@ -198,8 +199,8 @@ def test_anchors_behind_the_camera_have_cosine_zero():
     field = make(COLIAGS)
     seen = {}
     head = field.appearance_head
-    embed = head.embed
-    head.embed = lambda v, d, c: seen.setdefault("cosines", c) is None or embed(v, d, c)
+    inputs = head.inputs
+    head.inputs = lambda v, d, c: seen.setdefault("cosines", c) is None or inputs(v, d, c)
     with torch.no_grad():
         field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
         field.scalings.fill_(3.0)
@@ -265,9 +266,8 @@ def test_few_units_start_dead():
     for start in ("scene_distances", "pytorch"):
         head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
         head.init_from_distances(distances)
-        inputs = torch.cat(
-            [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
-        )
+        networks = head.networks(torch.zeros(500, 32), directions, distances[:, None], directions[:, 2:].abs(), None)
+        inputs = torch.cat([torch.zeros(500, 32), embedded_inputs(networks)], dim=1)
         dead[start] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
     assert dead["scene_distances"] <= 2
     assert dead["pytorch"] >= 11

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.fields.appearance_heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
+from coliags_plugin.fields.mlp import embedded_inputs
 from tests.fields.made import make_field
 from tests.scenes import camera_at
 
@@ -27,8 +28,8 @@ def unit(*vectors: tuple[float, float, float]) -> torch.Tensor:
 
 def embedded(head: GlintAppearanceHead, directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
     count = len(directions)
-    seen = head.embed_direction(torch.ones(count, 4), directions, normals)
-    return head.embed(seen, torch.full((count, 1), 7.0), torch.ones(count, 1))
+    distances, cosines = torch.full((count, 1), 7.0), torch.ones(count, 1)
+    return embedded_inputs(head.networks(torch.ones(count, 4), directions, distances, cosines, normals))
 
 
 @settings(deadline=None)

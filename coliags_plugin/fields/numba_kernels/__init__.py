@@ -1,0 +1,1 @@
+"""The fields' numba kernels on the CPU. Importing any of them imports numba."""

@@ -1,0 +1,154 @@
+"""Decoding by kernels against the definition in PyTorch, in float64."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from coliags_plugin.fields.appearance_heads import PlainAppearanceHead
+from coliags_plugin.fields.children import visible_anchors
+from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+from coliags_plugin.fields.geometry_heads import PlainGeometryHead
+from tests.fields.made import make_field
+from tests.scenes import camera_at
+
+OUTPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
+CAMERA = camera_at(1.0, 0.5, 2.0, yaw=0.1)
+FIELDS = {
+    "coliags": {"geometry_head": "imve", "appearance_head": "imia"},
+    "scaffold": {"geometry_head": "plain", "appearance_head": {"name": "plain", "distance": True}},
+    "odd sizes": {
+        "geometry_head": {"name": "imve", "hidden": 20, "frequencies": 1},
+        "appearance_head": {"name": "imia-glints", "hidden": 41},
+        "children": 17,
+        "features": 13,
+    },
+    "attenuated": {"geometry_head": "imve", "appearance_head": {"name": "attenuated", "head": "imia"}, "children": 1},
+}
+
+
+def made(name):
+    """A field whose children overlap the image in part, float32."""
+    field = make_field(name="anchors", **FIELDS[name])
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        field.offsets.uniform_(-1, 1, generator=generator)
+        field.features.uniform_(-1, 1, generator=generator)
+        for parameter in (*field.geometry_head.parameters(), *field.appearance_head.parameters()):
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.1)
+    return field
+
+
+def derived(field, camera):
+    """Gaussians, and derivatives of a random weighting of all that they have."""
+    drawn = field.gaussians(camera)
+    generator = torch.Generator().manual_seed(2)
+    values = [getattr(drawn, name).double() for name in OUTPUTS]
+    weights = [torch.randn(value.shape, generator=generator, dtype=torch.float64) for value in values]
+    torch.stack([(value * weight).sum() for value, weight in zip(values, weights, strict=True)]).sum().backward()
+    return drawn, {name: parameter.grad for name, parameter in field.named_parameters()}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_gaussians_and_derivatives_are_those_of_the_definition(name):
+    field = made(name)
+    wide = copy.deepcopy(field).double()
+    (drawn, found), (expected, expected_found) = derived(field, CAMERA), derived(wide, CAMERA)
+    assert 0 < len(drawn) < field.element_count * field.slots_per_element
+    assert torch.equal(drawn.source_index, expected.source_index)
+    assert torch.equal(drawn.visible_sources, expected.visible_sources)
+    for output in OUTPUTS:
+        actual, wanted = getattr(drawn, output), getattr(expected, output)
+        # Of a direction's octaves, 512 times 1e-7 is left.
+        torch.testing.assert_close(actual.double(), wanted, rtol=3e-5, atol=3e-5)
+    assert found.keys() == expected_found.keys()
+    for key, wanted in expected_found.items():
+        scale = wanted.abs().max().clamp_min(1e-6)
+        torch.testing.assert_close(found[key].double() / scale, wanted / scale, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["coliags", "scaffold"])
+def test_derivatives_with_respect_to_the_pose(name):
+    """They reach the viewing directions, distances and cosines, and gamma of them."""
+    found = []
+    for field in (made(name), made(name).double()):
+        pose = CAMERA.camera_to_world.to(field.anchors.dtype, copy=True).requires_grad_()
+        derived(field, replace(CAMERA, camera_to_world=pose))
+        found.append(pose.grad.double())
+    assert found[1].abs().max() > 0
+    torch.testing.assert_close(found[0], found[1], rtol=2e-3, atol=2e-4 * float(found[1].abs().max()))
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    results = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2, 3, 5):
+            torch.set_num_threads(count)
+            results.append(derived(made("coliags"), CAMERA))
+    finally:
+        torch.set_num_threads(threads)
+    for drawn, found in results[1:]:
+        assert all(torch.equal(getattr(drawn, name), getattr(results[0][0], name)) for name in OUTPUTS)
+        assert all(torch.equal(found[name], results[0][1][name]) for name in found)
+
+
+def test_nothing_visible_is_nothing_drawn():
+    field = made("coliags")
+    behind = replace(CAMERA, camera_to_world=camera_at(0.0, 0.0, 1e4).camera_to_world)
+    drawn, found = derived(field, behind)
+    assert len(drawn) == len(drawn.visible_sources) == 0
+    assert not any(gradient.any() for gradient in found.values())
+
+
+def test_what_is_not_a_number_is_not_hidden():
+    field = made("coliags")
+    first = int(field.visible_anchors(CAMERA)[0])
+    kept = field.gaussians(CAMERA).source_index // field.slots_per_element
+    assert (kept == first).any()
+    with torch.no_grad():
+        field.features[first] = torch.nan
+    drawn = field.gaussians(CAMERA)
+    assert not (drawn.source_index // field.slots_per_element == first).any()  # as nan > 0 is false
+    with torch.no_grad():
+        field.appearance_head.color_mlp[2].bias[0] = torch.nan
+    assert field.gaussians(CAMERA).colors.isnan().any()
+
+
+def test_visible_anchors_are_those_whose_sphere_is_in_the_frustum():
+    field = made("coliags")
+    with torch.no_grad():
+        field.scalings.uniform_(-2.0, 1.0, generator=torch.Generator().manual_seed(3))
+    for camera in (CAMERA, camera_at(0.0, 0.0, 0.0), camera_at(4.0, 3.0, 1.0, yaw=1.0)):
+        wide = copy.deepcopy(field).double()
+        reach = (wide.offsets * wide.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
+        radii = reach + DRAWN_SIGMAS * wide.scalings[:, 3:].amax(dim=1).exp()
+        near = spheres_in_frustum(wide.anchors, radii - 1e-3, camera)
+        far = spheres_in_frustum(wide.anchors, radii + 1e-3, camera)
+        seen = torch.zeros_like(near)
+        seen[visible_anchors(field._rows, camera)] = True
+        assert near.any() and not far.all()
+        assert (near <= seen).all() and (seen <= far).all()
+
+
+def test_a_head_that_decodes_in_another_way_is_asked():
+    """A subclass with a ``forward`` of its own does not decode by the networks of the class above."""
+
+    class Halved(PlainGeometryHead):
+        def forward(self, features, directions):
+            opacities, covariances = super().forward(features, directions)
+            return opacities / 2, covariances
+
+    class Same(PlainAppearanceHead):
+        pass
+
+    field = made("scaffold")
+    whole = field.gaussians(CAMERA)
+    field.geometry_head.__class__ = Halved
+    field.appearance_head.__class__ = Same
+    half = field.gaussians(CAMERA)
+    torch.testing.assert_close(half.opacities, whole.opacities / 2)
+    torch.testing.assert_close(half.colors, whole.colors)
