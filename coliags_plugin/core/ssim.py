@@ -14,6 +14,7 @@ import cv2
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from coliags_plugin.core.masked import masked_mean, zero_outside
 
@@ -22,6 +23,8 @@ SIGMA = 1.5
 REACH = 5
 C1 = 0.01**2
 C2 = 0.03**2
+#: Shorter rows of an image, in numbers, are left to PyTorch by the kernels.
+_SHORTEST_ROW = 16
 
 
 def ssim(
@@ -34,7 +37,9 @@ def ssim(
 def ssim_map(
     rendered: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "H W C"]:
-    """Structural similarity of the windows around every pixel of images in [0, 1], differentiable twice.
+    """Structural similarity of the windows around every pixel of images in [0, 1].
+
+    Differentiable twice; float32 on the CPU by kernels, once and in the rendered image alone.
 
     With a mask, a window's means, variances and covariance are taken over its valid pixels alone, their weights
     scaled up to the total that the window has without a mask. So an ignored pixel influences neither the value nor
@@ -46,12 +51,16 @@ def ssim_map(
     if rendered.shape != truth.shape or rendered.dim() != 3:
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")
     a, b = zero_outside(rendered, mask), zero_outside(truth, mask)
+    gain = None if mask is None else _coverage_gain(mask, a.dtype)
+    on_kernels = a.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and not b.requires_grad
+    if on_kernels and a.shape[1] * a.shape[2] >= _SHORTEST_ROW:
+        compared: Tensor = _Compare.apply(a, b, None if gain is None else gain.expand_as(a))  # type: ignore[no-untyped-call]
+        return compared
     # Only the sum of the two variances is used, so one blur serves both. The ground truth is blurred separately, which
     # saves the backward pass the blur of a gradient that is not needed.
     mean_a, squares, products = _blur(torch.cat([a, a * a + b * b, a * b], dim=2)).chunk(3, dim=2)
     mean_b = _blur(b)
-    if mask is not None:
-        gain = _coverage_gain(mask, a.dtype)
+    if gain is not None:
         mean_a, mean_b, squares, products = mean_a * gain, mean_b * gain, squares * gain, products * gain
     product_of_means = mean_a * mean_b
     squared_means = mean_a * mean_a + mean_b * mean_b
@@ -71,6 +80,43 @@ def _blur(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
     """Gaussian blur with zero padding. [H, W, C]"""
     blurred: Tensor = _Blur.apply(images)  # type: ignore[no-untyped-call]
     return blurred
+
+
+class _Compare(torch.autograd.Function):
+    """The kernels of ``numba_kernels/ssim.py``."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, gain: Tensor | None) -> Tensor:
+        from coliags_plugin.core.numba_kernels.ssim import compare
+        from coliags_plugin.core.numba_kernels.threads import workers
+
+        result = torch.empty(a.shape)
+        derivatives = torch.empty(3, *a.shape) if ctx.needs_input_grad[0] else torch.empty(0)
+        ctx.tables = (a.shape[1] * a.shape[2], a.shape[2], *_flat(_window().float()))
+        images = _flat(a, b)
+        constants, factors, *written = _flat(
+            torch.tensor([C1, C2]), torch.empty(0) if gain is None else gain, result, derivatives
+        )
+        with workers() as run:
+            run(compare, *ctx.tables, constants, *images, factors, *written)
+        ctx.images = images
+        ctx.derivatives = written[1]
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor, None, None]:
+        from coliags_plugin.core.numba_kernels.ssim import compare_backward
+        from coliags_plugin.core.numba_kernels.threads import workers
+
+        of_a = torch.empty(given.shape)
+        with workers() as run:
+            run(compare_backward, *ctx.tables, *ctx.images, *_flat(given), ctx.derivatives, *_flat(of_a))
+        return of_a, None, None
+
+
+def _flat(*tensors: Tensor) -> list[Any]:
+    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
 
 
 class _Blur(torch.autograd.Function):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import ClassVar
 
+import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
@@ -85,7 +87,8 @@ class ScaleVolumeLoss(Loss):
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term; 0 where the camera sees no Gaussians."""
         scales = step.output.drawn.gaussians.scales
-        return scales.prod(dim=-1).sum() / max(len(scales), 1)
+        volumes = reduce(torch.mul, scales.unbind(dim=-1))  # the derivative of ``Tensor.prod`` is slower
+        return volumes.sum() / max(len(scales), 1)
 
 
 class SurfaceNormalsSettings(LossSettings):

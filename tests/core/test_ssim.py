@@ -151,6 +151,38 @@ def test_a_hole_does_not_flatter_its_surroundings():
     assert blacked - plain > 0.02
 
 
+@pytest.mark.parametrize("size", [(1, 6), (3, 50), (33, 64), (65, 97)])
+@pytest.mark.parametrize("with_mask", [False, True])
+def test_the_kernels_agree_with_double_precision(size, with_mask):
+    """Value and derivative of every window, those beyond the border too, and of rows that are not whole vectors."""
+    a, b = images(*size)
+    mask = torch.rand(size, generator=torch.Generator().manual_seed(1)) < 0.7 if with_mask else None
+    weights = torch.rand(*size, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    maps, gradients = [], []
+    for dtype in (torch.float64, torch.float32):
+        rendered = a.to(dtype, copy=True).requires_grad_()
+        found = ssim_map(rendered, b.to(dtype), mask)
+        (found * weights.to(dtype))[... if mask is None else mask].sum().backward()
+        maps.append(found.detach().double()[... if mask is None else mask])
+        gradients.append(rendered.grad.double())
+    torch.testing.assert_close(maps[1], maps[0], rtol=0, atol=2e-5)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=1e-4 * float(gradients[0].abs().max()))
+
+
+def test_the_kernels_give_the_same_bits_on_any_number_of_threads():
+    a, b = images(37, 41, dtype=torch.float32)
+    results = []
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        rendered = a.clone().requires_grad_()
+        found = ssim_map(rendered, b)
+        found.square().sum().backward()
+        results.append((found, rendered.grad))
+    torch.set_num_threads(before)
+    assert all(torch.equal(x, y) for result in results[1:] for x, y in zip(result, results[0], strict=True))
+
+
 def test_single_precision_is_good_enough_for_training():
     a, b = images(270, 338, dtype=torch.float32)
     assert ssim(a, b).item() == pytest.approx(ssim(a.double(), b.double()).item(), abs=1e-6)
