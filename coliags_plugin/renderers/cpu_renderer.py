@@ -69,7 +69,7 @@ def render_gaussians(
 
     Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. The first call on a machine compiles the
-    kernels, which takes about half a minute.
+    kernels, which takes about ten seconds.
 
     Raises:
         InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a

@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numba
 import numba.core.caching
 import pytest
 import torch
@@ -85,8 +86,9 @@ def widest_registers():
 def test_inner_loops_fill_the_widest_registers(sweep):
     register, floats = widest_registers()
     loop, signature, multiply_adds = INNER_LOOPS[sweep]
-    loop.compile(signature)
-    assembly = loop.inspect_asm(signature)
+    alone = numba.njit(loop.py_func, error_model="numpy", no_cpython_wrapper=True)
+    alone.compile(signature)
+    assembly = alone.inspect_asm(signature)
     packed = re.findall(rf"^\s*vfn?m\w+ps\s.*%{register}", assembly, re.MULTILINE)
     # Where a block takes two registers, forward's U_xx x is the same in both and computed once.
     assert len(packed) > (multiply_adds - 1) * (16 // floats)
@@ -117,6 +119,22 @@ def test_compiled_kernels_are_kept(cache, caplog):
     assert sum(again.stats.cache_hits.values()) == 1
     assert [record.levelname for record in caplog.records] == ["INFO"]
     assert str(cache) in caplog.text
+
+
+@compilation.part
+def plus(number, more):
+    return number + more
+
+
+def plus_three(number):
+    return plus(plus(number, 1), 2)
+
+
+def test_parts_are_compiled_once_for_all_constants_and_not_called_from_python(cache):
+    assert compilation.kernel(plus_three)(4) == 7
+    assert list(plus.overloads) == [(types.int64, types.int64)]
+    with pytest.raises(TypeError, match="plus is a part of kernels"):
+        plus(4, 1)
 
 
 def test_a_cache_folder_that_cannot_be_made_costs_nothing_but_time(cache, caplog, monkeypatch):

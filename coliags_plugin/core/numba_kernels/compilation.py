@@ -5,14 +5,18 @@ from __future__ import annotations
 import hashlib
 import logging
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numba
 import numpy.typing as npt
+from numba.core import types
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Flags, compile_extra
+from numba.core.registry import CPUDispatcher
 
 if TYPE_CHECKING:
     from numba.core.base import BaseContext
@@ -33,12 +37,12 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 
 def inline(function: _Function) -> _Function:
     """Compile a function that is inlined into its callers."""
-    return numba.njit(function, forceinline=True, **_OPTIONS)  # type: ignore[no-any-return]
+    return _Part(function, targetoptions={"nopython": True, "forceinline": True, **_OPTIONS})  # type: ignore[return-value]
 
 
 def part(function: _Function) -> _Function:
     """Compile a function that kernels call, on one thread."""
-    return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
+    return _Part(function, targetoptions={"nopython": True, **_OPTIONS})  # type: ignore[return-value]
 
 
 def kernel(function: _Function) -> _Function:
@@ -49,12 +53,47 @@ def kernel(function: _Function) -> _Function:
     process, abort the interpreter; and numba moves what stands behind such a loop in front of it when the loop's
     writes are out of its sight, in a function called.
     """
-    dispatcher = numba.njit(function, **_OPTIONS)
+    dispatcher = numba.njit(function, no_cfunc_wrapper=True, **_OPTIONS)
     try:
         dispatcher._cache = _KernelCache(function)
     except RuntimeError:  # numba: no folder to keep it in
         _announce("nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one")
     return dispatcher  # type: ignore[no-any-return]
+
+
+class _Part(CPUDispatcher):  # type: ignore[misc]
+    """A function that only kernels call; its LLVM code is optimised and translated within each of them alone.
+
+    numba compiles each function completely, with wrappers for calls from Python and C and once for each constant among its
+    arguments, before it links it into its callers and optimises and translates it again there. That doubles the time.
+    """
+
+    def compile(self, sig: Sequence[types.Type]) -> None:
+        arguments = tuple(types.unliteral(kind) for kind in sig)
+        if arguments in self.overloads:
+            return
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        library = _PartLibrary(self.targetctx.codegen(), self.py_func.__qualname__)
+        compiled = compile_extra(self.typingctx, self.targetctx, self.py_func, arguments, None, flags, {}, library)
+        self.targetctx.insert_user_function(compiled.fndesc, compiled.fndesc, [library])
+        self.overloads[arguments] = compiled
+
+    def get_overload(self, sig: Sequence[types.Type]) -> object:
+        return self.overloads[tuple(sig)].fndesc
+
+    def _compile_for_args(self, *arguments: object, **named: object) -> None:
+        raise TypeError(f"{self.py_func.__qualname__} is a part of kernels and cannot be called from Python")
+
+
+class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """LLVM code of a part and of all that it calls, not optimised."""
+
+    def finalize(self) -> None:
+        for library in dict.fromkeys(self._linking_libraries):
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalized = True
 
 
 class _KernelCache(FunctionCache):
@@ -88,7 +127,7 @@ class _KernelCache(FunctionCache):
 @cache
 def _announce(where: str) -> None:
     """Log once per cache location that kernels are being compiled."""
-    _logger.info("compiling kernels for this machine, about half a minute, once (%s)", where)
+    _logger.info("compiling kernels for this machine, about ten seconds, once (%s)", where)
 
 
 @cache
