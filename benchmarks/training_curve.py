@@ -3,7 +3,8 @@
     python benchmarks/training_curve.py --data PHANTOM --method coliags --out RUN --threads 1
 
 RUN becomes a run folder as `coliags train` makes it, with `curve.jsonl` beside its log. A killed curve goes on where it
-was when the same command is given again. Seconds are those of training alone; looking at the views does not count.
+was when the same command is given again. Seconds are those of training alone, of the clock and of the processor, all
+threads together; looking at the views does not count.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def look(trainer: Trainer, frames: list[Frame], scorer: Scorer, seen_only: bool)
     return {name: sum(values) / len(values) for name, values in found.items() if values}
 
 
-def curve_row(trainer: Trainer, scorer: Scorer, taken: dict[str, Any], seconds: float) -> dict[str, Any]:
+def curve_row(trainer: Trainer, scorer: Scorer, taken: dict[str, Any], spent: dict[str, float]) -> dict[str, Any]:
     """One row of the curve."""
     row: dict[str, Any] = {"step": trainer.step}
     for name, frames in trainer.scene.test_sets.items():
@@ -83,7 +84,7 @@ def curve_row(trainer: Trainer, scorer: Scorer, taken: dict[str, Any], seconds: 
         "gaussians": taken.get("gaussians", 0),
         "train_psnr": taken["psnr"],
         "loss": taken["loss"],
-        "seconds": round(seconds, 1),
+        **{name: round(value, 1) for name, value in spent.items()},
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
 
@@ -112,9 +113,10 @@ def main(options: Options) -> None:
         trainer.start(overwrite=True)
     scorer = Scorer("paper", only=METRICS)
     rows = rows_until(curve, trainer.step)
-    seconds = float(rows[-1]["seconds"]) if rows else 0.0
+    clocks = {"seconds": time.perf_counter, "processor_seconds": time.process_time}
+    spent = {name: float(rows[-1][name]) if rows else 0.0 for name in clocks}
     while trainer.step < options.steps:
-        began = time.perf_counter()
+        began = {name: clock() for name, clock in clocks.items()}
         events: dict[str, int] = {}
         while True:
             taken = trainer.take_step()
@@ -122,8 +124,8 @@ def main(options: Options) -> None:
                 events[name] = events.get(name, 0) + taken.get(name, 0)
             if trainer.step % options.every == 0 or trainer.step == options.steps:
                 break
-        seconds += time.perf_counter() - began
-        rows.append({**curve_row(trainer, scorer, taken, seconds), **events})
+        spent = {name: spent[name] + clock() - began[name] for name, clock in clocks.items()}
+        rows.append({**curve_row(trainer, scorer, taken, spent), **events})
         print(json.dumps(rows[-1]), flush=True)
         trainer.save()
         atomic_write(curve, "".join(json.dumps(row) + "\n" for row in rows))
