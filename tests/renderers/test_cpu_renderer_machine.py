@@ -1,6 +1,7 @@
-"""What the compiled kernels owe the machine: wide registers, a cache that may fail, threads and forks."""
+"""Kernels on their machine: wide registers, also of other processors, a cache that may fail, threads and forks."""
 
 import dataclasses
+import functools
 import logging
 import os
 import re
@@ -9,12 +10,12 @@ import sys
 import threading
 from pathlib import Path
 
+import llvmlite.binding as llvm
 import numba
 import numba.core.caching
 import pytest
 import torch
 from numba import types
-from numba.core.registry import cpu_target
 
 from coliags_plugin.core.numba_kernels import compilation
 from coliags_plugin.renderers import cpu_renderer
@@ -71,30 +72,44 @@ INNER_LOOPS = {
 }
 
 
-def widest_registers():
-    """Name and floats of the widest vector registers that numba compiles for; skips where they are not x86's."""
-    _, cpu, features = cpu_target.target_context.codegen().magic_tuple()
-    found = set(features.split(","))
-    if "+avx512f" in found:
-        return "zmm", 16
-    if {"+avx2", "+fma"} <= found:
-        return "ymm", 8
-    pytest.skip(f"'{cpu}' has no AVX2 with FMA, whose instructions this test looks for")
+#: Processors by their vectors: LLVM's triple and name, a fused multiply-add of full registers, and floats in one.
+PROCESSORS = {
+    "AVX-512": ("x86_64-unknown-linux-gnu", "skylake-avx512", r"vfn?m\w+ps\s.*%zmm", 16),
+    "AVX2": ("x86_64-unknown-linux-gnu", "haswell", r"vfn?m\w+ps\s.*%ymm", 8),
+    "NEON, Linux": ("aarch64-unknown-linux-gnu", "neoverse-n1", r"fml[as]\s+v\d+\.4s", 4),
+    "NEON, macOS": ("arm64-apple-macosx13.0.0", "apple-m1", r"fml[as]\.4s\s", 4),
+}
 
 
-@pytest.mark.parametrize("sweep", INNER_LOOPS)
-def test_inner_loops_fill_the_widest_registers(sweep):
-    register, floats = widest_registers()
-    loop, signature, multiply_adds = INNER_LOOPS[sweep]
-    alone = numba.njit(loop.py_func, error_model="numpy", no_cpython_wrapper=True)
+@functools.cache
+def llvm_code(sweep):
+    """The inner loop of a sweep in LLVM's language, without its target."""
+    loop, signature, _ = INNER_LOOPS[sweep]
+    alone = numba.njit(loop.py_func, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
     alone.compile(signature)
-    assembly = alone.inspect_asm(signature)
-    packed = re.findall(rf"^\s*vfn?m\w+ps\s.*%{register}", assembly, re.MULTILINE)
-    # Where a block takes two registers, forward's U_xx x is the same in both and computed once.
-    assert len(packed) > (multiply_adds - 1) * (16 // floats)
+    return re.sub("^target .*$", "", alone.inspect_llvm(signature), flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("processor", PROCESSORS)
+@pytest.mark.parametrize("sweep", INNER_LOOPS)
+def test_inner_loops_fill_the_widest_registers(sweep, processor):
+    triple, name, fused, floats = PROCESSORS[processor]
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    try:
+        target = llvm.Target.from_triple(triple)
+    except RuntimeError:
+        pytest.skip(f"this llvmlite does not translate to {triple}")
+    machine = target.create_target_machine(cpu=name)
+    module = llvm.parse_assembly(llvm_code(sweep))
+    module.triple, module.data_layout = triple, str(machine.target_data)
+    assembly = machine.emit_assembly(module)
+    # Where a block takes several registers, forward's U_xx x is the same in some and computed once.
+    assert len(re.findall(rf"^\s*{fused}", assembly, re.MULTILINE)) > (INNER_LOOPS[sweep][2] - 1) * (16 // floats)
     # One number at a time, or by a function of the C library.
-    assert not re.findall(r"^\s*v?(?:fn?m(?:add|sub)\w*|mul|add|sub)ss\s.*", assembly, re.MULTILINE)
-    assert not re.findall(r"\b(?:exp2?|log2?|pow)f?\b", assembly)
+    scalar = r"^\s*(?:v?(?:fn?m(?:add|sub)\w*|mul|add|sub)ss|fn?m(?:add|sub|ul)\s+s\d)"
+    assert not re.findall(scalar, assembly, re.MULTILINE)
+    assert not re.findall(r"\b_?(?:exp2?|log2?|pow|fma)f?\b", assembly)
 
 
 # --- cache ------------------------------------------------------------------------------------------------------------
