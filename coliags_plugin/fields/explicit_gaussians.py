@@ -82,6 +82,10 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
         """Colours of some Gaussians, seen along vectors from the camera's centre to theirs. [V, 3]"""
         degree = int(self.degree)
+        if sight.device.type == "cpu" and sight.dtype == torch.float32:
+            from coliags_plugin.fields.numba_kernels.spherical_harmonics import colors
+
+            return colors(self.sh0, self.shN, rows, sight, degree)
         higher = unique_rows(self.shN[:, : (degree + 1) ** 2 - 1], rows)  # the active ones alone
         harmonics = torch.cat([unique_rows(self.sh0, rows), higher], dim=1)
         return spherical_harmonics.colors(harmonics, nn.functional.normalize(sight, dim=1), degree)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
 
@@ -21,7 +20,7 @@ def frustum_planes(camera: Camera) -> Float[Tensor, "5 3"]:
     # components of its normal up to length.
     sides = ((fx, 0, cx), (-fx, 0, camera.width - cx), (0, fy, cy), (0, -fy, camera.height - cy))
     local = camera.camera_to_world.new_tensor([(0, 0, 1), *sides])
-    return torch.nn.functional.normalize(local, dim=1) @ camera.camera_to_world[:3, :3].T
+    return nn.functional.normalize(local, dim=1) @ camera.camera_to_world[:3, :3].T
 
 
 def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera) -> Bool[Tensor, "M"]:
@@ -29,6 +28,6 @@ def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"],
 
     Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused. World frame, scene units.
     """
-    along = (centers - camera.center) @ frustum_planes(camera).T
-    along[:, 0] -= camera.near_plane
-    return (along.amin(dim=1) > -radii) if len(along) else along.new_zeros(0, dtype=torch.bool)
+    distances = frustum_planes(camera) @ (centers - camera.center).T
+    distances[0] -= camera.near_plane
+    return distances.amin(dim=0) > -radii

@@ -12,11 +12,26 @@ MAX_DEGREE = 3
 #: Y_0, by which a colour becomes a coefficient of degree 0.
 Y0 = 0.5 / math.sqrt(math.pi)
 
-_Y1 = math.sqrt(3.0 / (4.0 * math.pi))
-_Y2 = tuple(math.sqrt(value / math.pi) for value in (15.0 / 4.0, 15.0 / 4.0, 5.0 / 16.0, 15.0 / 4.0, 15.0 / 16.0))
-_Y3 = tuple(
-    math.sqrt(value / math.pi)
-    for value in (35.0 / 32.0, 105.0 / 4.0, 21.0 / 32.0, 7.0 / 16.0, 21.0 / 32.0, 105.0 / 16.0, 35.0 / 32.0)
+#: Of the functions of degrees 1 to 3 in turn: what the polynomials in :func:`basis` are multiplied by.
+FACTORS = tuple(
+    sign * math.sqrt(value / math.pi)
+    for sign, value in (
+        (-1.0, 3 / 4),
+        (1.0, 3 / 4),
+        (-1.0, 3 / 4),
+        (1.0, 15 / 4),
+        (-1.0, 15 / 4),
+        (1.0, 5 / 16),
+        (-1.0, 15 / 4),
+        (1.0, 15 / 16),
+        (-1.0, 35 / 32),
+        (1.0, 105 / 4),
+        (-1.0, 21 / 32),
+        (1.0, 7 / 16),
+        (-1.0, 21 / 32),
+        (1.0, 105 / 16),
+        (-1.0, 35 / 32),
+    )
 )
 
 
@@ -28,24 +43,23 @@ def basis(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree {degree}: expected 0 to {MAX_DEGREE}")
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, Y0)]
-    if degree >= 1:
-        values += [-_Y1 * y, _Y1 * z, -_Y1 * x]
+    xx, yy, zz = x * x, y * y, z * z
+    polynomials = [y, z, x]
     if degree >= 2:
-        a, b, c, d, e = _Y2
-        values += [a * x * y, -b * y * z, c * (3.0 * z * z - 1.0), -d * x * z, e * (x * x - y * y)]
+        polynomials += [x * y, y * z, 3.0 * zz - 1.0, x * z, xx - yy]
     if degree >= 3:
-        a, b, c, d, e, f, g = _Y3
-        values += [
-            -a * y * (3.0 * x * x - y * y),
-            b * x * y * z,
-            -c * y * (5.0 * z * z - 1.0),
-            d * z * (5.0 * z * z - 3.0),
-            -e * x * (5.0 * z * z - 1.0),
-            f * z * (x * x - y * y),
-            -g * x * (x * x - 3.0 * y * y),
+        polynomials += [
+            y * (3.0 * xx - yy),
+            x * y * z,
+            y * (5.0 * zz - 1.0),
+            z * (5.0 * zz - 3.0),
+            x * (5.0 * zz - 1.0),
+            z * (xx - yy),
+            x * (xx - 3.0 * yy),
         ]
-    return torch.stack(values, dim=-1)
+    count = (degree + 1) ** 2 - 1
+    values = [factor * polynomial for factor, polynomial in zip(FACTORS[:count], polynomials, strict=False)]
+    return torch.stack([torch.full_like(x, Y0), *values], dim=-1)
 
 
 def colors(coefficients: Float[Tensor, "N B 3"], directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N 3"]:

@@ -540,6 +540,44 @@ store_all = _writing_all("store_all", _emit_store_all)
 store_columns = _writing_all("store_columns", _emit_store_columns)
 
 
+@intrinsic
+def load_rows(typingctx: Context, table: types.Type, places: types.Type, column: types.Type) -> Intrinsic:
+    """Sixteen consecutive numbers of each of sixteen rows: vector i from ``table[places[i] + column]`` on."""
+    if not (_is_table(table) and isinstance(places, types.Array)):
+        return None
+
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+        return _pack(builder, [_read(builder, row) for row in _rows(context, builder, signature, arguments)])
+
+    return _tuple_of_lanes(WIDTH)(table, places, types.intp), generate
+
+
+@intrinsic
+def store_rows(
+    typingctx: Context, table: types.Type, places: types.Type, column: types.Type, vectors: types.Type
+) -> Intrinsic:
+    """Sixteen vectors, each to a row: vector i to ``table[places[i] + column]`` and on, in this order."""
+    if not (_is_table(table) and isinstance(places, types.Array)):
+        return None
+
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+        parts = [_element(builder, arguments[3], signature.args[3], row) for row in range(WIDTH)]
+        _emit_store_all(builder, parts, _rows(context, builder, signature, arguments))
+        return context.get_dummy_value()
+
+    return types.none(table, places, types.intp, vectors), generate
+
+
+def _rows(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> list[ir.Value]:
+    """Addresses of a column of sixteen rows of a table, which begin at places in it."""
+    table, places, column = arguments[:3]
+    begins = context.make_array(signature.args[1])(context, builder, places).data
+    return [
+        _address(context, builder, signature.args[0], table, builder.add(builder.load(begin), column))
+        for begin in _places(builder, begins, WIDTH)
+    ]
+
+
 def _transposed(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
     """The columns of a 16 x 16 matrix from its rows, or the rows from its columns."""
     low = [lane for pair in range(8) for lane in (pair, WIDTH + pair)]
