@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -24,6 +25,10 @@ from coliags_plugin.renderers.rays import CompositedRays, even_places, refined_p
 _COMPOSITED = frozenset(OUTPUTS) - SURFEL_OUTPUTS - {"normals"}
 #: Ending of the outputs of the first pass.
 _COARSE = "_coarse"
+#: Transmittance behind which samples are not evaluated in rendering.
+OPAQUE = 1e-6
+#: Samples of each ray that are evaluated at once in rendering, and what the number of rays is a multiple of.
+_AT_ONCE, _RAYS = 8, 256
 
 
 class VolumeRendererSettings(Settings):
@@ -186,14 +191,17 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         colors: bool,
     ) -> CompositedRays:
         """One pass through a level of the field."""
-        positions = camera.center + places[..., None] * lines.steps[:, None]
-        where = (positions, lines.directions, camera)
-        if generator is None and not colors:
-            density, rgb = level.query_density(*where), None
-        else:
-            samples = level.query(*where) if generator is None else level.query_in_training(*where, generator)
+        lengths = lines.stretches(places)
+        rgb: Tensor | None = None
+        if generator is not None:
+            where = (lines.positions(camera, places), lines.directions, camera)
+            samples = level.query_in_training(*where, generator)
             density, rgb = samples.density, samples.rgb
-        behind = transmittances(density, lines.stretches(places), self.settings.opaque_end)
+        elif torch.is_grad_enabled():
+            density, rgb = _samples(level, camera, lines, places, slice(None), colors)
+        else:
+            density, rgb = _samples_until_opaque(level, camera, lines, places, lengths, colors)
+        behind = transmittances(density, lengths, self.settings.opaque_end)
         return CompositedRays(places * lines.depth_per_place, behind, rgb)
 
     def _bounds(self, field: RadianceField, near_plane: float) -> tuple[Tensor | float, Tensor | float]:
@@ -237,8 +245,57 @@ class _Lines:
             return cls(directions, directions, lengths, ones, 1.0 / lengths, reach)
         return cls(rays, directions, lengths, lengths, ones, reach)
 
+    def positions(
+        self, camera: Camera, places: Float[Tensor, "P S"], rows: Tensor | slice = slice(None)
+    ) -> Float[Tensor, "P S 3"]:
+        """World positions of places along some of the rays."""
+        return camera.center + places[..., None] * self.steps[rows, None]
+
     def stretches(self, places: Float[Tensor, "P S"]) -> Float[Tensor, "P S"]:
         """Length of ray that each sample stands for: to the next; the last one's makes all of them ``reach``."""
         between = places.diff(dim=1)
         last = self.reach - (places[:, -1:] - places[:, :1])
         return torch.cat([between, last], dim=1) * self.length_per_place
+
+
+def _samples(
+    level: RadianceLevel,
+    camera: Camera,
+    lines: _Lines,
+    places: Float[Tensor, "R S"],
+    rows: Tensor | slice,
+    colors: bool,
+) -> tuple[Float[Tensor, "R S"], Float[Tensor, "R S 3"] | None]:
+    """Density, and colours where asked for, at places along some of the rays."""
+    where = (lines.positions(camera, places, rows), lines.directions[rows], camera)
+    if not colors:
+        return level.query_density(*where), None
+    samples = level.query(*where)
+    return samples.density, samples.rgb
+
+
+def _samples_until_opaque(
+    level: RadianceLevel,
+    camera: Camera,
+    lines: _Lines,
+    places: Float[Tensor, "P S"],
+    lengths: Float[Tensor, "P S"],
+    colors: bool,
+) -> tuple[Float[Tensor, "P S"], Float[Tensor, "P S 3"] | None]:
+    """:func:`_samples` of all rays, each at least until less than :data:`OPAQUE` gets through; 0 behind."""
+    density = torch.zeros_like(places)
+    rgb = places.new_zeros(*places.shape, 3) if colors else None
+    absorbed = places.new_zeros(len(places))
+    rows = torch.arange(len(places), device=places.device)
+    for first in range(0, places.shape[1], _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        density[rows, part], found = _samples(level, camera, lines, places[rows, part], rows, colors)
+        if rgb is not None and found is not None:
+            rgb[rows, part] = found
+        absorbed += (density[:, part] * lengths[:, part]).sum(1)
+        going_on = int((absorbed < -math.log(OPAQUE)).sum())
+        if going_on == 0:
+            break
+        # oneDNN compiles, and keeps in memory, kernels for every number of rows of a product of bfloat16: few of them.
+        rows = absorbed.argsort()[: math.ceil(going_on / _RAYS) * _RAYS]
+    return density, rgb

@@ -18,7 +18,7 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
+from coliags_plugin.renderers.volume_renderer import OPAQUE, VolumeRenderer, VolumeRendererSettings
 from tests.scenes import camera_at
 
 COLOR = (0.8, 0.3, 0.1)
@@ -211,6 +211,24 @@ def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
     assert torch.equal(silent.rgb, spoken.rgb)
     with pytest.raises(RuntimeError, match="asked for colours"):
         make(**REFINED).render(field, camera, ("rgb_coarse",))
+
+
+def test_samples_behind_an_opaque_surface_are_left_out_in_rendering_and_change_nothing():
+    class Wall(Fog):
+        asked = 0
+
+        def query(self, positions, directions, camera):
+            self.asked += positions.shape[:2].numel()
+            return super().query(positions, directions, camera)
+
+    camera, fields = camera_from(3.0, 0, 0, 0, 40, 30), (Wall(20.0, start=5.0), Wall(20.0, start=5.0))
+    wants = ("depth_accumulated", "depth_median", "inverse_depth_accumulated", "rgb_coarse")
+    everywhere = make(**REFINED).render(fields[0], camera, wants)
+    with torch.no_grad():
+        output = make(**REFINED).render(fields[1], camera, wants)
+    assert fields[0].asked == 40 * 30 * (48 + 48 + 64) and fields[1].asked < 0.8 * fields[0].asked
+    for name in ("rgb", "alpha", *wants):
+        torch.testing.assert_close(output[name], everywhere[name].detach(), rtol=0, atol=9.0 * OPAQUE)
 
 
 def test_chance_places_samples_in_training_alone():
