@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from typing import Any, Literal
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.fields.mlp import linear_layers
+from coliags_plugin.fields.precision import Precision, reduced_dtype
 
 #: Rows of a product of bfloat16 are a multiple of this: oneDNN compiles, and keeps in memory, a kernel for every size.
 _ROWS = 8192
-#: Of the products in training; auto: bfloat16 on CPUs that have instructions for it, otherwise float32.
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class DiffuseNetwork(nn.Module):
@@ -48,7 +43,7 @@ class DiffuseNetwork(nn.Module):
         """
         cosines = (normals * lamps).sum(1, keepdim=True)
         inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
-        dtype = self._reduced_dtype(inputs) if in_training else inputs.dtype
+        dtype = reduced_dtype(self.precision, inputs) if in_training else inputs.dtype
         *hidden, (last_weight, last_bias) = (
             (layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in self.layers
         )
@@ -60,16 +55,3 @@ class DiffuseNetwork(nn.Module):
         # The bias, near 1, is added to the small rest in full precision.
         rest = nn.functional.linear(values, last_weight.to(dtype))[: len(inputs)]
         return rest.to(inputs.dtype) + last_bias
-
-    def _reduced_dtype(self, inputs: Tensor) -> torch.dtype:
-        if inputs.dtype != torch.float32 or self.precision == "float32":
-            return inputs.dtype
-        fast = self.precision == "bfloat16" or (inputs.device.type == "cpu" and _cpu_multiplies_bfloat16())
-        return torch.bfloat16 if fast else inputs.dtype
-
-
-@cache
-def _cpu_multiplies_bfloat16() -> bool:
-    """Whether the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
-    capabilities: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

@@ -21,8 +21,9 @@ from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
-from coliags_plugin.fields.diffuse_network import DiffuseNetwork, Precision
+from coliags_plugin.fields.diffuse_network import DiffuseNetwork
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+from coliags_plugin.fields.precision import Precision
 from coliags_plugin.fields.rows import unique_rows
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
 

@@ -23,6 +23,7 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.mlp import cosine_embedding, first_layer, glorot_linear
 from coliags_plugin.fields.normalisation import SceneNormalisation, surface_distances
+from coliags_plugin.fields.precision import Precision, reduced_dtype
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +39,7 @@ class ReimNerfFieldSettings(Settings):
     direction_frequencies: int = Option(default=4, ge=0)  # of the embedding
     light_frequencies: int = Option(default=4, ge=0)  # of the embedding
     light: bool = True  # whether the colour depends on the lamp's position, which is the camera's; without: NeRF
+    render_precision: Precision = "auto"  # of products in rendering; auto: bfloat16 where the CPU is made for it
     density_noise: float = Option(default=1.0, ge=0)  # standard deviation, in training, before ReLU, per field's unit
 
     @model_validator(mode="after")
@@ -66,21 +68,28 @@ class RadianceMLP(nn.Module):
         self.color = glorot_linear(width + seen, settings.color_width, generator)
         self.rgb = glorot_linear(settings.color_width, 3, generator)
 
-    def hidden(self, positions: Float[Tensor, "P S 3"]) -> Float[Tensor, "P*S W"]:
-        """Output of the trunk at normalised coordinates."""
+    def hidden(self, positions: Float[Tensor, "P S 3"], in_rendering: bool = False) -> Float[Tensor, "P*S W"]:
+        """Output of the trunk at normalised coordinates.
+
+        In rendering, without gradients, factors of products are of ``render_precision``, but for the first layer, which
+        needs all digits of the positions.
+        """
         embedded = cosine_embedding(positions.flatten(0, 1), self.settings.position_frequencies)
-        hidden = embedded
+        dtype = reduced_dtype(self.settings.render_precision, embedded) if in_rendering else embedded.dtype
+        hidden = self.trunk[0](embedded).relu_().to(dtype)
+        embedded = embedded.to(dtype)
         for index, layer in enumerate(self.trunk):
+            weight, bias = layer.get_parameter("weight").to(dtype), layer.get_parameter("bias").to(dtype)
             if index == self.settings.skip:
-                weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
                 hidden = first_layer(hidden, embedded, weight, bias).relu_()
-            else:
-                hidden = layer(hidden).relu_()
+            elif index > 0:
+                hidden = functional.linear(hidden, weight, bias).relu_()
         return hidden
 
     def raw_density(self, hidden: Float[Tensor, "P*S W"], rays: int) -> Float[Tensor, "P S"]:
         """Density before ReLU, in normalised units, of what :meth:`hidden` gave for P rays."""
-        return functional.linear(hidden, self.density.weight, self.density.bias).view(rays, -1)
+        density = functional.linear(hidden.to(self.density.weight.dtype), self.density.weight, self.density.bias)
+        return density.view(rays, -1)
 
     def colors(
         self, hidden: Float[Tensor, "P*S W"], directions: Float[Tensor, "P 3"], light: Float[Tensor, "3"]
@@ -98,7 +107,7 @@ class RadianceMLP(nn.Module):
         from_feature, from_ray = self.color.weight[:, : settings.width], self.color.weight[:, settings.width :]
         constant = self.color.bias + from_feature @ self.feature.bias
         of_ray = functional.linear(seen, from_ray, constant)
-        of_point = functional.linear(hidden, from_feature @ self.feature.weight)
+        of_point = functional.linear(hidden, (from_feature @ self.feature.weight).to(hidden.dtype))
         mixed = (of_point.view(len(seen), -1, settings.color_width) + of_ray[:, None]).relu_()
         return functional.linear(mixed, self.rgb.weight, self.rgb.bias).sigmoid()
 
@@ -132,16 +141,19 @@ class _NetworkLevel(RadianceLevel):
     def query_density(
         self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
     ) -> Float[Tensor, "P S"]:
-        normalisation, network = self._parts()
-        return self._density(network.hidden(normalisation(positions)), len(positions), None)
+        return self._density(self._hidden(positions, None), len(positions), None)
 
     def _samples(
         self, positions: Tensor, directions: Tensor, camera: Camera, generator: torch.Generator | None
     ) -> RadianceSamples:
         normalisation, network = self._parts()
-        hidden = network.hidden(normalisation(positions))
+        hidden = self._hidden(positions, generator)
         rgb = network.colors(hidden, directions, normalisation(camera.center))
         return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
+
+    def _hidden(self, positions: Tensor, generator: torch.Generator | None) -> Tensor:
+        normalisation, network = self._parts()
+        return network.hidden(normalisation(positions), generator is None and not torch.is_grad_enabled())
 
     def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
         """Per scene unit."""

@@ -93,6 +93,25 @@ def test_the_lamp_changes_colours_and_not_densities():
         assert torch.equal(first.density, field.query_density(positions, directions, here))
 
 
+def test_bfloat16_is_of_rendering_alone():
+    positions = torch.rand(64, 8, 3, generator=generator()) * 10 + torch.tensor([0.0, 0.0, 10.0])
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator(1)), dim=1)
+    camera = camera_at(0, 0, 0).to(dtype=torch.float32)
+    full, half = (make(render_precision=precision, density_noise=0.0).float() for precision in ("float32", "bfloat16"))
+    where = (positions, directions, camera)
+    trained, drawn = ([field.query(*where), field.query_in_training(*where, generator())] for field in (full, half))
+    for one, other in zip(trained, drawn, strict=True):
+        assert torch.equal(one.density, other.density) and torch.equal(one.rgb, other.rgb)
+    with torch.no_grad():
+        exact, reduced = (field.query(*where) for field in (full, half))
+        still = half.query_in_training(*where, generator())
+    assert torch.equal(exact.density, trained[0].density) and torch.equal(still.density, trained[0].density)
+    assert reduced.density.dtype == reduced.rgb.dtype == torch.float32
+    for one, other in ((exact.density, reduced.density), (exact.rgb, reduced.rgb)):
+        assert not torch.equal(one, other)
+        torch.testing.assert_close(one, other, rtol=0, atol=float(0.01 * one.max()))
+
+
 # ----------------------------------------------------------------------------------------------------- units of length
 
 
@@ -236,13 +255,14 @@ def test_a_run_resumes_to_the_bit_and_renders_alike_twice(tmp_path):
 
 
 def test_noise_and_jitter_are_of_training_alone(tmp_path):
-    run = trainer(tmp_path / "run", ["renderer.jitter=false"])
+    even = ["renderer.jitter=false", "field.render_precision=float32"]
+    run = trainer(tmp_path / "run", even)
     camera, pixels = wall_scene().train[0].camera, torch.tensor([[4, 5], [20, 12]])
     still = run.model.render(camera, pixels=pixels)
     noisy = [run.model.render(camera, pixels=pixels, generator=generator(seed)) for seed in (0, 0, 1)]
     assert torch.equal(noisy[0].rgb, noisy[1].rgb) and not torch.equal(noisy[0].rgb, noisy[2].rgb)
     assert torch.equal(still.rgb, run.model.render(camera, pixels=pixels).rgb)
-    silent = trainer(tmp_path / "run", ["renderer.jitter=false", "field.density_noise=0.0"])
+    silent = trainer(tmp_path / "run", [*even, "field.density_noise=0.0"])
     silent = silent.model.render(camera, pixels=pixels, generator=generator())
     assert torch.equal(silent.rgb, still.rgb)
 
