@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+import math
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead, HeadNetworks
@@ -24,6 +27,8 @@ MAX_OFFSET = 20.0
 _MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE = 0.02, 0.05, 0.1
 #: Largest b and c that a fit may start with: cos^9 in linear light.
 _LARGEST_EXPONENT = 4.0
+#: Fewer Gaussians are left to PyTorch by the kernels.
+_FEWEST = 16
 
 
 class AttenuatedAppearanceSettings(Settings):
@@ -172,7 +177,14 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         if light is not None:
             incidences = None if facing is None else (light.towards(positions, facing) * facing).sum(1).abs()
             return colors * self.law(*light.incidence(positions), incidences)
-        rays = positions - (camera.center + camera.camera_to_world[:3, :3] @ self.offset)
+        lamp = camera.center + camera.camera_to_world[:3, :3] @ self.offset
+        if colors.device.type == "cpu" and colors.dtype == torch.float32 and len(colors) >= _FEWEST:
+            exponents = functional.pad(self.exponents, (0, 3 - self.exponents.shape[1])).expand(3, 3)
+            bounds = torch.stack([torch.tensor([_MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE]), self.reference.expand(3)])
+            seen = (lamp, camera.optical_axis, exponents, positions, facing, bounds)
+            attenuated: Tensor = _Attenuate.apply(colors, *seen)  # type: ignore[no-untyped-call]
+            return attenuated
+        rays = positions - lamp
         return colors * self._along(rays, rays @ camera.optical_axis, facing)
 
     @property
@@ -184,3 +196,45 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             "lamp_offset": self.offset.detach().tolist(),
             "reference_distance": float(self.reference),
         }
+
+
+class _Attenuate(torch.autograd.Function):
+    """The kernels of ``numba_kernels/attenuation.py``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        colors: Tensor,
+        lamp: Tensor,
+        axis: Tensor,
+        exponents: Tensor,
+        positions: Tensor,
+        normals: Tensor | None,
+        bounds: Tensor,
+    ) -> Tensor:
+        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.fields.numba_kernels.attenuation import attenuate
+
+        facing = colors.new_empty(0) if normals is None else normals
+        view = torch.cat([lamp.detach(), axis.detach(), bounds.flatten()])
+        ctx.tables = [
+            tensor.detach().contiguous().view(-1).numpy() for tensor in (colors, positions, facing, view, exponents)
+        ]
+        result = torch.empty(colors.shape)
+        with workers() as run:
+            run(attenuate, *ctx.tables, result.view(-1).numpy())
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+        from coliags_plugin.core.numba_kernels.threads import workers
+        from coliags_plugin.fields.numba_kernels.attenuation import SLABS, attenuate_backward
+
+        of_colors, sums = torch.empty(given.shape), torch.empty(SLABS, 16)
+        written = (of_colors.view(-1).numpy(), sums.view(-1).numpy())
+        with workers() as run:
+            run(attenuate_backward, *ctx.tables, given.contiguous().view(-1).numpy(), *written)
+        total = sums.sum(0)
+        # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
+        return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None

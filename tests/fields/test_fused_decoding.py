@@ -27,6 +27,11 @@ FIELDS = {
         "features": 13,
     },
     "attenuated": {"geometry_head": "imve", "appearance_head": {"name": "attenuated", "head": "imia"}, "children": 1},
+    "with incidence": {
+        "geometry_head": "plain",
+        "appearance_head": {"name": "attenuated", "head": "imia", "incidence_exponent": 0.3},
+    },
+    "one channel": {"geometry_head": "plain", "appearance_head": {"name": "attenuated", "head": "imia", "channels": 1}},
 }
 
 
@@ -70,7 +75,7 @@ def test_gaussians_and_derivatives_are_those_of_the_definition(name):
         torch.testing.assert_close(found[key].double() / scale, wanted / scale, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["coliags", "scaffold"])
+@pytest.mark.parametrize("name", ["coliags", "scaffold", "with incidence"])
 def test_derivatives_with_respect_to_the_pose(name):
     """They reach the viewing directions, distances and cosines, and gamma of them."""
     found = []
@@ -94,6 +99,28 @@ def test_any_number_of_threads_gives_the_same_bits():
     for drawn, found in results[1:]:
         assert all(torch.equal(getattr(drawn, name), getattr(results[0][0], name)) for name in OUTPUTS)
         assert all(torch.equal(found[name], results[0][1][name]) for name in found)
+
+
+def test_the_law_is_bounded_close_to_the_lamp_and_beside_it():
+    """Where distance, cosine or incidence are at their bounds, neither the law nor its derivatives depend on them."""
+    fields = [made("with incidence"), made("with incidence").double()]
+    results = []
+    for field in fields:
+        head = field.appearance_head
+        generator = torch.Generator().manual_seed(4)
+        towards = torch.nn.functional.normalize(torch.randn(333, 3, generator=generator, dtype=torch.float64), dim=1)
+        steps = torch.logspace(-3, 1, 333, dtype=torch.float64)[:, None] * float(head.reference)
+        positions = (CAMERA.center + towards * steps).to(field.anchors.dtype)
+        normals = torch.nn.functional.normalize(towards.flip(1) + 0.1, dim=1).to(positions)
+        colors = torch.rand(333, 3, generator=generator).to(positions).requires_grad_()
+        lit = head.apply_light(colors, positions, normals, CAMERA.to("cpu", positions.dtype), None)
+        (lit * torch.rand(lit.shape, generator=generator).to(lit)).sum().backward()
+        results.append((lit, colors.grad, head.exponents.grad, head.lamp_offset.grad))
+    for name, actual, wanted in zip(("lit", "colors", "exponents", "offset"), *results, strict=True):
+        scale = float(wanted.abs().max())
+        torch.testing.assert_close(
+            actual.double(), wanted, rtol=1e-4, atol=2e-5 * scale, msg=lambda text, of=name: of + text
+        )
 
 
 def test_nothing_visible_is_nothing_drawn():

@@ -13,6 +13,7 @@ so what is compiled has no loop over them. Tables are flat, contiguous float32 a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
@@ -290,8 +291,6 @@ quick_div = _lanewise("quick_div", 2, lambda builder, a, b: builder.fdiv(a, b, f
 neg = _lanewise("neg", 1, lambda builder, a: builder.fneg(a))
 #: Square root
 sqrt = _lanewise("sqrt", 1, lambda builder, a: _call(builder, "llvm.sqrt", a))
-#: Logarithm to base 2, by the C library one number at a time: not for inner loops
-log2 = _lanewise("log2", 1, lambda builder, a: _call(builder, "llvm.log2", a))
 #: The integer at or above
 ceil = _lanewise("ceil", 1, lambda builder, a: _call(builder, "llvm.ceil", a))
 #: The integer at or below
@@ -352,7 +351,7 @@ lowest_bit = _of_one(
 bit_count = _of_one("bit_count", types.Integer, types.int64, lambda builder, flags: builder.ctpop(flags))
 
 
-# --- 2^x --------------------------------------------------------------------------------------------------------------
+# --- 2^x and its inverse --------------------------------------------------------------------------------------------------------------
 
 #: Adding it to a float32 rounds that to an integer, which is then found in the lowest bits.
 _ROUNDING_BIAS = 1.5 * 2.0**23
@@ -381,6 +380,34 @@ def _emit_exp2(builder: ir.IRBuilder, power: ir.Value) -> ir.Value:
 
 #: 2^a to a relative error of 2e-7 for a in [-126, 127]; any bits at all elsewhere
 exp2 = _lanewise("exp2", 1, _emit_exp2)
+
+#: Bits of the float32 nearest to sqrt(1/2), at which mantissas begin.
+_ROOT_HALF_BITS = 0x3F3504F3
+
+
+def _emit_log2(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
+    def ints(value: int) -> ir.Value:
+        return _constant([value] * WIDTH, _INTS)
+
+    def floats(value: float) -> ir.Value:
+        return _constant([value] * WIDTH)
+
+    bits = builder.bitcast(number, _INTS)
+    exponent = builder.ashr(builder.sub(bits, ints(_ROOT_HALF_BITS)), ints(23))
+    mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, ints(23))), _LANES)
+    # log((1 + t) / (1 - t)) = 2 (t + t^3/3 + t^5/5 + ...), and |t| < 0.172.
+    t = builder.fdiv(builder.fsub(mantissa, floats(1.0)), builder.fadd(mantissa, floats(1.0)))
+    square = builder.fmul(t, t)
+    series = floats(2.0 / math.log(2.0) / 9.0)
+    for odd in (7.0, 5.0, 3.0, 1.0):
+        series = _call(builder, "llvm.fmuladd", series, square, floats(2.0 / math.log(2.0) / odd))
+    value = _call(builder, "llvm.fmuladd", series, t, builder.sitofp(exponent, _LANES))
+    without = builder.select(builder.fcmp_ordered("==", number, floats(0.0)), floats(-math.inf), floats(math.nan))
+    return builder.select(builder.fcmp_ordered(">", number, floats(0.0)), value, without)
+
+
+#: Logarithm to base 2 to 1e-7 and a unit in the last place, of normal numbers; -inf of 0, not a number below it
+log2 = _lanewise("log2", 1, _emit_log2)
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------
