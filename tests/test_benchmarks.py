@@ -70,10 +70,15 @@ def test_frames_a_second(run):
     assert "| frames_per_s |" in table and "| cpu | 300 |" in table
 
 
-def test_the_memory_of_training(run, tmp_path):
-    run("memory", "--anchors", 300, "--steps", 1, *SIZE, "--renderers", "cpu", "--json", tmp_path / "rows.json")
-    (row,) = json.loads((tmp_path / "rows.json").read_text())
-    assert row["peak_mib"] >= row["before_mib"] > 0
+def test_growth_with_anchors_pixels_and_frames(run, tmp_path):
+    sizes = ("--anchors", "300,600", "--sizes", "48x36", "--frames", "20,40")
+    printed = run("growth", *sizes, "--steps", 1, "--json", tmp_path / "rows.json")
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [(row["along"], row["size"]) for row in rows] == [
+        *(("anchors", 300), ("anchors", 600), ("pixels", 48 * 36), ("frames", 20), ("frames", 40)),
+    ]
+    assert all(row["peak_mib"] >= row["before_mib"] > 0 and row["ms"] > 0 for row in rows)
+    assert "frames: exponents of time" in printed and "pixels: exponents" not in printed
 
 
 def test_reading_a_long_sequence(run):
