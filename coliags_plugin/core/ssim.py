@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.tables import fit_kernels, tables
 
 SIGMA = 1.5
 #: Half width of the window, pixels.
@@ -52,8 +53,7 @@ def ssim_map(
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")
     a, b = zero_outside(rendered, mask), zero_outside(truth, mask)
     gain = None if mask is None else _coverage_gain(mask, a.dtype)
-    on_kernels = a.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and not b.requires_grad
-    if on_kernels and a.shape[1] * a.shape[2] >= _SHORTEST_ROW:
+    if fit_kernels(a, b) and not b.requires_grad and a.shape[1] * a.shape[2] >= _SHORTEST_ROW:
         compared: Tensor = _Compare.apply(a, b, None if gain is None else gain.expand_as(a))  # type: ignore[no-untyped-call]
         return compared
     # Only the sum of the two variances is used, so one blur serves both. The ground truth is blurred separately, which
@@ -92,15 +92,11 @@ class _Compare(torch.autograd.Function):
 
         result = torch.empty(a.shape)
         derivatives = torch.empty(3, *a.shape) if ctx.needs_input_grad[0] else torch.empty(0)
-        ctx.tables = (a.shape[1] * a.shape[2], a.shape[2], *_flat(_window().float()))
-        images = _flat(a, b)
-        constants, factors, *written = _flat(
-            torch.tensor([C1, C2]), torch.empty(0) if gain is None else gain, result, derivatives
-        )
+        ctx.sizes, ctx.images = (a.shape[1] * a.shape[2], a.shape[2], *tables(_window().float())), tables(a, b)
+        factors = torch.empty(0) if gain is None else gain
+        constants, *written, ctx.derivatives = tables(torch.tensor([C1, C2]), factors, result, derivatives)
         with workers() as run:
-            run(compare, *ctx.tables, constants, *images, factors, *written)
-        ctx.images = images
-        ctx.derivatives = written[1]
+            run(compare, *ctx.sizes, constants, *ctx.images, *written, ctx.derivatives)
         return result
 
     @staticmethod
@@ -111,12 +107,8 @@ class _Compare(torch.autograd.Function):
 
         of_a = torch.empty(given.shape)
         with workers() as run:
-            run(compare_backward, *ctx.tables, *ctx.images, *_flat(given), ctx.derivatives, *_flat(of_a))
+            run(compare_backward, *ctx.sizes, *ctx.images, *tables(given), ctx.derivatives, *tables(of_a))
         return of_a, None, None
-
-
-def _flat(*tensors: Tensor) -> list[Any]:
-    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
 
 
 class _Blur(torch.autograd.Function):

@@ -20,6 +20,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tables import fit_kernels
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
 from coliags_plugin.fields.children import AnchorRows, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
@@ -172,7 +173,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     @property
     def _on_kernels(self) -> bool:
         """Whether the kernels of the CPU can compute."""
-        return self.anchors.device.type == "cpu" and self.anchors.dtype == torch.float32
+        return fit_kernels(self.anchors)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
         camera = camera.to(self.anchors.device, self.anchors.dtype)

@@ -17,6 +17,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tables import fit_kernels, tables
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.lighting.photometry import fit_light
 
@@ -178,7 +179,7 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             incidences = None if facing is None else (light.towards(positions, facing) * facing).sum(1).abs()
             return colors * self.law(*light.incidence(positions), incidences)
         lamp = camera.center + camera.camera_to_world[:3, :3] @ self.offset
-        if colors.device.type == "cpu" and colors.dtype == torch.float32 and len(colors) >= _FEWEST:
+        if fit_kernels(colors) and len(colors) >= _FEWEST:
             exponents = functional.pad(self.exponents, (0, 3 - self.exponents.shape[1])).expand(3, 3)
             bounds = torch.stack([torch.tensor([_MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE]), self.reference.expand(3)])
             seen = (lamp, camera.optical_axis, exponents, positions, facing, bounds)
@@ -217,12 +218,10 @@ class _Attenuate(torch.autograd.Function):
 
         facing = colors.new_empty(0) if normals is None else normals
         view = torch.cat([lamp.detach(), axis.detach(), bounds.flatten()])
-        ctx.tables = [
-            tensor.detach().contiguous().view(-1).numpy() for tensor in (colors, positions, facing, view, exponents)
-        ]
+        ctx.seen = tables(colors, positions, facing, view, exponents)
         result = torch.empty(colors.shape)
         with workers() as run:
-            run(attenuate, *ctx.tables, result.view(-1).numpy())
+            run(attenuate, *ctx.seen, *tables(result))
         return result
 
     @staticmethod
@@ -232,9 +231,8 @@ class _Attenuate(torch.autograd.Function):
         from coliags_plugin.fields.numba_kernels.attenuation import SLABS, attenuate_backward
 
         of_colors, sums = torch.empty(given.shape), torch.empty(SLABS, 16)
-        written = (of_colors.view(-1).numpy(), sums.view(-1).numpy())
         with workers() as run:
-            run(attenuate_backward, *ctx.tables, given.contiguous().view(-1).numpy(), *written)
+            run(attenuate_backward, *ctx.seen, *tables(given, of_colors, sums))
         total = sums.sum(0)
         # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
         return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None

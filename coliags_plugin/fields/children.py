@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from coliags_plugin.contracts import HeadNetworks
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.tables import tables
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, frustum_planes
 
 
@@ -68,9 +69,9 @@ def visible_anchors(rows: AnchorRows, camera: Camera) -> Int[Tensor, "V"]:
 
     camera = camera.to(torch.device("cpu"), torch.float32)
     visible = torch.empty(len(rows.positions), dtype=torch.bool)
-    tables = _flat(rows.positions, rows.offsets, rows.scalings.exp(), camera.center, frustum_planes(camera))
+    given = tables(rows.positions, rows.offsets, rows.scalings.exp(), camera.center, frustum_planes(camera))
     with workers() as run:
-        run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *tables, camera.near_plane, visible.numpy())
+        run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *given, camera.near_plane, visible.numpy())
     return visible.nonzero().squeeze(1)
 
 
@@ -147,24 +148,24 @@ class _Fused(torch.autograd.Function):
         new = positions.new_empty
         ctx.widths, ctx.waves = kernels.Widths(*widths), waves
         hidden, opacities = new(len(visible), networks[0].shape[1]), new(len(visible), ctx.widths.opacities)
-        ctx.hidden = _flat(hidden, opacities)
+        ctx.hidden = tables(hidden, opacities)
         ctx.seen = (
-            kernels.Anchors(*_flat(visible, positions, offsets, scalings.exp(), features)),
+            kernels.Anchors(*tables(visible, positions, offsets, scalings.exp(), features)),
             *(
-                kernels.Inputs(values.shape[1], *_flat(values, *_waves(values.shape[1], *wave)))
+                kernels.Inputs(values.shape[1], *tables(values, *_waves(values.shape[1], *wave)))
                 for values, wave in zip((geometry, appearance), waves, strict=True)
             ),
         )
-        tables = (kernels.Networks(*_flat(*networks)), *ctx.hidden)
+        decoding = (kernels.Networks(*tables(*networks)), *ctx.hidden)
         starts = torch.zeros(-(-len(visible) // kernels.TILE) + 1, dtype=torch.int64)
         with workers() as run:
-            run(kernels.decode_opacities, ctx.widths, *ctx.seen, *tables, starts[1:].numpy())
+            run(kernels.decode_opacities, ctx.widths, *ctx.seen, *decoding, starts[1:].numpy())
             torch.cumsum(starts, 0, out=starts)
             count, ctx.starts = int(starts[-1]), starts[:-1].numpy()
             sources = torch.empty(count, dtype=torch.int64)
             drawn = [new(count, *width) for width in ((3,), (4,), (3,), (), (3,), ())]
-            ctx.drawn = kernels.Drawn(*_flat(sources, *drawn))
-            run(kernels.draw, ctx.widths, ctx.seen[0], *tables, ctx.starts, ctx.drawn)
+            ctx.drawn = kernels.Drawn(*tables(sources, *drawn))
+            run(kernels.draw, ctx.widths, ctx.seen[0], *decoding, ctx.starts, ctx.drawn)
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(sources)
         return *drawn[:5], sources
@@ -190,12 +191,12 @@ class _Fused(torch.autograd.Function):
                 kernels.decode_backward,
                 ctx.widths,
                 *ctx.seen,
-                kernels.Transposed(*_flat(*transposed)),
+                kernels.Transposed(*tables(*transposed)),
                 *ctx.hidden,
                 ctx.starts,
                 ctx.drawn,
-                kernels.Given(*_flat(*given[:5])),
-                kernels.Found(*_flat(*found)),
+                kernels.Given(*tables(*given[:5])),
+                kernels.Found(*tables(*found)),
                 sums.numpy(),
             )
         of_inputs = [
@@ -219,7 +220,3 @@ def _embedding_backward(
     of_phases = of_waves[:, :, 0] * phases.cos() - of_waves[:, :, 1] * phases.sin()
     of_inputs[:, given - embedded :] += (octaves * of_phases).sum(1)
     return of_inputs
-
-
-def _flat(*tensors: Tensor) -> list[Any]:
-    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]

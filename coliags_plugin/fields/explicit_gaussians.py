@@ -15,6 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tables import fit_kernels
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.rows import unique_rows
@@ -82,7 +83,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     def _colors(self, rows: Int[Tensor, "V"], sight: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
         """Colours of some Gaussians, seen along vectors from the camera's centre to theirs. [V, 3]"""
         degree = int(self.degree)
-        if sight.device.type == "cpu" and sight.dtype == torch.float32:
+        if fit_kernels(sight):
             from coliags_plugin.fields.numba_kernels.spherical_harmonics import colors
 
             return colors(self.sh0, self.shN, rows, sight, degree)

@@ -14,9 +14,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from coliags_plugin.core.numba_kernels import lanes as vec
-from coliags_plugin.core.numba_kernels.compilation import Array, inline, kernel, part
+from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.lanes import WIDTH
 from coliags_plugin.core.numba_kernels.threads import pieces, workers
+from coliags_plugin.core.tables import tables
 from coliags_plugin.fields.spherical_harmonics import FACTORS, Y0
 
 #: Gaussians that a thread takes at a time.
@@ -55,22 +56,18 @@ class _Colors(torch.autograd.Function):
         ctx.terms = (degree + 1) ** 2
         result = torch.empty_like(sight, memory_format=torch.contiguous_format)
         with workers() as run:
-            run(_forward, ctx.terms, *map(_flat, (sh0, shN, rows, sight, result)))
+            run(_forward, ctx.terms, *tables(sh0, shN, rows, sight, result))
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        results = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in tensors[:3]]
-        sh0, shN, sight, rows = map(_flat, tensors)
+        saved = ctx.saved_tensors
+        results = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in saved[:3]]
+        sh0, shN, sight, rows = tables(*saved)
         with workers() as run:
-            run(_backward, ctx.terms, sh0, shN, rows, sight, _flat(given), *map(_flat, results))
+            run(_backward, ctx.terms, sh0, shN, rows, sight, *tables(given, *results))
         return *results, None, None
-
-
-def _flat(tensor: Tensor) -> Array:
-    return np.asarray(tensor.detach().contiguous()).reshape(-1)
 
 
 @kernel

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from coliags_plugin.core.numba_kernels.compilation import Array
+from coliags_plugin.core.tables import tables
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.pipeline import Pipeline
 
@@ -118,5 +119,4 @@ def _array(tensor: Tensor | None) -> Array | None:
 
 
 def _flat_gaussians(tensors: Iterable[Tensor]) -> layout.Parameters:
-    arrays: list[Array] = [np.asarray(tensor.detach().contiguous()).reshape(-1) for tensor in tensors]
-    return layout.Parameters(*arrays)
+    return layout.Parameters(*tables(*tensors))
