@@ -440,6 +440,59 @@ number = _reading("number", types.float32, _FLOAT)
 broadcast = _reading("broadcast", lanes, _FLOAT, _repeat)
 
 
+def _gathering(name: str, columns: int, result: types.Type) -> Callable[..., Intrinsic]:
+    """An operation that reads ``columns`` numbers from ``table[index + columns * place]`` on, for sixteen places."""
+    form = _FLOAT if columns == 1 else ir.VectorType(_FLOAT, columns)
+
+    def typed(typingctx: Context, table: types.Type, index: types.Type, places: types.Type) -> Intrinsic:
+        if not (_is_table(table) and isinstance(places, Lanes)):
+            return None
+
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+            address = _address(context, builder, signature.args[0], *arguments[:2], form)
+            whole = builder.fptosi(arguments[2], _INTS)
+            rows = []
+            for number in range(WIDTH):
+                place = builder.extract_element(whole, ir.Constant(_INT, number))
+                rows.append(_read(builder, builder.gep(address, [place])))
+            if columns == 4:
+                return _pack(builder, _columns_of_four(builder, rows))
+            vector = ir.Constant(_LANES, ir.Undefined)
+            for number, value in enumerate(rows):
+                vector = builder.insert_element(vector, value, ir.Constant(_INT, number))
+            return vector
+
+        return result(table, types.intp, places), generate
+
+    typed.__name__ = name
+    return intrinsic(typed)
+
+
+def _columns_of_four(builder: ir.IRBuilder, rows: list[ir.Value]) -> list[ir.Value]:
+    """The four columns of sixteen rows; each vector in between has every fourth row, so that quarters are transposed."""
+    quarters = []
+    for first in range(4):
+        halves = [_shuffle(builder, rows[row], rows[row + 4], range(8)) for row in (first, first + 8)]
+        quarters.append(_shuffle(builder, *halves, range(16)))
+    pairs = []
+    for a, b in ((quarters[0], quarters[1]), (quarters[2], quarters[3])):
+        for low in (0, 2):
+            picks = [4 * lane + low + k for lane in range(4) for k in (0, 16, 1, 17)]
+            pairs.append(_shuffle(builder, a, b, picks))
+    columns = []
+    for a, b in ((pairs[0], pairs[2]), (pairs[1], pairs[3])):
+        for low in (0, 2):
+            picks = [4 * lane + low + k for lane in range(4) for k in (0, 1, 16, 17)]
+            columns.append(_shuffle(builder, a, b, picks))
+    return columns
+
+
+#: ``table[index + place]`` for sixteen places, which are whole numbers from 0 to 2^24
+gather = _gathering("gather", 1, lanes)
+#: The four numbers from ``table[index + 4 place]`` on, of each place: four vectors
+gather_fours = _gathering("gather_fours", 4, _tuple_of_lanes(4))
+
+
 @intrinsic
 def store(typingctx: Context, table: types.Type, index: types.Type, value: types.Type) -> Intrinsic:
     """Sixteen numbers to ``table[index]`` and on."""
@@ -702,6 +755,17 @@ def _summed(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
         ]
         run = half
     return parts[0]
+
+
+def _emit_least(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+    for run in (8, 4, 2, 1):
+        moved = _shuffle(builder, vector, vector, [lane ^ run for lane in range(WIDTH)])
+        vector = builder.select(builder.fcmp_ordered("<", vector, moved), vector, moved)
+    return builder.extract_element(vector, ir.Constant(_INT, 0))
+
+
+#: The least of the sixteen numbers
+least_lane = _of_one("least_lane", Lanes, types.float32, _emit_least)
 
 
 def _fixed(values: Sequence[float]) -> Callable[..., Intrinsic]:

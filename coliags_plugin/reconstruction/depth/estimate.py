@@ -33,8 +33,8 @@ FEWEST_FRAMES = FEWEST_NEIGHBOURS + 1
 #: Mean weight of a frame's own matches, outside of masks and highlights, below which it shows nothing that others do:
 #: blur, darkness, a touched wall.
 LEAST_MATCHED = 0.1
-#: Frames and depth maps held in memory.
-_HELD = 40
+#: Frames and depth maps held in memory: at least so many, and of small images as many as have so many pixels.
+_HELD, _HELD_PIXELS = 40, 12_000_000
 
 
 class Estimation:
@@ -53,6 +53,8 @@ class Estimation:
         check_video(frames)
         self.frames, self.prior, self.range, self.settings = frames, prior, depth_range, settings
         self.work, self.jobs, self.progress = work, jobs, progress
+        camera = frames[0].camera
+        self.held = max(_HELD, _HELD_PIXELS // (camera.width * camera.height))
         self.last = ""
         self.medians: Sequence[float] = depth_range.medians
 
@@ -116,7 +118,7 @@ class Estimation:
         swept, guides = self.last, self._guides(sweep.reduction)
         low, high = np.log(self.range.near), np.log(self.range.far)
 
-        @lru_cache(maxsize=_HELD)
+        @lru_cache(maxsize=self.held)
         def depth_map(index: int) -> WeightedDepth:
             own = Swept(**self.work.load(swept, index))
             return WeightedDepth(guides(index).pose, own.depth, sweep_weight(own))
@@ -151,7 +153,7 @@ class Estimation:
     def _guides(self, reduction: int) -> Callable[[int], Guide]:
         """Frames prepared for matching, the last ones held."""
 
-        @lru_cache(maxsize=_HELD)
+        @lru_cache(maxsize=self.held)
         def guide(index: int) -> Guide:
             return guide_of(self.frames[index].to("cpu"), reduction, self.settings.features)
 

@@ -35,7 +35,7 @@ _KNOWN = 0.5
 #: Shares of the known pixels between whose depths the summary's range is, and the number of logarithmic bins of depth.
 _SHARES, _BINS = (0.01, 0.99), 2000
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 4
+_VERSION = 5
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 

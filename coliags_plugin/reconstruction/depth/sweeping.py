@@ -51,11 +51,12 @@ def sweep_frame(
     Correlation of log intensity in square windows, sampled on the surface itself, so that windows follow its slant;
     semi-global aggregation; a parabola between hypotheses. The neighbours, at least one, are all of one size.
     """
+    from coliags_plugin.core.numba_kernels.lanes import WIDTH
     from coliags_plugin.reconstruction.depth.numba_kernels import sweep as kernels
 
     shape = base.shape
     pairs = [guide.pose.homography(other.pose) for other in neighbours]
-    cost = np.empty((*shape, len(factors)), np.float32)
+    cost = np.full((*shape, WIDTH * math.ceil(len(factors) / WIDTH)), np.inf, np.float32)
     kernels.sweep(
         np.ascontiguousarray(base, np.float32),
         factors,

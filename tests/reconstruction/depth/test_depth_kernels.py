@@ -25,20 +25,26 @@ def zncc(first, second, floor):
 
 def test_costs_are_correlations_of_windows():
     rng = np.random.default_rng(0)
-    reference, other = rng.normal(size=(2, 12, 15)).astype(np.float32)
-    ones = np.ones((12, 15), np.float32)
+    reference, other = rng.normal(size=(2, 12, 35)).astype(np.float32)
+    ones = np.ones((12, 35), np.float32)
     turn = np.eye(3, dtype=np.float32)[None]
     # The neighbour is two pixels to the side at depth 1: disparity 2 / z.
     shift = np.array([[2.0, 0.0, 0.0]], np.float32)
-    cost = np.empty((12, 15, 2), np.float32)
-    whole = ones.astype(np.uint8)[None]
-    sweep(ones, np.array([1.0, 2.0], np.float32), reference, ones, other[None], whole, turn, shift, 1, 0.01, 1.0, cost)
+    cost = np.empty((12, 35, 2), np.float32)
+    mask = ones.astype(np.uint8)
+    mask[6, 20] = 0
+    # Pixels between four of which the first or the last is masked are not known.
+    known = (mask[:-1, :-1] & mask[1:, 1:]).astype(bool)
+    depths = np.array([1.0, 2.0], np.float32)
+    sweep(ones, depths, reference, ones, other[None], mask[None], turn, shift, 1, 0.01, 1.0, cost)
     for y in (3, 6, 8):
-        for x in (3, 7, 10):
+        for x in (3, 7, 10, 16, 17, 18, 19, 20, 30):
             window = (slice(y - 1, y + 2), slice(x - 1, x + 2))
             for d, disparity in enumerate((2, 1)):
-                moved = other[y - 1 : y + 2, x - 1 + disparity : x + 2 + disparity]
-                assert cost[y, x, d] == pytest.approx(1.0 - zncc(reference[window], moved, 0.01), abs=1e-5)
+                moved = (slice(y - 1, y + 2), slice(x - 1 + disparity, x + 2 + disparity))
+                there = known[moved]
+                correlation = zncc(reference[window][there], other[moved][there], 0.01)
+                assert cost[y, x, d] == pytest.approx(1.0 - correlation, abs=1e-5)
 
 
 def test_of_several_neighbours_the_best_count():
@@ -79,13 +85,15 @@ def brute_force_paths(cost, guide, small, large, contrast):
     return total
 
 
-def test_aggregation_is_semi_global_matching():
+@pytest.mark.parametrize("count", [4, 20])
+def test_aggregation_is_semi_global_matching(count):
     rng = np.random.default_rng(2)
-    cost = rng.uniform(0, 2, (5, 6, 4)).astype(np.float32)
+    cost = rng.uniform(0, 2, (5, 6, count)).astype(np.float32)
     guide = rng.normal(size=(5, 6)).astype(np.float32)
-    total = np.empty_like(cost)
-    aggregate(cost, guide, np.float32(0.1), np.float32(0.7), np.float32(3.0), total)
-    np.testing.assert_allclose(total, brute_force_paths(cost, guide, 0.1, 0.7, 3.0), rtol=1e-5)
+    padded = np.pad(cost, ((0, 0), (0, 0), (0, -count % 16)), constant_values=np.inf)
+    total = np.empty_like(padded)
+    aggregate(padded, guide, np.float32(0.1), np.float32(0.7), np.float32(3.0), total)
+    np.testing.assert_allclose(total[..., :count], brute_force_paths(cost, guide, 0.1, 0.7, 3.0), rtol=1e-5)
 
 
 def test_the_parabola_finds_the_minimum_between_steps():

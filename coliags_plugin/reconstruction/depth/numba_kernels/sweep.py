@@ -4,88 +4,162 @@ from __future__ import annotations
 
 import numpy as np
 
+from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import Array, kernel, part
+
+#: Numbers before and behind each row of a table: more than the radius of a window.
+_MARGIN = vec.WIDTH
+
+
+@part
+def _framed(image: Array, radius: int, row: int) -> Array:
+    """An image as a table with rows of ``row`` numbers and a border of zeros."""
+    height, width = image.shape
+    framed = np.zeros((height + 2 * radius) * row, np.float32)
+    for y in range(height):
+        for x in range(width):
+            framed[(y + radius) * row + _MARGIN + x] = image[y, x]
+    return framed
+
+
+@part
+def _corners(images: Array, masks: Array) -> Array:
+    """Values of each pixel and of those to the right, below and across, as a table; the first is NaN where masked.
+
+    A pixel counts as masked where it is, or the one across.
+    """
+    count, height, width = images.shape
+    corners = np.zeros(4 * images.size, np.float32)
+    for n in range(count):
+        for y in range(height - 1):
+            for x in range(width - 1):
+                at = 4 * ((n * height + y) * width + x)
+                both = masks[n, y, x] != 0 and masks[n, y + 1, x + 1] != 0
+                corners[at] = images[n, y, x] if both else np.float32(np.nan)
+                corners[at + 1] = images[n, y, x + 1]
+                corners[at + 2] = images[n, y + 1, x]
+                corners[at + 3] = images[n, y + 1, x + 1]
+    return corners
 
 
 @part
 def _warp(
-    base: Array, ratio: float, image: Array, usable: Array, turn: Array, shift: Array, out: Array, visible: Array
+    base: Array,
+    ratio: float,
+    usable: Array,
+    radius: int,
+    row: int,
+    corners: Array,
+    start: int,
+    shape: tuple[int, int],
+    turn: Array,
+    shift: Array,
+    warped: Array,
+    visible: Array,
 ) -> None:
-    """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly."""
-    height, width = base.shape
-    rows, columns = image.shape
-    for y in range(height):
+    """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly; 0 where not visible."""
+    rows, columns = shape
+    numbers = vec.fma(vec.lane_rows(), 4.0, vec.lane_columns())
+    for y in range(len(base) // row - 2 * radius):
         cy = np.float32(y) + np.float32(0.5)
         ax = turn[0, 1] * cy + turn[0, 2]
         ay = turn[1, 1] * cy + turn[1, 2]
         az = turn[2, 1] * cy + turn[2, 2]
-        for x in range(width):
-            cx = np.float32(x) + np.float32(0.5)
-            z = base[y, x] * ratio
-            pz = (turn[2, 0] * cx + az) * z + shift[2]
-            visible[y, x] = 0.0
-            out[y, x] = 0.0
-            if not pz > np.float32(1e-3) * z:
+        for x in range(0, row - 2 * _MARGIN, vec.WIDTH):
+            at = (y + radius) * row + _MARGIN + x
+            cx = vec.add(numbers, np.float32(x) + np.float32(0.5))
+            z = vec.mul(vec.load(base, at), ratio)
+            pz = vec.fma(vec.fma(cx, turn[2, 0], az), z, shift[2])
+            scale = vec.div(1.0, pz)
+            u = vec.fma(vec.fma(vec.fma(cx, turn[0, 0], ax), z, shift[0]), scale, -0.5)
+            v = vec.fma(vec.fma(vec.fma(cx, turn[1, 0], ay), z, shift[1]), scale, -0.5)
+            seen = vec.both(vec.greater(pz, vec.mul(z, 1e-3)), vec.greater(vec.load(usable, at), 0.0))
+            seen = vec.both(seen, vec.both(vec.at_least(u, 0.0), vec.less(u, columns - 1)))
+            seen = vec.both(seen, vec.both(vec.at_least(v, 0.0), vec.less(v, rows - 1)))
+            if vec.bits(seen) == 0:
+                vec.store(warped, at, 0.0)
+                vec.store(visible, at, 0.0)
                 continue
-            scale = np.float32(1.0) / pz
-            u = ((turn[0, 0] * cx + ax) * z + shift[0]) * scale - np.float32(0.5)
-            v = ((turn[1, 0] * cx + ay) * z + shift[1]) * scale - np.float32(0.5)
-            if not (u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1):
-                continue
-            i, j = int(u), int(v)
-            if usable[j, i] == 0 or usable[j + 1, i + 1] == 0:
-                continue
-            fx, fy = u - np.float32(i), v - np.float32(j)
-            top = image[j, i] + fx * (image[j, i + 1] - image[j, i])
-            bottom = image[j + 1, i] + fx * (image[j + 1, i + 1] - image[j + 1, i])
-            out[y, x] = top + fy * (bottom - top)
-            visible[y, x] = 1.0
+            u, v = vec.select(seen, u, 0.0), vec.select(seen, v, 0.0)
+            i, j = vec.floor(u), vec.floor(v)
+            fx, fy = vec.sub(u, i), vec.sub(v, j)
+            place = vec.fma(j, columns, i)
+            corner, right, below, across = vec.gather_fours(corners, start, place)
+            seen = vec.both(seen, vec.at_least(corner, corner))
+            top = vec.fma(fx, vec.sub(right, corner), corner)
+            bottom = vec.fma(fx, vec.sub(across, below), below)
+            vec.store(warped, at, vec.select(seen, vec.fma(fy, vec.sub(bottom, top), top), 0.0))
+            vec.store(visible, at, vec.select(seen, 1.0, 0.0))
 
 
 @part
 def _correlate(
-    reference: Array, warped: Array, visible: Array, radius: int, floor: float, least: float, out: Array
+    reference: Array,
+    warped: Array,
+    visible: Array,
+    radius: int,
+    row: int,
+    floor: float,
+    lines: Array,
+    scores: Array,
+    start: int,
 ) -> None:
-    """ZNCC of two images in square windows, of their common pixels; NaN where these are too few.
+    """ZNCC of two images in square windows, of their common pixels; NaN where these are less than half of the window.
 
-    Sums run along columns, then along rows. ``floor`` is added to both variances.
+    Sums are taken along columns, then along rows. ``floor`` is added to both variances.
     """
-    height, width = reference.shape
-    sums = np.zeros((6, width))
-    for y in range(-radius, height):
-        for row, sign in ((y + radius, 1.0), (y - radius - 1, -1.0)):
-            if 0 <= row < height:
-                for x in range(width):
-                    s = visible[row, x]
-                    a, b = s * reference[row, x], s * warped[row, x]
-                    sums[0, x] += sign * s
-                    sums[1, x] += sign * a
-                    sums[2, x] += sign * b
-                    sums[3, x] += sign * (a * a)
-                    sums[4, x] += sign * (b * b)
-                    sums[5, x] += sign * (a * b)
-        if y < 0:
-            continue
-        n, sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for x in range(-radius, width):
-            for column, sign in ((x + radius, 1.0), (x - radius - 1, -1.0)):
-                if 0 <= column < width:
-                    n += sign * sums[0, column]
-                    sa += sign * sums[1, column]
-                    sb += sign * sums[2, column]
-                    saa += sign * sums[3, column]
-                    sbb += sign * sums[4, column]
-                    sab += sign * sums[5, column]
-            if x < 0:
-                continue
-            if n < least:
-                out[y, x] = np.nan
-                continue
-            each = 1.0 / n
-            va = saa * each - sa * sa * each * each + floor
-            vb = sbb * each - sb * sb * each * each + floor
-            cov = sab * each - sa * sb * each * each
-            out[y, x] = cov / np.sqrt(max(va, floor) * max(vb, floor))
+    least = 0.5 * (2 * radius + 1) ** 2
+    width = row - 2 * _MARGIN
+    for y in range(len(reference) // row - 2 * radius):
+        for x in range(0, row, vec.WIDTH):
+            n = sa = sb = saa = sbb = sab = vec.splat(0.0)
+            for at in range(y * row + x, (y + 2 * radius + 1) * row + x, row):
+                s, b = vec.load(visible, at), vec.load(warped, at)
+                a = vec.mul(vec.load(reference, at), s)
+                n, sa, sb = vec.add(n, s), vec.add(sa, a), vec.add(sb, b)
+                saa, sbb, sab = vec.fma(a, a, saa), vec.fma(b, b, sbb), vec.fma(a, b, sab)
+            for k, value in enumerate((n, sa, sb, saa, sbb, sab)):
+                vec.store(lines, k * row + x, value)
+        for x in range(0, width, vec.WIDTH):
+            n = sa = sb = saa = sbb = sab = vec.splat(0.0)
+            for at in range(_MARGIN + x - radius, _MARGIN + x + radius + 1):
+                n = vec.add(n, vec.load(lines, at))
+                sa, sb = vec.add(sa, vec.load(lines, row + at)), vec.add(sb, vec.load(lines, 2 * row + at))
+                saa, sbb = vec.add(saa, vec.load(lines, 3 * row + at)), vec.add(sbb, vec.load(lines, 4 * row + at))
+                sab = vec.add(sab, vec.load(lines, 5 * row + at))
+            each, noise = vec.div(1.0, n), vec.mul(n, floor)
+            mean = vec.mul(sa, each)
+            va = vec.larger(vec.sub(saa, vec.mul(mean, sa)), 0.0)
+            vb = vec.larger(vec.sub(sbb, vec.mul(vec.mul(sb, each), sb)), 0.0)
+            product = vec.mul(vec.add(va, noise), vec.add(vb, noise))
+            score = vec.div(vec.sub(sab, vec.mul(mean, sb)), vec.sqrt(product))
+            vec.store(scores, start + y * width + x, vec.select(vec.less(n, least), np.nan, score))
+
+
+@part
+def _mean_of_best(scores: Array, count: int, size: int, at: int, taken: Array, lowest: Array) -> vec.Vector:
+    """One minus the mean of the best of sixteen pixels' scores; 1 where too few are known.
+
+    ``taken``: how many of so many count, 0 for too few. ``lowest`` is for those that do not, the least first.
+    """
+    for k in range(0, len(lowest), vec.WIDTH):
+        vec.store(lowest, k, np.inf)
+    total = known = vec.splat(0.0)
+    for n in range(count):
+        score = vec.load(scores, n * size + at)
+        there = vec.at_least(score, score)
+        total, known = vec.add(total, vec.select(there, score, 0.0)), vec.add(known, vec.select(there, 1.0, 0.0))
+        score = vec.select(there, score, np.inf)
+        for k in range(0, len(lowest), vec.WIDTH):
+            other = vec.load(lowest, k)
+            vec.store(lowest, k, vec.smaller(score, other))
+            score = vec.larger(score, other)
+    counted = vec.gather(taken, 0, known)
+    for k in range(0, len(lowest), vec.WIDTH):
+        left_out = vec.greater(vec.sub(known, counted), k // vec.WIDTH)
+        total = vec.sub(total, vec.select(left_out, vec.load(lowest, k), 0.0))
+    cost = vec.larger(0.0, vec.sub(1.0, vec.div(total, counted)))
+    return vec.select(vec.greater(counted, 0.0), cost, 1.0)
 
 
 @kernel
@@ -94,70 +168,82 @@ def sweep(
     ratios: Array,  # factors on it; float32 [D]
     reference: Array,  # guide image (log intensity); float32 [H, W]
     usable: Array,  # 0 where the reference is masked; float32 [H, W]
-    images: Array,  # guides of the neighbours; float32 [N, h, w]
+    images: Array,  # guides of the neighbours, of less than 2^24 pixels; float32 [N, h, w]
     masks: Array,  # 0 where a neighbour is masked; uint8 [N, h, w]
     turns: Array,  # pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour; float32 [N, 3, 3]
     shifts: Array,  # homogeneous pixel of the reference's centre in the neighbour; float32 [N, 3]
-    radius: int,  # of the windows, pixels
+    radius: int,  # of the windows, pixels; at most sixteen
     floor: float,  # variance of the guides' noise
     share: float,  # part of the neighbours that counts at each pixel, the best ones
-    cost: Array,  # written; 0 (equal) to 2, 1 where less than a quarter of the neighbours see it; float32 [H, W, D]
+    cost: Array,  # written; 0 (equal) to 2, 1 where less than a quarter of the neighbours see it; float32 [H, W, >= D]
 ) -> None:
     """Costs of the hypotheses ``base * ratios[d]``: one minus the mean of the best correlations with the neighbours."""
     height, width = base.shape
-    count = images.shape[0]
-    warped = np.empty((height, width), np.float32)
-    visible = np.empty((height, width), np.float32)
-    scores = np.empty((count, height, width), np.float32)
-    best = np.empty(count, np.float32)
-    least = 0.5 * (2 * radius + 1) ** 2
+    count, rows, columns = images.shape
+    wide = (width + vec.WIDTH - 1) // vec.WIDTH * vec.WIDTH
+    row, size = wide + 2 * _MARGIN, height * wide
+    surface, own, counts = _framed(base, radius, row), _framed(reference, radius, row), _framed(usable, radius, row)
+    corners = _corners(images, masks)
+    warped, visible = np.zeros_like(own), np.zeros_like(own)
+    lines = np.empty(6 * row, np.float32)
+    scores = np.empty(count * size, np.float32)
+    costs = np.empty(len(ratios) * size, np.float32)
     fewest = min(count, max(2, (count + 3) // 4))
+    taken = np.zeros(count + 1, np.float32)
+    left_out = 0
+    for known in range(fewest, count + 1):
+        taken[known] = np.ceil(share * known)
+        left_out = max(left_out, known - int(taken[known]))
+    lowest = np.empty(left_out * vec.WIDTH, np.float32)
     for d in range(len(ratios)):
         for n in range(count):
-            _warp(base, ratios[d], images[n], masks[n], turns[n], shifts[n], warped, visible)
-            for y in range(height):
-                for x in range(width):
-                    visible[y, x] *= usable[y, x]
-            _correlate(reference, warped, visible, radius, floor, least, scores[n])
-        for y in range(height):
-            for x in range(width):
-                valid = 0
-                for n in range(count):
-                    value = scores[n, y, x]
-                    if not value == value:
-                        continue
-                    rank = valid
-                    while rank > 0 and best[rank - 1] < value:
-                        best[rank] = best[rank - 1]
-                        rank -= 1
-                    best[rank] = value
-                    valid += 1
-                taken = int(np.ceil(share * valid))
-                if valid < fewest:
-                    cost[y, x, d] = 1.0
-                    continue
-                total = np.float32(0.0)
-                for rank in range(taken):
-                    total += best[rank]
-                cost[y, x, d] = max(np.float32(0.0), np.float32(1.0) - total / np.float32(taken))
+            start = 4 * n * rows * columns
+            _warp(
+                surface,
+                ratios[d],
+                counts,
+                radius,
+                row,
+                corners,
+                start,
+                (rows, columns),
+                turns[n],
+                shifts[n],
+                warped,
+                visible,
+            )
+            _correlate(own, warped, visible, radius, row, floor, lines, scores, n * size)
+        for at in range(0, size, vec.WIDTH):
+            vec.store(costs, d * size + at, _mean_of_best(scores, count, size, at, taken, lowest))
+    for y in range(height):
+        for x in range(width):
+            for d in range(len(ratios)):
+                cost[y, x, d] = costs[d * size + y * wide + x]
 
 
 @part
-def _path_step(cost: Array, before: Array, least: float, jump: float, small: float, into: Array, total: Array) -> float:
-    """One step of a path: Hirschmueller's recurrence. Returns the least value of ``into``."""
-    count = len(cost)
-    lowest = np.float32(np.inf)
-    for d in range(count):
-        value = min(before[d], least + jump)
-        if d > 0:
-            value = min(value, before[d - 1] + small)
-        if d + 1 < count:
-            value = min(value, before[d + 1] + small)
-        value = cost[d] + value - least
-        into[d] = value
-        total[d] += value
-        lowest = min(lowest, value)
-    return lowest
+def _path_step(
+    costs: Array,
+    at: int,
+    count: int,
+    least: float,
+    jump: float,
+    small: float,
+    paths: Array,
+    before: int,
+    into: int,
+    totals: Array,
+) -> float:
+    """One step of a path: Hirschmueller's recurrence. Returns the least cost of the path."""
+    lowest = vec.splat(np.inf)
+    for d in range(0, count, vec.WIDTH):
+        beside = vec.smaller(vec.load(paths, before + d - 1), vec.load(paths, before + d + 1))
+        value = vec.smaller(vec.smaller(vec.load(paths, before + d), least + jump), vec.add(beside, small))
+        value = vec.sub(vec.add(vec.load(costs, at + d), value), least)
+        vec.store(paths, into + d, value)
+        vec.store(totals, at + d, vec.add(vec.load(totals, at + d), value))
+        lowest = vec.smaller(lowest, value)
+    return vec.least_lane(lowest)
 
 
 @kernel
@@ -168,30 +254,34 @@ def aggregate(
 
     ``guide``: image whose edges make jumps cheaper. Penalty of a change by one hypothesis: ``small`` (P1); of any
     greater one: ``large`` (P2) divided by ``1 + contrast * |difference of the guide|``, and not less than ``small``.
-    Costs are float32 [H, W, D].
+    Costs are float32 [H, W, D], D a multiple of sixteen; hypotheses beyond the last one cost infinity.
     """
     height, width, count = cost.shape
-    total[:] = 0.0
-    # Of the path before, by rows: this one and the one before it.
-    paths = np.empty((2, width, count), np.float32)
-    lowest = np.empty((2, width), np.float32)
-    start = np.zeros(count, np.float32)
+    costs, totals = cost.reshape(cost.size), total.reshape(cost.size)
+    totals[:] = 0.0
+    # Paths to this row and to the one before, of four directions, with infinity between them; last, what all begin at.
+    length = count + vec.WIDTH
+    paths = np.full((8 * width + 1) * length + vec.WIDTH, np.inf, np.float32)
+    start = 8 * width * length + vec.WIDTH
+    paths[start : start + count] = 0.0
+    lowest = np.empty(8 * width, np.float32)
     for way in (1, -1):
-        rows = range(height) if way > 0 else range(height - 1, -1, -1)
-        columns = range(width) if way > 0 else range(width - 1, -1, -1)
-        # Along the row, and from the row before, straight and along both diagonals.
-        for down, right in ((0, way), (way, -1), (way, 0), (way, 1)):
-            for y in rows:
-                for x in columns:
+        for y in range(height) if way > 0 else range(height - 1, -1, -1):
+            for x in range(width) if way > 0 else range(width - 1, -1, -1):
+                at = (y * width + x) * count
+                # Along the row, and from the row before, straight and along both diagonals.
+                for k, (down, right) in enumerate(((0, way), (way, -1), (way, 0), (way, 1))):
                     above, aside = y - down, x - right
-                    into, sums = paths[y % 2, x], total[y, x]
+                    into = (2 * k + y % 2) * width + x
+                    before, least, jump = start, np.float32(0.0), large
                     if 0 <= above < height and 0 <= aside < width:
                         edge = abs(guide[y, x] - guide[above, aside])
                         jump = max(small, large / (np.float32(1.0) + contrast * edge))
-                        before, least = paths[above % 2, aside], lowest[above % 2, aside]
-                        lowest[y % 2, x] = _path_step(cost[y, x], before, least, jump, small, into, sums)
-                    else:
-                        lowest[y % 2, x] = _path_step(cost[y, x], start, np.float32(0.0), large, small, into, sums)
+                        other = (2 * k + above % 2) * width + aside
+                        before, least = other * length + vec.WIDTH, lowest[other]
+                    lowest[into] = _path_step(
+                        costs, at, count, least, jump, small, paths, before, into * length + vec.WIDTH, totals
+                    )
 
 
 @kernel
@@ -217,7 +307,7 @@ def pick(total: Array, cost: Array, rivals: int, index: Array, match: Array, mar
                 if abs(d - best) > 2 and cost[y, x, d] != 1.0:
                     second = min(second, costs[d])
             offset = np.float32(0.0)
-            if 0 < best < count - 1:
+            if 0 < best < count - 1 and costs[best + 1] < np.inf:
                 bend = costs[best - 1] - np.float32(2.0) * costs[best] + costs[best + 1]
                 if bend > np.float32(1e-6):
                     offset = np.float32(0.5) * (costs[best - 1] - costs[best + 1]) / bend
