@@ -39,16 +39,21 @@ def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreemen
     A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
     iteration from the frame's own depth. Depths agree up to a relative difference of ``agreement``.
     """
+    from coliags_plugin.core.numba_kernels.lanes import WIDTH
     from coliags_plugin.reconstruction.depth.numba_kernels.fusion import reproject, vote
 
-    shape = own.depth.shape
-    candidates = np.empty((len(neighbours), *shape), np.float32)
+    height, width = own.depth.shape
+    size = height * width
+    rest = (0, -size % WIDTH)
+    depth, weight = np.pad(own.depth.ravel(), rest), np.pad(own.weight.ravel(), rest)
+    candidates = np.empty((len(neighbours), len(depth)), np.float32)
     trusts = np.empty_like(candidates)
     for index, other in enumerate(neighbours):
         turn, shift = own.pose.homography(other.pose)
         back, origin = own.pose.depth_from(other.pose)
         reproject(
-            own.depth,
+            depth,
+            width,
             other.depth,
             other.weight,
             turn,
@@ -60,9 +65,9 @@ def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreemen
             candidates[index],
             trusts[index],
         )
-    fused, votes, against, spread = (np.empty(shape, np.float32) for _ in range(4))
-    vote(own.depth, own.weight, candidates, trusts, np.float32(agreement), fused, votes, against, spread)
-    return Fused(fused, votes, against, spread)
+    written = np.empty((4, len(depth)), np.float32)
+    vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
+    return Fused(*written[:, :size].reshape(4, height, width))
 
 
 #: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.

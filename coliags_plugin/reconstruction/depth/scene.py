@@ -187,11 +187,14 @@ class VoxelPoints:
         inside = ((cell >= 0) & (cell < _SPAN)).all(axis=1)
         keys = (cell[:, 0] * _SPAN + cell[:, 1]) * _SPAN + cell[:, 2]
         rows = np.concatenate([weight, weight * offset, weight * image[chosen]], axis=1)[inside]
-        own, sums = _summed(keys[inside], rows)
-        once = np.ones((len(own), 1))
-        self._keys, self._sums = _summed(
-            np.concatenate([self._keys, own]), np.concatenate([self._sums, np.hstack([sums, once])])
-        )
+        own, cells = np.unique(keys[inside], return_inverse=True)
+        sums = np.stack([np.bincount(cells, column, len(own)) for column in rows.T], axis=1)
+        sums = np.hstack([sums, np.ones((len(own), 1))])
+        place = np.searchsorted(self._keys, own)
+        is_known = np.append(self._keys, -1)[place] == own
+        self._sums[place[is_known]] += sums[is_known]
+        self._keys = np.insert(self._keys, place[~is_known], own[~is_known])
+        self._sums = np.insert(self._sums, place[~is_known], sums[~is_known], axis=0)
 
     def points(self) -> tuple[Float32[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
         """Weighted mean position and colour of every voxel that ``FEWEST_FRAMES`` frames have points in."""
@@ -199,14 +202,6 @@ class VoxelPoints:
         weight = sums[:, :1]
         positions = sums[:, 1:4] / weight + self.origin
         return positions.astype(np.float32), np.rint(sums[:, 4:7] / weight).astype(np.uint8)
-
-
-def _summed(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of equal keys added up; keys ascending."""
-    order = np.argsort(keys, kind="stable")
-    keys, rows = keys[order], rows[order]
-    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]])) if len(keys) else np.zeros(0, np.int64)
-    return keys[first], np.add.reduceat(rows, first, axis=0) if len(keys) else rows
 
 
 def _steep(depth: Map) -> Mask:

@@ -147,12 +147,12 @@ def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
 
 
 def voted(own, candidates, weights=None, tolerance=0.02):
-    candidates = np.array(candidates, np.float32)[:, None, None]
-    weights = np.ones_like(candidates) if weights is None else np.array(weights, np.float32)[:, None, None]
-    out = [np.empty((1, 1), np.float32) for _ in range(4)]
-    one = np.ones((1, 1), np.float32)
+    candidates = np.repeat(np.array(candidates, np.float32)[:, None], 16, axis=1)
+    weights = np.ones_like(candidates) if weights is None else np.repeat(np.float32(weights)[:, None], 16, axis=1)
+    out = np.empty((4, 16), np.float32)
+    one = np.ones(16, np.float32)
     vote(one * np.float32(own), one, candidates, weights, np.float32(tolerance), *out)
-    return [float(values[0, 0]) for values in out]
+    return [float(values[0]) for values in out]
 
 
 def test_votes():

@@ -6,6 +6,7 @@ import numpy as np
 
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import Array, kernel, part
+from coliags_plugin.reconstruction.depth.numba_kernels.corners import corners
 
 #: Numbers before and behind each row of a table: more than the radius of a window.
 _MARGIN = vec.WIDTH
@@ -23,23 +24,18 @@ def _framed(image: Array, radius: int, row: int) -> Array:
 
 
 @part
-def _corners(images: Array, masks: Array) -> Array:
-    """Values of each pixel and of those to the right, below and across, as a table; the first is NaN where masked.
-
-    A pixel counts as masked where it is, or the one across.
-    """
+def _masked_corners(images: Array, masks: Array) -> Array:
+    """Four values of each pixel, as by :func:`corners`; the first is NaN where it is masked, or the one across is."""
     count, height, width = images.shape
-    corners = np.zeros(4 * images.size, np.float32)
+    values = np.zeros(4 * images.size, np.float32)
     for n in range(count):
+        start = 4 * n * height * width
+        corners(images[n], values, start)
         for y in range(height - 1):
             for x in range(width - 1):
-                at = 4 * ((n * height + y) * width + x)
-                both = masks[n, y, x] != 0 and masks[n, y + 1, x + 1] != 0
-                corners[at] = images[n, y, x] if both else np.float32(np.nan)
-                corners[at + 1] = images[n, y, x + 1]
-                corners[at + 2] = images[n, y + 1, x]
-                corners[at + 3] = images[n, y + 1, x + 1]
-    return corners
+                if masks[n, y, x] == 0 or masks[n, y + 1, x + 1] == 0:
+                    values[start + 4 * (y * width + x)] = np.nan
+    return values
 
 
 @part
@@ -49,7 +45,7 @@ def _warp(
     usable: Array,
     radius: int,
     row: int,
-    corners: Array,
+    values: Array,
     start: int,
     shape: tuple[int, int],
     turn: Array,
@@ -84,7 +80,7 @@ def _warp(
             i, j = vec.floor(u), vec.floor(v)
             fx, fy = vec.sub(u, i), vec.sub(v, j)
             place = vec.fma(j, columns, i)
-            corner, right, below, across = vec.gather_fours(corners, start, place)
+            corner, right, below, across = vec.gather_fours(values, start, place)
             seen = vec.both(seen, vec.at_least(corner, corner))
             top = vec.fma(fx, vec.sub(right, corner), corner)
             bottom = vec.fma(fx, vec.sub(across, below), below)
@@ -183,7 +179,7 @@ def sweep(
     wide = (width + vec.WIDTH - 1) // vec.WIDTH * vec.WIDTH
     row, size = wide + 2 * _MARGIN, height * wide
     surface, own, counts = _framed(base, radius, row), _framed(reference, radius, row), _framed(usable, radius, row)
-    corners = _corners(images, masks)
+    values = _masked_corners(images, masks)
     warped, visible = np.zeros_like(own), np.zeros_like(own)
     lines = np.empty(6 * row, np.float32)
     scores = np.empty(count * size, np.float32)
@@ -204,7 +200,7 @@ def sweep(
                 counts,
                 radius,
                 row,
-                corners,
+                values,
                 start,
                 (rows, columns),
                 turns[n],
