@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -105,10 +106,10 @@ def light_map(trained: TrainedRun) -> JsonObject | None:
     gain = next((part for part in parts if isinstance(part, GainModule)), None)
     curve = next((part for part in parts if isinstance(part, ResponseModule)), None)
     field = model.field if isinstance(model.field, LampAware) else None
-    depths = scene.depths_in_view().double()
+    depths = scene.depths_in_view().double().cpu().numpy()
     if len(depths) == 0:
         return None
-    low, middle, high = (float(depths.quantile(share)) for share in (0.02, 0.5, 0.98))
+    low, middle, high = np.quantile(depths, (0.02, 0.5, 0.98)).tolist()
     distances = torch.linspace(low, high, _POINTS, dtype=torch.float64)
     angles = torch.linspace(0.0, _MAX_ANGLE, _POINTS, dtype=torch.float64)
     radians = angles.deg2rad()
