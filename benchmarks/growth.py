@@ -81,11 +81,11 @@ def training_row(options: Options, axis: str, anchors: int, size: str) -> dict[s
 
 
 def reading_rows(lengths: list[int]) -> Iterator[dict[str, Any]]:
-    """Sequences of several lengths; elapsed time, as of a command."""
+    """Sequences of several lengths."""
     for frames in lengths:
         with tempfile.TemporaryDirectory() as folder:
             scene = write_sequence(Path(folder), frames, *size_of(SIZE))
-            before, peak, seconds = numbers_of(str(LOADING), "--child", str(scene), "--no-keep-pixels")
+            before, peak, _, seconds = numbers_of(str(LOADING), "--child", str(scene), "--no-keep-pixels")
         yield {"along": "frames", "size": frames, "ms": 1e3 * seconds, "before_mib": before, "peak_mib": peak}
 
 
