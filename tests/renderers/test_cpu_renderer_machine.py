@@ -124,6 +124,7 @@ def cache(tmp_path, monkeypatch, caplog):
     """The folder that kernels made in this test are kept in."""
     caplog.set_level(logging.INFO, compilation.__name__)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compilation, "_announced", set())
     return tmp_path / "cache"
 
 
@@ -154,7 +155,6 @@ def test_parts_are_compiled_once_for_all_constants_and_not_called_from_python(ca
 
 def test_a_cache_folder_that_cannot_be_made_costs_nothing_but_time(cache, caplog, monkeypatch):
     monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
-    compilation._announce.cache_clear()
     kernel = compilation.kernel(twice)
     assert kernel(4) == 8
     assert "nowhere to keep them" in caplog.text and "NUMBA_CACHE_DIR" in caplog.text

@@ -32,6 +32,8 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 _logger = logging.getLogger(__name__)
 #: What a cache may raise when its folder is full, unreadable or holds damaged files.
 _CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ValueError, AttributeError, ImportError, IndexError, TypeError)
+#: Of what has been told: whether kernels are kept.
+_announced: set[bool] = set()
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 
 
@@ -57,7 +59,7 @@ def kernel(function: _Function) -> _Function:
     try:
         dispatcher._cache = _KernelCache(function)
     except RuntimeError:  # numba: no folder to keep it in
-        _announce("nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one")
+        _announce(False, "nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one")
     return dispatcher  # type: ignore[no-any-return]
 
 
@@ -111,7 +113,7 @@ class _KernelCache(FunctionCache):
             _logger.warning("kernel cache in %s cannot be read (%s)", self.cache_path, error)
             found = None
         if found is None:
-            _announce(f"kept in {self.cache_path}")
+            _announce(True, f"kept in {self.cache_path} and the like")
         return found
 
     def save_overload(self, sig: Signature, data: CompileResult) -> None:
@@ -124,10 +126,11 @@ class _KernelCache(FunctionCache):
         return (*super()._index_key(sig, codegen), _fingerprint(Path(self._py_func.__code__.co_filename).parent))
 
 
-@cache
-def _announce(where: str) -> None:
-    """Log once per cache location that kernels are being compiled."""
-    _logger.info("compiling kernels for this machine, about ten seconds, once (%s)", where)
+def _announce(kept: bool, where: str) -> None:
+    """Log once that kernels are being compiled, and once that they cannot be kept."""
+    if kept not in _announced:
+        _announced.add(kept)
+        _logger.info("compiling kernels for this machine, about ten seconds, once (%s)", where)
 
 
 @cache

@@ -21,7 +21,8 @@ def attenuate(counters, colors, positions, normals, lamp, exponents, result):
     """Write colours times the law. ``normals`` may be empty; ``exponents`` are those of three channels. [3, 3]"""
     count = len(colors) // 3
     for slab in pieces(counters, 0, SLABS):
-        for first in range(*_part_of(slab, count), vec.WIDTH):
+        begin, end = _part_of(slab, count)
+        for first in range(begin, end, vec.WIDTH):
             at = min(first, count - vec.WIDTH)
             logs = _seen(at, positions, normals, lamp)[0]
             color = vec.load_columns(colors, 3 * at, (0, 0, 0))
@@ -35,7 +36,8 @@ def attenuate_backward(counters, colors, positions, normals, lamp, exponents, gi
     three = (0, 0, 0)
     for slab in pieces(counters, 0, SLABS):
         total = vec.repeat(0.0, _SUMS)
-        for first in range(*_part_of(slab, count), vec.WIDTH):
+        begin, end = _part_of(slab, count)
+        for first in range(begin, end, vec.WIDTH):
             at = min(first, count - vec.WIDTH)
             logs, ray, inverse_square, axis, depth, normal, facing, counted = _seen(at, positions, normals, lamp)
             factors = _factors(logs, exponents)
