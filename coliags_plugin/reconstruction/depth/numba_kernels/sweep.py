@@ -102,7 +102,8 @@ def _correlate(
 ) -> None:
     """ZNCC of two images in square windows, of their common pixels; NaN where these are less than half of the window.
 
-    Sums are taken along columns, then along rows. ``floor`` is added to both variances.
+    Sums are taken along columns, then in float64 along rows: variances of dark, flat wall are small differences of
+    large sums. ``floor`` is added to both variances.
     """
     least = 0.5 * (2 * radius + 1) ** 2
     width = row - 2 * _MARGIN
@@ -117,18 +118,18 @@ def _correlate(
             for k, value in enumerate((n, sa, sb, saa, sbb, sab)):
                 vec.store(lines, k * row + x, value)
         for x in range(0, width, vec.WIDTH):
-            n = sa = sb = saa = sbb = sab = vec.splat(0.0)
+            n = vec.splat(0.0)
+            sa = sb = saa = sbb = sab = vec.widen(vec.splat(0.0))
             for at in range(_MARGIN + x - radius, _MARGIN + x + radius + 1):
                 n = vec.add(n, vec.load(lines, at))
                 sa, sb = vec.add(sa, vec.load(lines, row + at)), vec.add(sb, vec.load(lines, 2 * row + at))
                 saa, sbb = vec.add(saa, vec.load(lines, 3 * row + at)), vec.add(sbb, vec.load(lines, 4 * row + at))
                 sab = vec.add(sab, vec.load(lines, 5 * row + at))
-            each, noise = vec.div(1.0, n), vec.mul(n, floor)
-            mean = vec.mul(sa, each)
-            va = vec.larger(vec.sub(saa, vec.mul(mean, sa)), 0.0)
-            vb = vec.larger(vec.sub(sbb, vec.mul(vec.mul(sb, each), sb)), 0.0)
+            count, noise = vec.widen(n), vec.mul(vec.mul(n, n), floor)
+            va = vec.larger(vec.narrow(vec.sub(vec.mul(count, saa), vec.mul(sa, sa))), 0.0)
+            vb = vec.larger(vec.narrow(vec.sub(vec.mul(count, sbb), vec.mul(sb, sb))), 0.0)
             product = vec.mul(vec.add(va, noise), vec.add(vb, noise))
-            score = vec.div(vec.sub(sab, vec.mul(mean, sb)), vec.sqrt(product))
+            score = vec.div(vec.narrow(vec.sub(vec.mul(count, sab), vec.mul(sa, sb))), vec.sqrt(product))
             vec.store(scores, start + y * width + x, vec.select(vec.less(n, least), np.nan, score))
 
 
