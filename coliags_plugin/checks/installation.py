@@ -23,6 +23,7 @@ LIBRARIES = {
     "numpy": "numpy",
     "kornia": "kornia",
     "opencv-contrib-python-headless": "cv2",
+    "scikit-image": "skimage",
     "scipy": "scipy",
     "pycolmap": "pycolmap",
     "open3d": "open3d",
