@@ -10,6 +10,7 @@ are slopes of logarithms, by least squares over all sizes, and between the two l
 from __future__ import annotations
 
 import math
+import os
 import statistics
 import tempfile
 import time
@@ -17,6 +18,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; read when torch is first imported
 
 import numpy as np
 import torch

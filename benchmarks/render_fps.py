@@ -5,11 +5,14 @@ python benchmarks/render_fps.py --anchors 20000,100000 --renderers torch,cpu --j
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; read when torch is first imported
 
 import torch
 import tyro

@@ -8,6 +8,7 @@ which changes no number. Medians over the steps; renderers take turns step by st
 
 from __future__ import annotations
 
+import os
 import statistics
 import tempfile
 import time
@@ -15,6 +16,8 @@ from collections import defaultdict
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; read when torch is first imported
 
 import torch
 import tyro

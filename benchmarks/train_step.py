@@ -10,11 +10,14 @@ is busy with other work, --threads 1 --clock processor counts only the time that
 
 from __future__ import annotations
 
+import os
 import statistics
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; read when torch is first imported
 
 import torch
 import tyro
