@@ -101,7 +101,8 @@ class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
 class _KernelCache(FunctionCache):
     """numba's on-disk cache with three changes.
 
-    - A kernel is invalidated when any file of its folder or of this one changes (numba checks its own file only).
+    - A kernel is invalidated when any file of its folder, of the one above or of this one changes, as it may have
+      constants from there (numba checks its own file only).
     - A cache that cannot be read or written causes a compilation, never an error.
     - A message is logged before compilation.
     """
@@ -135,8 +136,10 @@ def _announce(kept: bool, where: str) -> None:
 
 @cache
 def _fingerprint(folder: Path) -> str:
-    """Hash of the sources of all kernels of a folder and of this one."""
+    """Hash of the sources in a folder of kernels, in the one above and in this one."""
     digest = hashlib.sha256()
-    for path in sorted({*Path(__file__).parent.glob("*.py"), *folder.glob("*.py")}):
+    for path in sorted(
+        {path for place in (Path(__file__).parent, folder, folder.parent) for path in place.glob("*.py")}
+    ):
         digest.update(path.read_bytes())
     return digest.hexdigest()
