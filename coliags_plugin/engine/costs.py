@@ -158,10 +158,9 @@ def seconds_to_psnr(rows: Sequence[Mapping[str, Any]], frames: int) -> dict[str,
     if not rows:
         return {}
     steps, psnr, seconds = (np.array([row[name] for row in rows], dtype=float) for name in ("step", "psnr", "seconds"))
-    sums = np.concatenate([[0.0], np.cumsum(psnr)])
     first = np.searchsorted(steps, steps - frames, side="right")
-    index = np.arange(len(steps))
-    smoothed = (sums[index + 1] - sums[first]) / (index + 1 - first)
+    # Each rounded once: differences of running sums may miss a mark that is reached exactly.
+    smoothed = np.array([fmean(psnr[begin : end + 1]) for end, begin in enumerate(first)])
     found: dict[str, float | None] = {}
     for mark in PSNR_MARKS:
         reached = seconds[(steps >= frames) & (smoothed >= mark)]
