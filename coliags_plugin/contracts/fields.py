@@ -237,7 +237,10 @@ class Head(nn.Module, ABC, Generic[SettingsT]):
             cls.has_networks = "networks" in vars(cls)
 
     def networks(self, *inputs: Any) -> HeadNetworks | None:
-        """The networks that ``forward`` consists of, for the same inputs; None where it does other things."""
+        """MLPs of this head and their inputs, for fused decoding; None where ``forward`` is not made of MLPs.
+
+        Called as ``forward`` is.
+        """
         return None
 
     @abstractmethod

@@ -168,7 +168,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
 
     @property
     def _rows(self) -> AnchorRows:
-        return AnchorRows(self.anchors, self.offsets, self.scalings, self.features)
+        return AnchorRows(self.anchors, self.offsets, self.scalings)
 
     @property
     def _on_kernels(self) -> bool:
@@ -206,7 +206,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
             for head, inputs in ((self.geometry_head, seen[:2]), (self.appearance_head, seen))
         )
         if geometry is not None and appearance is not None:
-            drawn = fused_children(self._rows, visible, geometry, appearance)
+            drawn = fused_children(self._rows, visible, features, geometry, appearance)
         else:
             opacities, covariances = self.geometry_head(*seen[:2])
             drawn = drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(*seen))

@@ -104,17 +104,9 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
         return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
 
-    def networks(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
-    ) -> HeadNetworks | None:
+    def networks(self, *inputs: Any) -> HeadNetworks | None:
         """Those of the head below, if it has some."""
-        seen = (features, directions, distances, cosines, normals)
-        return self.head.networks(*seen) if self.head.has_networks else None
+        return self.head.networks(*inputs) if self.head.has_networks else None
 
     def forward(
         self,

@@ -18,12 +18,11 @@ from coliags_plugin.fields.frustum import DRAWN_SIGMAS, frustum_planes
 
 
 class AnchorRows(NamedTuple):
-    """What a field has of each of its M anchors."""
+    """Positions, children's offsets and log scales of the M anchors of a field."""
 
     positions: Float[Tensor, "M 3"]
     offsets: Float[Tensor, "M K 3"]
     scalings: Float[Tensor, "M 6"]
-    features: Float[Tensor, "M F"]
 
 
 class DrawnChildren(NamedTuple):
@@ -44,7 +43,7 @@ def drawn_children(
     covariances: Float[Tensor, "V K 7"],
     colors: Float[Tensor, "V K 3"],
 ) -> DrawnChildren:
-    """Gaussians of the visible anchors' children whose opacity is positive, from what the heads decoded."""
+    """Gaussians decoded from the visible anchors: their children of positive opacity."""
     children = rows.offsets.shape[1]
     slots = (opacities.reshape(-1) > 0.0).nonzero().squeeze(1)
     parents = visible.index_select(0, slots // children)
@@ -76,13 +75,17 @@ def visible_anchors(rows: AnchorRows, camera: Camera) -> Int[Tensor, "V"]:
 
 
 def fused_children(
-    rows: AnchorRows, visible: Int[Tensor, "V"], geometry: HeadNetworks, appearance: HeadNetworks
+    rows: AnchorRows,
+    visible: Int[Tensor, "V"],
+    features: Float[Tensor, "V F"],
+    geometry: HeadNetworks,
+    appearance: HeadNetworks,
 ) -> DrawnChildren:
     """:func:`drawn_children` from the heads' networks, by kernels for float32 on the CPU.
 
     ``visible`` is ascending. Differentiable once, and not in the anchors' positions.
     """
-    children, count = rows.offsets.shape[1], rows.features.shape[1]
+    children, count = rows.offsets.shape[1], features.shape[1]
     first: list[Tensor] = []  # weights with inputs as rows, units as columns
     first_biases: list[Tensor] = []
     last: list[Tensor] = []  # with units as rows, outputs as columns
@@ -104,10 +107,10 @@ def fused_children(
         *last_biases,
     )
     units, outputs = ([len(bias) for bias in biases] for biases in (first_biases, last_biases))
-    widths = (*units, *outputs, len(_filled(torch.empty(3 * children, 0))), count, children)
+    widths = (*units, *outputs, 3 * children + _missing(3 * children), count, children)
     waves = [(head.embedded, head.frequencies) for head in (geometry, appearance)]
     inputs = (geometry.inputs, appearance.inputs)
-    return DrawnChildren(*_Fused.apply(widths, waves, visible, *rows, *inputs, *networks))  # type: ignore[no-untyped-call]
+    return DrawnChildren(*_Fused.apply(widths, waves, visible, *rows, features, *inputs, *networks))  # type: ignore[no-untyped-call]
 
 
 def _scales_first(values: Float[Tensor, "7K *H"], children: int) -> Float[Tensor, "C *H"]:
@@ -128,11 +131,16 @@ def _waves(given: int, embedded: int, frequencies: int) -> tuple[Tensor, Tensor]
     return _filled(octaves.t()).t().contiguous(), _filled(quadrants)
 
 
-def _filled(values: Tensor) -> Tensor:
-    """With rows of zeros added, up to whole vectors."""
+def _missing(count: int) -> int:
+    """How many rows a table of so many lacks to whole vectors."""
     from coliags_plugin.core.numba_kernels.lanes import WIDTH
 
-    missing = -len(values) % WIDTH
+    return -count % WIDTH
+
+
+def _filled(values: Tensor) -> Tensor:
+    """The values with their rows zero-padded to whole vectors."""
+    missing = _missing(len(values))
     return functional.pad(values, (0, 0) * (values.dim() - 1) + (0, missing)) if missing else values
 
 
@@ -178,14 +186,16 @@ class _Fused(torch.autograd.Function):
 
         visible, _, offsets, scalings, features, geometry, appearance, *networks = ctx.saved_tensors
         make = torch.empty_like if len(visible) else torch.zeros_like
-        of_rows = [make(rows) for rows in (offsets, scalings, features)]
+        of_rows = [make(rows) for rows in (offsets, scalings)]
+        zeros = features.new_zeros
+        of_features = zeros(len(visible), features.shape[1] + _missing(features.shape[1]))
         of_embedded = [
-            features.new_zeros(len(visible), len(seen.quadrants)) if ctx.needs_input_grad[7 + place] else None
+            zeros(len(visible), len(seen.quadrants)) if ctx.needs_input_grad[7 + place] else None
             for place, seen in enumerate(ctx.seen[1:])
         ]
         sums = torch.zeros(kernels.SLABS, sum(network.numel() for network in networks))
         transposed = [_filled(weight).t() for weight in networks if weight.dim() == 2]
-        found = [*of_rows, *(features.new_empty(0) if embedded is None else embedded for embedded in of_embedded)]
+        found = [*of_rows, of_features, *(zeros(0) if embedded is None else embedded for embedded in of_embedded)]
         with workers() as run:
             run(
                 kernels.decode_backward,
@@ -205,7 +215,7 @@ class _Fused(torch.autograd.Function):
         ]
         parts: Any = torch.split(sums.sum(0), [network.numel() for network in networks])
         of_networks = [part.view(network.shape) for part, network in zip(parts, networks, strict=True)]
-        return None, None, None, None, *of_rows, *of_inputs, *of_networks
+        return None, None, None, None, *of_rows, of_features[:, : features.shape[1]], *of_inputs, *of_networks
 
 
 def _embedding_backward(

@@ -59,14 +59,14 @@ def first_layer(
 
 
 def embedded_inputs(networks: HeadNetworks) -> Float[Tensor, "V E"]:
-    """What the networks see besides the features."""
+    """Inputs of the MLPs after the features, the last ones embedded by gamma."""
     plain = networks.inputs.shape[1] - networks.embedded
     waves = cosine_embedding(networks.inputs[:, plain:], networks.frequencies)
     return torch.cat([networks.inputs[:, :plain], waves], dim=1)
 
 
 def outputs(features: Float[Tensor, "V F"], networks: HeadNetworks) -> list[Tensor]:
-    """Results of the networks, one product for all first layers."""
+    """Outputs of the MLPs of a head, with one product for all first layers."""
     weight, bias = (torch.cat([mlp.get_parameter(name) for mlp in networks.mlps]) for name in ("0.weight", "0.bias"))
     hidden = first_layer(features, embedded_inputs(networks), weight, bias).relu()
     parts: Any = torch.split(hidden, [len(mlp.get_parameter("0.bias")) for mlp in networks.mlps], dim=1)

@@ -776,6 +776,8 @@ def _fixed(values: Sequence[float]) -> Callable[..., Intrinsic]:
 lane_columns = _fixed([float(lane % 4) for lane in range(WIDTH)])
 #: Row of a lane's pixel in a block, or of a block in a tile: each of 0, 1, 2, 3 four times
 lane_rows = _fixed([float(lane // 4) for lane in range(WIDTH)])
+#: Number of a lane: 0 to 15
+lane_numbers = _fixed([float(lane) for lane in range(WIDTH)])
 
 
 @intrinsic

@@ -95,6 +95,6 @@ class Runner:
 
 @contextmanager
 def workers() -> Iterator[Runner]:
-    """Lock the thread pool, whose callers each use all cores; with as many threads as torch uses."""
+    """Exclusive use of the thread pool, with as many threads as torch uses."""
     with _crew.turn:
         yield Runner(torch.get_num_threads())

@@ -46,7 +46,7 @@ def attenuate_backward(counters, colors, positions, normals, lamp, exponents, gi
             vec.store_columns(of_colors, 3 * at, of_color)
             # With respect to the logarithms of the channels' factors; 0 in lanes that the vector before had.
             of_log = vec.mul(of_color, vec.load_columns(colors, 3 * at, three))
-            of_log = vec.mul(of_log, vec.select(vec.at_least(_lane_numbers(), float(first - at)), 1.0, 0.0))
+            of_log = vec.mul(of_log, vec.select(vec.at_least(vec.lane_numbers(), float(first - at)), 1.0, 0.0))
             red, green, blue = of_log
             of_exponents = vec.mul(logs, red) + vec.mul(logs, green) + vec.mul(logs, blue)
             # With respect to the logarithms of distance, cosine and incidence, 0 where these are bounded.
@@ -62,9 +62,9 @@ def attenuate_backward(counters, colors, positions, normals, lamp, exponents, gi
 
 @inline
 def _seen(at, positions, normals, lamp):
-    """Logarithms to base 2 of relative distance, cosine and incidence, and what their derivatives need.
+    """Terms of the law for sixteen Gaussians: base-2 logarithms of relative distance, cosine and incidence first.
 
-    These are the ray from the lamp, its inverse square, the optical axis, the ray's depth along it, the normal, the ray's depth
+    Then what their derivatives need: the ray from the lamp, its inverse square, the optical axis, the ray's depth along it, the normal, the ray's depth
     along that, and 1 for each logarithm, 0 where its argument is bounded.
     """
     place, axis = vec.broadcast_all(lamp, 0, (0, 0, 0)), vec.broadcast_all(lamp, 3, (0, 0, 0))
@@ -103,15 +103,10 @@ def _factors(logs, exponents):
 
 @inline
 def _weighted(of_log, exponents, column):
-    """The sum over channels of what is given times their exponents of one kind."""
+    """Derivative with respect to one logarithm: the sum over channels of gradient times exponent."""
     total = vec.mul(of_log[0], vec.broadcast(exponents, column))
     total = vec.fma(of_log[1], vec.broadcast(exponents, 3 + column), total)
     return vec.fma(of_log[2], vec.broadcast(exponents, 6 + column), total)
-
-
-@inline
-def _lane_numbers():
-    return vec.fma(vec.lane_rows(), 4.0, vec.lane_columns())
 
 
 @part

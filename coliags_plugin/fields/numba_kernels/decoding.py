@@ -74,7 +74,7 @@ class Networks(NamedTuple):
 
 
 class Transposed(NamedTuple):
-    """The weights of :class:`Networks` with outputs as rows and inputs as columns, filled up to whole vectors."""
+    """Transposed weights of :class:`Networks`, for the backward pass; inputs are filled up to whole vectors."""
 
     of_features: Array
     of_geometry: Array
@@ -85,17 +85,17 @@ class Transposed(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """The field's rows; ``sizes`` are the exponentials of its scalings."""
+    """Positions and parameters of the anchors; ``sizes`` are the exponentials of the scalings."""
 
     visible: Array  # int64, ascending [V]
     positions: Array  # [M, 3]
     offsets: Array  # [M, K, 3]
     sizes: Array  # [M, 6]
-    features: Array  # [M, F]
+    features: Array  # of the visible ones [V, F]
 
 
 class Drawn(NamedTuple):
-    """What is written of the children of positive opacity, and what only the derivatives need."""
+    """Output Gaussians, and of their quaternions what the backward pass needs."""
 
     sources: Array  # int64, in M * K
     means: Array
@@ -107,7 +107,7 @@ class Drawn(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Derivatives with respect to what was drawn."""
+    """Gradients with respect to the output Gaussians."""
 
     means: Array
     quats: Array
@@ -117,11 +117,11 @@ class Given(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Derivatives with respect to the field's rows, and to the embedded inputs where not empty."""
+    """Gradients with respect to the anchors' parameters and to the networks' embedded inputs, these where not empty."""
 
-    offsets: Array
-    scalings: Array
-    features: Array
+    offsets: Array  # [M, K, 3]
+    scalings: Array  # [M, 6]
+    features: Array  # filled up to whole vectors and with zeros, as all below [V, columns]
     geometry: Array
     appearance: Array
 
@@ -130,16 +130,14 @@ class Found(NamedTuple):
 def decode_opacities(counters, widths, anchors, geometry, appearance, networks, hidden, opacities, counts):
     """Write the hidden layer [V, units] and the opacities [V, columns], and count the positive ones of each tile."""
     units, geometry_units = _units(widths)
-    features = _tile_of(widths.features)
     geometry_columns, appearance_columns = len(geometry.quadrants), len(appearance.quadrants)
     geometry_inputs, appearance_inputs = _tile_of(geometry_columns), _tile_of(appearance_columns)
     for tile in pieces(counters, 0, len(counts)):
         first = TILE * tile
         rows = min(TILE, len(anchors.visible) - first)
         start, at = first * units, first * widths.opacities
-        _gather(features, widths.features, anchors, first, rows)
         _fill(hidden, start, rows, networks.first_bias)
-        a = (features, 0, widths.features, 1)
+        a = (anchors.features, first * widths.features, widths.features, 1)
         multiply((rows, units, widths.features), a, (networks.of_features, 0, units), (hidden, start, units))
         _embed(geometry_inputs, geometry, first, rows)
         a, b = (geometry_inputs, 0, geometry_columns, 1), (networks.of_geometry, 0, geometry_units)
@@ -225,7 +223,6 @@ def decode_backward(
     networks, for each slab one behind the other.
     """
     units, geometry_units = _units(widths)
-    features, of_features = _tile_of(widths.features), _tile_of(filled(widths.features))
     outputs = (_tile_of(widths.opacities), _tile_of(widths.covariances), _tile_of(widths.colors))
     of_hidden = _tile_of(units)
     geometry_columns, appearance_columns = len(geometry.quadrants), len(appearance.quadrants)
@@ -244,10 +241,8 @@ def decode_backward(
                 vec.store(of_hidden, i, vec.select(active, vec.load(of_hidden, i), 0.0))
             _add_rows(total.first_bias, of_hidden, rows)
 
-            _gather(features, widths.features, anchors, first, rows)
-            b = (of_hidden, 0, units)
-            a, c = (features, 0, 1, widths.features), (total.of_features, 0, units)
-            multiply((widths.features, units, rows), a, b, c)
+            a, b = (anchors.features, first * widths.features, 1, widths.features), (of_hidden, 0, units)
+            multiply((widths.features, units, rows), a, b, (total.of_features, 0, units))
             _embed(geometry_inputs, geometry, first, rows)
             a, c = (geometry_inputs, 0, 1, geometry_columns), (total.of_geometry, 0, geometry_units)
             multiply((geometry_columns, geometry_units, rows), a, b, c)
@@ -256,11 +251,9 @@ def decode_backward(
             c = (total.of_appearance, 0, widths.color_units)
             multiply((appearance_columns, widths.color_units, rows), a, b, c)
 
-            columns = filled(widths.features)
-            of_features[:] = 0.0
+            columns = len(transposed.of_features) // units
             a, b = (of_hidden, 0, units, 1), (transposed.of_features, 0, columns)
-            multiply((rows, columns, units), a, b, (of_features, 0, columns))
-            _scatter(of_features, columns, widths.features, anchors, first, rows, found.features)
+            multiply((rows, columns, units), a, b, (found.features, first * columns, columns))
             if len(found.geometry):
                 b = (transposed.of_geometry, 0, geometry_columns)
                 c = (found.geometry, first * geometry_columns, geometry_columns)
@@ -318,7 +311,6 @@ def _clear(v, widths, anchors, found):
     end = anchors.visible[v] + 1 if v + 1 < len(anchors.visible) else len(anchors.sizes) // 6
     found.scalings[6 * begin : 6 * end] = 0.0
     found.offsets[3 * widths.children * begin : 3 * widths.children * end] = 0.0
-    found.features[widths.features * begin : widths.features * end] = 0.0
 
 
 @part
@@ -357,12 +349,6 @@ def _units(widths):
 @inline
 def _tile_of(columns):
     return np.empty(TILE * columns, np.float32)
-
-
-@part
-def filled(columns):
-    """Columns filled up to whole vectors."""
-    return -(-columns // vec.WIDTH) * vec.WIDTH
 
 
 @part
@@ -428,24 +414,6 @@ def _sine(x, quadrant):
     value = vec.select(is_odd, cosine, sine)
     is_negative = vec.greater(vec.fma(vec.floor(vec.mul(halves, 0.5)), -2.0, halves), 0.5)
     return vec.select(is_negative, vec.neg(value), value)
-
-
-@part
-def _gather(table, columns, anchors, first, rows):
-    """Copy the features of a tile."""
-    for row in range(rows):
-        m = anchors.visible[first + row]
-        for i in range(columns):
-            table[row * columns + i] = anchors.features[m * columns + i]
-
-
-@part
-def _scatter(table, table_columns, columns, anchors, first, rows, features):
-    """Copy rows of a tile to those of its anchors."""
-    for row in range(rows):
-        m = anchors.visible[first + row]
-        for i in range(columns):
-            features[m * columns + i] = table[row * table_columns + i]
 
 
 @part

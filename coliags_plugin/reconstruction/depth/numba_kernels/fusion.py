@@ -29,7 +29,7 @@ def reproject(
     values = np.zeros(4 * other.size, np.float32)
     corners(other, values, 0)
     weights = weight.reshape(weight.size)
-    numbers = vec.fma(vec.lane_rows(), 4.0, vec.lane_columns())
+    numbers = vec.lane_numbers()
     for at in range(0, len(depth), vec.WIDTH):
         pixel = vec.add(numbers, at)
         row = vec.floor(vec.div(vec.add(pixel, 0.5), width))

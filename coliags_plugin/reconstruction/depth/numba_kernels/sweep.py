@@ -55,7 +55,7 @@ def _warp(
 ) -> None:
     """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly; 0 where not visible."""
     rows, columns = shape
-    numbers = vec.fma(vec.lane_rows(), 4.0, vec.lane_columns())
+    numbers = vec.lane_numbers()
     for y in range(len(base) // row - 2 * radius):
         cy = np.float32(y) + np.float32(0.5)
         ax = turn[0, 1] * cy + turn[0, 2]
