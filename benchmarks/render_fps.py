@@ -29,6 +29,8 @@ from coliags_plugin.renderers.choice import choose_renderer
 class Options:
     """Time rendering."""
 
+    method: str = "coliags"
+    """Method config, of a field of anchors."""
     anchors: str = "20000,100000"
     """Numbers of anchors, comma separated."""
     renderers: str = "torch"
@@ -51,7 +53,7 @@ def main(options: Options) -> None:
     rows = []
     for anchors in map(int, options.anchors.split(",")):
         scene = tube_scene(anchors, frames=options.frames, width=width, height=height)
-        node = load_method("coliags", ["field.voxel_size=0.01"]).config.field
+        node = load_method(options.method, ["field.voxel_size=0.01"]).config.field
         field = node.target.from_scene(scene, node.settings, torch.Generator().manual_seed(0)).to(device)
         names = options.renderers.split(",")
         chosen = {name: choose_renderer(make_component("renderers", name), field.primitive, device) for name in names}

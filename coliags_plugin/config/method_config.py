@@ -53,9 +53,8 @@ class OptimizerSettings(Settings):
     final_lr: float | None = Field(default=None, ge=0)  # at the last step; None: as at the first
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
     halve_at: tuple[Share, ...] = ()  # shares of the run, between 0 and 1, after each of which the rate is halved
-    eps: float = Field(
-        default=1e-15, gt=0
-    )  # Adam's epsilon; the default is the splatting methods' (docs/methods.md 2.3)
+    beta2: float = Field(default=0.999, ge=0, lt=1)  # Adam's decay of mean squared gradients: over 1/(1 - beta2) steps
+    eps: float = Field(default=1e-15, gt=0)  # Adam's epsilon; the splatting methods' (docs/methods.md 2.3)
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:

@@ -16,6 +16,8 @@ from coliags_plugin.engine.model import Model
 _GRADIENT, _MOMENTUM, _MEAN_SQUARE = "grad", "exp_avg", "exp_avg_sq"
 #: Of a parameter in the state of Adam, beside its moments.
 _COUNT = "step"
+#: Adam's decay of mean gradients.
+_BETA1 = 0.9
 
 
 class Optimizers:
@@ -33,7 +35,7 @@ class Optimizers:
         self.steps = steps
         self.extent = extent
         self.adam: dict[str, torch.optim.Optimizer] = {
-            name: torch.optim.Adam(parameters, lr=0.0, eps=settings[name].eps, fused=True)
+            name: torch.optim.Adam(parameters, 0.0, (_BETA1, settings[name].beta2), settings[name].eps, fused=True)
             for name, parameters in groups.items()
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import torch
@@ -19,6 +20,8 @@ class PlainGeometrySettings(Settings):
     """Options of the plain geometry head."""
 
     hidden: int = Field(default=32, ge=1)  # units of each hidden layer
+    # Of every child at the start; null: random, about half of an anchor's children are below 0 (docs/methods.md 3.4).
+    initial_opacity: float | None = Field(default=None, gt=0, lt=1)
 
 
 #: Settings of a geometry head.
@@ -37,6 +40,10 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
         inputs = features + 3 * (1 + 2 * self.frequencies)
         self.opacity_mlp = mlp(inputs, settings.hidden, children, generator)
         self.covariance_mlp = mlp(inputs, settings.hidden, 7 * children, generator)
+        if settings.initial_opacity is not None:
+            weight, bias = self.opacity_mlp[-1].parameters()
+            nn.init.zeros_(weight)
+            nn.init.constant_(bias, math.atanh(settings.initial_opacity))
 
     @property
     def frequencies(self) -> int:

@@ -108,3 +108,16 @@ def test_before_the_first_step_there_are_no_moments_to_cut():
     optimizers.reset_rows("sizes")
     optimizers.keep_rows(["points"], torch.arange(6) > 0)
     assert len(field.points) == 5
+
+
+def test_beta2_sets_how_long_squared_gradients_are_remembered():
+    """Without a memory of squares, bias-corrected Adam divides the momentum by the present gradient's size."""
+    field = Rows()
+    before = field.points.detach().clone()
+    settings = {"points": OptimizerSettings(lr=0.1, beta2=0.0), "sizes": OptimizerSettings(lr=0.01)}
+    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
+    for step, gradient in ((1, 4.0), (2, 1.0)):
+        field.points.grad = torch.full((5, 3), gradient)
+        optimizers.step(step)
+    second = (0.9 * 0.4 + 0.1 * 1.0) / (1 - 0.9**2)
+    torch.testing.assert_close(field.points.detach(), before - 0.1 * (1.0 + second))

@@ -105,6 +105,14 @@ def test_decoding_step_by_step():
     torch.testing.assert_close(found, torch.stack(expected), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("head", ["plain", "imve"])
+def test_all_children_can_start_with_one_opacity(head):
+    field = make_field("anchors", geometry_head={"name": head, "initial_opacity": 0.2}, appearance_head="plain")
+    gaussians = field.gaussians(camera_at(0.0, 0.0, 0.0))
+    assert len(gaussians) == len(gaussians.visible_sources) * 10 > 0
+    torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.2))
+
+
 def test_sources_name_anchor_and_child():
     field = make(COLIAGS)
     drawn = field.gaussians(camera_at(0.0, 0.0, 0.0))
