@@ -11,6 +11,9 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 import pytest
 import torch
 
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

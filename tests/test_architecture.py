@@ -31,7 +31,20 @@ LAYERS = (
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 #: Loaded when a command or component runs, never when a module is imported.
-LAZY = {"open3d", "pycolmap", "numba", "gsplat", "gsply", "pooch", "requests", "viser", "nerfstudio", "pyarrow", "ray"}
+LAZY = {
+    "open3d",
+    "pycolmap",
+    "numba",
+    "triton",
+    "gsplat",
+    "gsply",
+    "pooch",
+    "requests",
+    "viser",
+    "nerfstudio",
+    "pyarrow",
+    "ray",
+}
 LAZY |= {"tensorboard", "wandb"}
 
 SOURCES = {
@@ -105,7 +118,7 @@ def test_heavy_libraries_are_imported_late():
     for name in components():
         path = SOURCES[name]
         loaded = {imported.split(".")[0] for imported in imports(path, top_level_only=True)}
-        allowed = {"numba"} if "numba_kernels" in path.parts else set()
+        allowed = {name for name in ("numba", "triton") if f"{name}_kernels" in path.parts}
         early += [f"{name} imports {library}" for library in loaded & (LAZY - allowed)]
     assert early == []
 

@@ -186,6 +186,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
         "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
+        "triton": "coliags_plugin.renderers.triton_renderer:TritonRenderer",
         "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",
     },
     ("modules", "view module"): {

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from coliags_plugin.renderers.splatting import CutSettings
 from coliags_plugin.renderers.sweeping import Chunk, crossing_of_half, padded_rows, sweep
+from coliags_plugin.renderers.tiles import TileGrid, TilePairs
 
 
 def log_alpha_polynomials(
@@ -49,6 +50,26 @@ def monomials(points: Float[Tensor, "P 2"]) -> Float[Tensor, "6 P"]:
     """1, x, y, x^2, x y, y^2 of points. [6, P]"""
     x, y = points.unbind(-1)
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def composite_gaussians(
+    table: Float[Tensor, "N 6+F"],
+    depths: Float[Tensor, "N"] | None,
+    pairs: TilePairs,
+    grid: TileGrid,
+    cuts: CutSettings,
+) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W"] | None]:
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    # One lookup: its gradient is the most expensive step outside compositing.
+    of_pairs = table.index_select(0, pairs.gaussian)
+    offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]
+    polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
+    pixels = monomials(grid.offsets(table))
+    sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts))
+    if depths is None:
+        return sums, None
+    medians = median_depths(polynomials, depths[pairs.gaussian], pairs.starts, pixels, cuts)
+    return sums, grid.to_image(medians[:, None])[..., 0]
 
 
 def composite(

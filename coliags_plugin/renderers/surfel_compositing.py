@@ -14,20 +14,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.renderers.splatting import CutSettings
+from coliags_plugin.renderers.stages import SurfelRules
 from coliags_plugin.renderers.sweeping import Chunk, crossing_of_half, padded_rows, sweep
-from coliags_plugin.renderers.tiles import TilePairs
+from coliags_plugin.renderers.tiles import TileGrid, TilePairs
 
 
-class SurfelRules(NamedTuple):
-    """How surfels are composited: they are skipped at pixels where they are nearer than the near plane, a z-depth.
-
-    ``depths`` tells whether depths, their distortion and the median are wanted.
-    """
-
-    settings: CutSettings
-    near_plane: float
-    depths: bool
+def composite_surfels(
+    table: Float[Tensor, "N 13+F"], pairs: TilePairs, grid: TileGrid, rules: SurfelRules
+) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W 4"]]:
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    of_pairs = table.index_select(0, pairs.gaussian)
+    origins = grid.centers(pairs.tile, of_pairs.dtype)
+    rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
+    sums, depths = composite_pairs(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
+    return grid.to_image(sums), grid.to_image(depths)
 
 
 def pair_rows(
@@ -36,7 +36,7 @@ def pair_rows(
     log_opacities: Float[Tensor, "M"],
     origins: Float[Tensor, "M 2"],
 ) -> Float[Tensor, "M 13"]:
-    """What :func:`composite_surfels` reads of each pair, from its surfel's ``ProjectedSurfels.intersections``.
+    """What :func:`composite_pairs` reads of each pair, from its surfel's ``ProjectedSurfels.intersections``.
 
     These are the coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, D, the offset from there
     to the filter's centre, and log(opacity). ``origins`` are the midpoints of the tiles, pixels.
@@ -50,7 +50,7 @@ def pair_rows(
     return torch.cat([planes, plane_offsets, filter_centers - origins, log_opacities[:, None]], dim=-1)
 
 
-def composite_surfels(
+def composite_pairs(
     rows: Float[Tensor, "M 13"],
     features: Float[Tensor, "M F"],
     pairs: TilePairs,
@@ -96,12 +96,12 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules) -
         u, v = u * inverse_w, v * inverse_w
         x, y = pixels[1] - table[:, 10:11], pixels[2] - table[:, 11:12]
         squared = u * u + v * v
-        filtered = (x * x + y * y) * rules.settings.surfel_filter**-2
+        filtered = (x * x + y * y) * rules.cuts.surfel_filter**-2
         on_disc = squared <= filtered
         alphas = torch.exp(table[:, 12:] - 0.5 * torch.where(on_disc, squared, filtered)).mul_(hit)
         return alphas, _Hits(inverse_w, u, v, torch.where(hit, depths, 1.0), on_disc, (x, y))
 
-    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), rules.settings)
+    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), rules.cuts)
 
 
 class _Spread:
@@ -184,7 +184,7 @@ class _CompositeSurfels(torch.autograd.Function):
                 crossing, crosses = crossing_of_half(chunk)
                 of_z.scatter_add_(1, crossing[:, None], of_median * crosses[:, None])
             gained.mul_(weights)
-            of_log_alphas = chunk.of_log_alphas(gained, behind, rules.settings.alpha_max)
+            of_log_alphas = chunk.of_log_alphas(gained, behind, rules.cuts.alpha_max)
             of_rows[chunk.rows] = _of_rows(
                 hits, of_log_alphas, None if of_z is None else of_z.flatten(0, 1), pixels, rules
             )
@@ -208,6 +208,6 @@ def _of_rows(
         of_w = of_w - of_offsets * hits.depths
         of_offset = of_offsets.sum(1, keepdim=True)
     of_planes = torch.stack([of_u, of_v, of_w], dim=1) @ pixels.T
-    filtered = of_log_alphas * ~hits.on_disc * rules.settings.surfel_filter**-2
+    filtered = of_log_alphas * ~hits.on_disc * rules.cuts.surfel_filter**-2
     of_center = torch.stack([(filtered * offset).sum(1) for offset in hits.from_center], dim=1)
     return torch.cat([of_planes.flatten(1), of_offset, of_center, of_log_alphas.sum(1, keepdim=True)], dim=1)

@@ -51,38 +51,39 @@ class ProjectedSurfels:
 def project_surfels(gaussians: Gaussians, camera: Camera) -> ProjectedSurfels:
     """Project surfels; differentiable in all of them and in ``camera.camera_to_world``.
 
-    Those whose centre has z <= the camera's near plane are not drawn.
+    Those whose centre has z <= the camera's near plane are not drawn. The result is of the surfels' dtype but computed
+    in float64, as a disc seen nearly edge-on magnifies rounding.
     """
-    camera = camera.to(gaussians.means.device, gaussians.means.dtype)
+    dtype, double = gaussians.means.dtype, torch.float64
+    camera = camera.to(gaussians.means.device, double)
     camera_axes = camera.camera_to_world[:3, :3]
-    # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
-    local = (gaussians.means - camera.center) @ camera_axes
+    local = (gaussians.means.to(double) - camera.center) @ camera_axes
     in_front = local[:, 2] > camera.near_plane
     # A stand-in keeps 0 * inf out of the backward pass of what is not drawn.
     places = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0]))
     z = places[:, 2:]
     focal, principal = local.new_tensor([camera.fx, camera.fy]), local.new_tensor([camera.cx, camera.cy])
-    filter_centers = focal * places[:, :2] / z + principal
+    filter_centers = (focal * places[:, :2] / z + principal).to(dtype)
     means2d = filter_centers.clone()
 
-    rotations = camera_axes.T @ rotation_matrices(gaussians.quats_wxyz)
+    rotations = camera_axes.T @ rotation_matrices(gaussians.quats_wxyz.to(double))
     first, second = rotations[:, :, 0], rotations[:, :, 1]
     sight = torch.cat([_exactly(places[:, :2], (means2d - principal) / focal * z), z], dim=-1)
     # With U and V over the scales instead of W and D times both, depths do not depend on scales even in rounding, and
     # what the filter makes of the smallest surfels gives these no gradient.
     scaled = gaussians.scales != 0
-    scales = torch.where(scaled, gaussians.scales, 1.0)
+    scales = torch.where(scaled, gaussians.scales, 1.0).to(double)
     cross = torch.linalg.cross
     u, v, w = cross(second, sight) / scales[:, :1], cross(sight, first) / scales[:, 1:], cross(first, second)
     offsets = (w * sight).sum(-1)
     return ProjectedSurfels(
-        places=places,
-        tangents=torch.stack([first, second], dim=1) * scales[:, :, None],
-        normals=facing(rotations[:, :, 2], local),
+        places=places.to(dtype),
+        tangents=(torch.stack([first, second], dim=1) * scales[:, :, None]).to(dtype),
+        normals=facing(rotations[:, :, 2], local).to(dtype),
         means2d=means2d,
         filter_centers=filter_centers,
-        slopes=torch.stack([u, v, w], dim=1)[:, :, :2] / focal,
-        offsets=offsets,
+        slopes=(torch.stack([u, v, w], dim=1)[:, :, :2] / focal).to(dtype),
+        offsets=offsets.to(dtype),
         visible=in_front & scaled.all(-1) & (offsets != 0),
     )
 

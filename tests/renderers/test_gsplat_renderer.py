@@ -188,7 +188,7 @@ def test_auto_and_the_doctor_give_the_reason(monkeypatch):
     forget()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
-    reason = "gsplat runs on cuda, the device is cpu; "
+    reason = "triton runs on cuda, the device is cpu; gsplat runs on cuda, the device is cpu; "
     chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", torch.device("cpu"))
     assert chosen.reason.startswith(reason)
     told = {result.name: result for result in check_installation()}
@@ -202,7 +202,7 @@ def test_auto_takes_gsplat_where_it_works(calls):
     # The renderer seems to run on the CPU here, which is where the stand-in is.
     component = make_component("renderers", {"name": "auto", "background": BACKGROUND})
     chosen = choose_renderer(component, "gaussians3d", torch.device("cpu"))
-    assert chosen.name == "gsplat" and chosen.reason == "auto chose gsplat: gsplat 1.5.3 on a stand-in"
+    assert chosen.name == "gsplat" and chosen.reason.endswith("; auto chose gsplat: gsplat 1.5.3 on a stand-in")
     assert chosen.renderer.settings == GsplatRendererSettings(background=BACKGROUND)
     assert choose_renderer(component, "surfels", torch.device("cpu")).name != "gsplat"
 

@@ -1,11 +1,14 @@
 """The compiled kernels against the written definition, for 3D Gaussians and surfels, and what they refuse.
 
+Those of triton run in triton's interpreter where there is no GPU (``tests/conftest.py``).
+
 The definition draws nothing below ``alpha_min`` and stops before ``transmittance_min``. A pixel that float32 rounds to
 the other side of such a cut-off is not wrong, only on the cut-off. These pixels are found by moving the cut-offs a
 little in float64; there may be few of them, and all others, and the gradients through them, are held to the tolerance.
 """
 
 import dataclasses
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -15,7 +18,7 @@ from hypothesis import strategies as st
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.rotations import rotation_matrices
-from coliags_plugin.renderers import cpu_renderer, torch_renderer
+from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
@@ -24,6 +27,36 @@ from tests.renderers.test_torch_renderer import INPUTS, cast, make, pinhole, ran
 
 PRIMITIVES = ("gaussians3d", "surfels")
 of_each = pytest.mark.parametrize("primitive", PRIMITIVES)
+needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
+
+
+class OnCuda:
+    """The triton renderer on a device, from and to tensors on the CPU."""
+
+    TritonRendererSettings = triton_renderer.TritonRendererSettings
+
+    @staticmethod
+    def render_gaussians(gaussians, camera, wants=("rgb", "alpha"), settings=None):
+        moved = {name: getattr(gaussians, name).cuda() for name in INPUTS}
+        moved["features"] = {name: value.cuda() for name, value in gaussians.features.items()}
+        output = triton_renderer.render_gaussians(dataclasses.replace(gaussians, **moved), camera, wants, settings)
+        maps = {name: value.cpu() for name, value in output.maps.items()}
+        return dataclasses.replace(output, rgb=output.rgb.cpu(), alpha=output.alpha.cpu(), maps=maps)
+
+
+RENDERERS = (
+    pytest.param(cpu_renderer, id="cpu"),
+    pytest.param(triton_renderer, id="triton", marks=needs_triton),
+    pytest.param(OnCuda, id="triton on CUDA", marks=[needs_triton, pytest.mark.gpu]),
+)
+#: What takes long in triton's interpreter is thorough.
+SLOW_IN_INTERPRETER = (
+    RENDERERS[0],
+    pytest.param(triton_renderer, id="triton", marks=[needs_triton, pytest.mark.thorough]),
+    RENDERERS[2],
+)
+by_each = pytest.mark.parametrize("renderer", RENDERERS)
+by_each_at_length = pytest.mark.parametrize("renderer", SLOW_IN_INTERPRETER)
 #: How far the cut-offs are moved, relative to themselves: more than float32 can be off by.
 CUTOFF_MARGIN = 2e-5
 #: An intersection this many times as far as the disc's centre is near the horizon of the disc's plane, where rays are
@@ -37,8 +70,7 @@ FEATURES = {"one": 1, "many": 7}
 BACKGROUND = (0.3, 0.1, 0.9)
 #: What float32 holds that is not to be expected.
 WILD = torch.tensor([0.0, -0.0, 1e-38, -1e38, 1e38, 3e38, torch.inf, torch.nan, 1e-45, 1e10, -1e-10])
-SCENES = [*(("gaussians3d", name) for name in (*solids.SCENES, "thousands")),
-          *(("surfels", name) for name in (*surfels.SCENES, "thousands"))]  # fmt: skip
+SCENES = [*(("gaussians3d", name) for name in solids.SCENES), *(("surfels", name) for name in surfels.SCENES)]
 
 
 def few(pixels):
@@ -100,18 +132,21 @@ def near_horizon(gaussians, camera):
     return horizon
 
 
+def settings_of(module):
+    return next(value for name, value in vars(module).items() if name.endswith("RendererSettings"))
+
+
 def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d=0.0):
     """Output and gradients of one renderer under random cotangents, which are 0 at the pixels ignored."""
     wants = wants or outputs_of(gaussians)
     gaussians = cast(gaussians, dtype, grad=True)
     features = {name: value.to(dtype).clone().requires_grad_() for name, value in gaussians.features.items()}
     pose = camera.camera_to_world.to(dtype).clone().requires_grad_()
-    kind = module.CpuRendererSettings if module is cpu_renderer else module.TorchRendererSettings
     output = module.render_gaussians(
         dataclasses.replace(gaussians, features=features),
         dataclasses.replace(camera, camera_to_world=pose),
         wants,
-        kind(background=BACKGROUND),
+        settings_of(module)(background=BACKGROUND),
     )
     generator = torch.Generator().manual_seed(1)
     widths = {name: 3 if name in ("rgb", "normals") else 0 for name in OUTPUTS} | FEATURES
@@ -119,7 +154,7 @@ def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d
         name: torch.randn(camera.height, camera.width, *([width] if width else []), generator=generator)
         for name, width in widths.items()
     }
-    loss = of_means2d * output.splats.means2d[output.splats.radii > 0].square().sum()
+    loss = of_means2d * output.splats.means2d[output.splats.radii > 0].square().sum().cpu()
     for name in {"rgb", "alpha", *wants}:
         if ignored is not None:
             cotangents[name][ignored] = 0
@@ -127,7 +162,7 @@ def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d
     loss.backward()
     gradients = {key: getattr(gaussians, key).grad for key in INPUTS}
     gradients |= {name: value.grad for name, value in features.items() if name in wants}
-    return output, {**gradients, "pose": pose.grad, "means2d": output.splats.means2d.grad}
+    return output, {**gradients, "pose": pose.grad, "means2d": output.splats.means2d.grad.cpu()}
 
 
 def with_features(gaussians):
@@ -136,14 +171,27 @@ def with_features(gaussians):
     return dataclasses.replace(gaussians, features=features)
 
 
+@by_each
 @pytest.mark.parametrize(("primitive", "name"), SCENES)
-def test_agrees_with_the_definition_in_float64(primitive, name):
+def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
+    check_against_the_definition(renderer, primitive, name)
+
+
+@by_each_at_length
+@of_each
+def test_thousands_agree_with_the_definition_in_float64(renderer, primitive):
+    check_against_the_definition(renderer, primitive, "thousands")
+
+
+def check_against_the_definition(renderer, primitive, name):
     gaussians, camera = scene(primitive, name)
     ignored = on_a_cutoff(gaussians, camera)
     assert int(ignored.sum()) <= few(ignored.numel())
-    ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, ignored=ignored)
+    ours, gradients = drawn(renderer, gaussians, camera, torch.float32, ignored=ignored)
     true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, ignored=ignored)
     of_outputs, of_gradients = MAGNIFIED.get((primitive, name), (1e-5, 2e-5))
+    if renderer is not cpu_renderer and primitive == "surfels":
+        of_gradients *= 3  # sums of offsets in the image, which cancel more than those of offsets on the disc
     # Half of the light is one more cut-off, of the median alone.
     most = (10 if primitive == "surfels" else 1) * of_outputs
     off = (ours["depth_median"] - true["depth_median"]).abs() > most * true["depth_median"]
@@ -159,9 +207,9 @@ def test_agrees_with_the_definition_in_float64(primitive, name):
     else:
         shown, tolerance = slice(None), {"rtol": 1e-5, "atol": 1e-4}
     torch.testing.assert_close(
-        ours.splats.means2d.detach().double()[shown], true.splats.means2d.detach()[shown], **tolerance
+        ours.splats.means2d.detach().cpu().double()[shown], true.splats.means2d.detach()[shown], **tolerance
     )
-    assert int((ours.splats.radii.double() != true.splats.radii).sum()) <= len(gaussians) // 1000
+    assert int((ours.splats.radii.cpu().double() != true.splats.radii).sum()) <= len(gaussians) // 1000
 
 
 @pytest.mark.parametrize(
@@ -177,12 +225,13 @@ def test_pixels_on_a_cutoff_are_found(depths, opacity):
     assert on_a_cutoff(gaussians, pinhole()).nonzero().tolist() == [[3, 4]]
 
 
+@by_each
 @of_each
-def test_features_and_the_centres_own_gradient_agree_with_the_definition(primitive):
+def test_features_and_the_centres_own_gradient_agree_with_the_definition(renderer, primitive):
     gaussians, camera = scene(primitive)
     gaussians, wants = with_features(gaussians), ("many", "normals", "one", "depth_accumulated")
     ignored = on_a_cutoff(gaussians, camera)
-    ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)
+    ours, gradients = drawn(renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)
     true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, wants, ignored, of_means2d=0.01)
     for key in ("rgb", "alpha", *wants):
         assert relative(ours[key][~ignored], true[key][~ignored]) <= 1e-5, key
@@ -190,6 +239,7 @@ def test_features_and_the_centres_own_gradient_agree_with_the_definition(primiti
         assert relative(gradient, true_gradients[key]) <= (1e-4 if key == "pose" else 2e-5), key
 
 
+@by_each
 @pytest.mark.parametrize(
     ("primitive", "name", "wants"),
     [
@@ -201,11 +251,11 @@ def test_features_and_the_centres_own_gradient_agree_with_the_definition(primiti
         ("surfels", "across the near plane", ("inverse_depth_accumulated", "distortion", "one")),
     ],
 )
-def test_outputs_and_gradients_do_not_depend_on_what_else_is_asked_for(primitive, name, wants):
+def test_outputs_and_gradients_do_not_depend_on_what_else_is_asked_for(renderer, primitive, name, wants):
     gaussians, camera = scene(primitive, name)
     gaussians = with_features(gaussians)
-    less, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, wants)
-    more, _ = drawn(cpu_renderer, gaussians, camera, torch.float32, (*outputs_of(gaussians), "one"))
+    less, gradients = drawn(renderer, gaussians, camera, torch.float32, wants)
+    more, _ = drawn(renderer, gaussians, camera, torch.float32, (*outputs_of(gaussians), "one"))
     _, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, wants)
     for key in ("rgb", "alpha", *wants):
         torch.testing.assert_close(less[key], more[key], rtol=1e-6, atol=1e-6)
@@ -259,13 +309,14 @@ def test_bins_miss_no_pixel_that_a_surfel_reaches(seed, size, depth, low_pass):
     assert ours.splats.radii.item() > 0 or not (true > 1.001 / 255).any()
 
 
+@by_each_at_length
 @of_each
 @settings(max_examples=25, deadline=None)
 @given(n=st.integers(0, 60), width=st.integers(1, 70), height=st.integers(1, 50), seed=st.integers(0, 99))
-def test_any_size(primitive, n, width, height, seed):
+def test_any_size(renderer, primitive, n, width, height, seed):
     gaussians, (_, camera) = of_primitive(primitive, random_gaussians(n, seed)), scene(primitive)
     camera = dataclasses.replace(camera, width=width, height=height, camera_to_world=torch.eye(4))
-    ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32)
+    ours, gradients = drawn(renderer, gaussians, camera, torch.float32)
     true, _ = drawn(torch_renderer, cast(gaussians, torch.float32), camera, torch.float64)
     assert ours.rgb.shape == (height, width, 3) and ours["depth_expected"].shape == (height, width)
     # A pixel on a cut-off may fall to either side in float32.
@@ -274,16 +325,17 @@ def test_any_size(primitive, n, width, height, seed):
     assert all(gradient is None or torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
+@by_each
 @pytest.mark.parametrize("near_plane", [0.0, 0.2])
-def test_what_is_not_drawn_leaves_no_trace(near_plane):
+def test_what_is_not_drawn_leaves_no_trace(renderer, near_plane):
     """Behind the camera, of no area, too faint, beside the image."""
     means = [[0, 0, -3.0], [0, 0, 2.0], [0, 0, 2.0], [50.0, 0, 2.0]]
     scales = torch.tensor([[0.3, 0.3], [0.3, 0.0], [0.3, 0.3], [0.3, 0.3]])
     gaussians = make_surfels(means, scales, torch.tensor([0.9, 0.9, 1 / 256, 0.9]))
     gaussians = cast(gaussians, torch.float32, grad=True)
-    options = cpu_renderer.CpuRendererSettings(background=(0.1, 0.2, 0.3))
+    options = settings_of(renderer)(background=(0.1, 0.2, 0.3))
     camera = dataclasses.replace(pinhole(dtype=torch.float32), near_plane=near_plane)
-    output = cpu_renderer.render_gaussians(gaussians, camera, OUTPUTS, options)
+    output = renderer.render_gaussians(gaussians, camera, OUTPUTS, options)
     assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(7, 9, 3))
     assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
     assert not output.splats.radii.any()
@@ -291,9 +343,10 @@ def test_what_is_not_drawn_leaves_no_trace(near_plane):
     assert not any(getattr(gaussians, name).grad.any() for name in INPUTS)
 
 
-def test_the_median_depth_has_a_gradient():
+@by_each
+def test_the_median_depth_has_a_gradient(renderer):
     gaussians = cast(make_surfels([[0, 0, 2.0], [0, 0, 3.0]], 1e2, 0.4), torch.float32, grad=True)
-    output = cpu_renderer.render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS)
+    output = renderer.render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS)
     assert torch.equal(output["depth_median"], torch.full((7, 9), 3.0))
     output["depth_median"][3, 4].backward()
     torch.testing.assert_close(gaussians.means.grad, torch.tensor([[0.0, 0, 0], [0, 0, 1.0]]), rtol=0, atol=1e-6)
@@ -380,16 +433,17 @@ def test_wild_numbers_never_crash(primitive, seed):
     assert output.rgb.shape == (camera.height, camera.width, 3)
 
 
+@by_each_at_length
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), exponent=st.integers(-44, 15))
-def test_extreme_sizes_and_views_stay_finite(seed, exponent):
+def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
     """Discs too small, too large, or seen too nearly edge-on for float32."""
     gaussians = cast(as_surfels(random_gaussians(40, seed, depth=(0.15, 2.0))), torch.float32)
     gaussians.scales[::2] *= 10.0**exponent
     half = torch.tensor(0.5).sqrt()
     gaussians.quats_wxyz[:10] = torch.stack([half, half * 0, half, half * 0])
     gaussians.means[:5, 0] = 0.0
-    output, gradients = drawn(cpu_renderer, gaussians, pinhole(9, 7, dtype=torch.float32), torch.float32)
+    output, gradients = drawn(renderer, gaussians, pinhole(9, 7, dtype=torch.float32), torch.float32)
     assert all(torch.isfinite(output[name]).all() for name in OUTPUTS)
     assert all(torch.isfinite(gradients[name]).all() for name in ("opacities", "colors"))
 

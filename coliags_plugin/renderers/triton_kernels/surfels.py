@@ -1,0 +1,187 @@
+"""Compositing of surfels, forward and backward; their depth differs from pixel to pixel.
+
+Rows of the table are means2d (2), slopes of U, V and W (6), W at the centre, D, the filter's centre (2), log(opacity)
+and the features (``ProjectedSurfels.intersections``, ``stages.Compositors``).
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from coliags_plugin.renderers.triton_kernels.tile import crosses_half, cut, of_log_alphas, tile_pixels, transmittances
+
+#: Columns of the table before the features.
+OWN_COLUMNS = tl.constexpr(13)
+
+
+@triton.jit
+def _plane(rows, here, column, dx, dy):
+    """The number of a pixel that has these slopes and is 0 at the centre. [R, P]"""
+    return tl.load(rows + column, here, 0.0)[:, None] * dx + tl.load(rows + column + 1, here, 0.0)[:, None] * dy
+
+
+@triton.jit
+def _hits(rows, here, x, y, near_plane):
+    """Where rays meet discs: offset from the centre, 1 / W, intersection, depth, and whether they do. [R, P] each"""
+    dx = x[None, :] - tl.load(rows, here, 0.0)[:, None]
+    dy = y[None, :] - tl.load(rows + 1, here, 0.0)[:, None]
+    inverse_w = 1.0 / (_plane(rows, here, 6, dx, dy) + tl.load(rows + 8, here, 0.0)[:, None])
+    depths = tl.load(rows + 9, here, 0.0)[:, None] * inverse_w
+    # Infinite, or NaN, where W is 0.
+    hit = (depths >= near_plane) & (depths < float("inf"))
+    inverse_w = tl.where(hit, inverse_w, 0.0)
+    u, v = _plane(rows, here, 2, dx, dy) * inverse_w, _plane(rows, here, 4, dx, dy) * inverse_w
+    return dx, dy, inverse_w, u, v, tl.where(hit, depths, 1.0), hit
+
+
+@triton.jit
+def _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max):
+    """Alphas, offset from the filter's centre, and whether the disc counts, not the filter. [R, P] each"""
+    from_x = x[None, :] - tl.load(rows + 10, here, 0.0)[:, None]
+    from_y = y[None, :] - tl.load(rows + 11, here, 0.0)[:, None]
+    squared, filtered = u * u + v * v, (from_x * from_x + from_y * from_y) * sharpness
+    on_disc = squared <= filtered
+    log_opacities = tl.load(rows + 12, here, -1e4)
+    alphas = tl.exp(log_opacities[:, None] - 0.5 * tl.where(on_disc, squared, filtered))
+    return cut(tl.where(hit, alphas, 0.0), alpha_min, alpha_max), from_x, from_y, on_disc
+
+
+@triton.jit
+def forward(
+    table, gaussian, starts, image, depth_image, spread_image, columns, width, height, channels,
+    alpha_min, alpha_max, transmittance_min, near_plane, sharpness,
+    WITH_DEPTHS: tl.constexpr, CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
+):  # fmt: skip
+    """Sums of weight times feature [channels, H, W], and where wanted those of depths [4, H, W].
+
+    With these come the weight, mean and sum of squared differences of 1/z that the backward pass needs. [3, H, W]
+    """
+    tile = tl.program_id(0)
+    x, y, pixel, inside = tile_pixels(tile, columns, width, height, SIZE)
+    before = inside.to(tl.float32)
+    sums = tl.zeros([CHANNELS, SIZE * SIZE], tl.float32)
+    of_depth, of_inverse, median = tl.zeros_like(before), tl.zeros_like(before), tl.zeros_like(before)
+    total, mean, squares = tl.zeros_like(before), tl.zeros_like(before), tl.zeros_like(before)
+    channel = tl.arange(0, CHANNELS)
+    stride = OWN_COLUMNS + channels
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (first < end) & (tl.max(before) > 0.0):
+        ranks = first + tl.arange(0, RANKS)
+        here = ranks < end
+        rows = table + tl.load(gaussian + ranks, here, 0) * stride
+        _, _, _, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
+        alphas, _, _, _ = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
+        behind = transmittances(alphas, before, transmittance_min)
+        weights = alphas / (1.0 - alphas) * behind
+        wanted = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        sums += tl.dot(tl.trans(features), weights, input_precision="ieee")
+        if WITH_DEPTHS:
+            inverse = 1.0 / depths
+            of_depth += tl.sum(weights * depths, axis=0)
+            of_inverse += tl.sum(weights * inverse, axis=0)
+            crossing = crosses_half(behind, weights, before, RANKS)
+            median += tl.sum(tl.where(crossing, depths, 0.0), axis=0)
+            # Means and squared differences are merged; differences of large sums would not be accurate.
+            weight = tl.sum(weights, axis=0)
+            own_mean = tl.sum(weights * inverse, axis=0) / tl.where(weight > 0.0, weight, 1.0)
+            difference = inverse - own_mean[None, :]
+            step = (own_mean - mean) * (weight / tl.where(weight > 0.0, total + weight, 1.0))
+            squares += tl.sum(weights * difference * difference, axis=0) + total * step * (own_mean - mean)
+            mean += step
+            total += weight
+        before = tl.min(behind, axis=0)
+        first += RANKS
+    area = width * height
+    stored = (channel < channels)[:, None] & inside[None, :]
+    tl.store(image + channel[:, None] * area + pixel[None, :], sums, stored)
+    if WITH_DEPTHS:
+        tl.store(depth_image + pixel, of_depth, inside)
+        tl.store(depth_image + area + pixel, of_inverse, inside)
+        tl.store(depth_image + 2 * area + pixel, total * squares, inside)
+        tl.store(depth_image + 3 * area + pixel, median, inside)
+        tl.store(spread_image + pixel, total, inside)
+        tl.store(spread_image + area + pixel, mean, inside)
+        tl.store(spread_image + 2 * area + pixel, squares, inside)
+
+
+@triton.jit
+def backward(
+    table, gaussian, starts, image, depth_image, spread_image, of_image, of_depth_image, of_table,
+    columns, width, height, channels, alpha_min, alpha_max, transmittance_min, near_plane, sharpness,
+    WITH_DEPTHS: tl.constexpr, CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
+):  # fmt: skip
+    """Add to the table's derivatives what follows from those of the images."""
+    tile = tl.program_id(0)
+    x, y, pixel, inside = tile_pixels(tile, columns, width, height, SIZE)
+    before = inside.to(tl.float32)
+    channel = tl.arange(0, CHANNELS)
+    stride = OWN_COLUMNS + channels
+    area = width * height
+    stored = (channel < channels)[:, None] & inside[None, :]
+    place = channel[:, None] * area + pixel[None, :]
+    of_sums = tl.load(of_image + place, stored, 0.0)
+    hidden = tl.sum(of_sums * tl.load(image + place, stored, 0.0), axis=0)
+    if WITH_DEPTHS:
+        of_depth = tl.load(of_depth_image + pixel, inside, 0.0)
+        of_inverse = tl.load(of_depth_image + area + pixel, inside, 0.0)
+        of_spread = tl.load(of_depth_image + 2 * area + pixel, inside, 0.0)
+        of_median = tl.load(of_depth_image + 3 * area + pixel, inside, 0.0)
+        total = tl.load(spread_image + pixel, inside, 0.0)
+        mean = tl.load(spread_image + area + pixel, inside, 0.0)
+        squares = tl.load(spread_image + 2 * area + pixel, inside, 0.0)
+        hidden += tl.load(depth_image + pixel, inside, 0.0) * of_depth
+        hidden += tl.load(depth_image + area + pixel, inside, 0.0) * of_inverse
+        # The spread is quadratic in the weights.
+        hidden += 2.0 * tl.load(depth_image + 2 * area + pixel, inside, 0.0) * of_spread
+    first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
+    while (first < end) & (tl.max(before) > 0.0):
+        ranks = first + tl.arange(0, RANKS)
+        here = ranks < end
+        index = tl.load(gaussian + ranks, here, 0)
+        rows, of_rows = table + index * stride, of_table + index * stride
+        dx, dy, inverse_w, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
+        alphas, from_x, from_y, on_disc = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
+        behind = transmittances(alphas, before, transmittance_min)
+        weights = alphas / (1.0 - alphas) * behind
+        wanted = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")
+        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, wanted)
+        gained = tl.dot(features, of_sums, input_precision="ieee")
+        of_offset = tl.zeros_like(weights)
+        if WITH_DEPTHS:
+            inverse = 1.0 / depths
+            deviation = inverse - mean[None, :]
+            gained += of_depth[None, :] * depths + of_inverse[None, :] * inverse
+            gained += of_spread[None, :] * (total[None, :] * deviation * deviation + squares[None, :])
+            of_over_z = of_inverse[None, :] + 2.0 * of_spread[None, :] * total[None, :] * deviation
+            of_z = weights * (of_depth[None, :] - of_over_z * inverse * inverse)
+            crossing = crosses_half(behind, weights, before, RANKS)
+            of_offset = (of_z + tl.where(crossing, of_median[None, :], 0.0)) * inverse_w
+        gained *= weights
+        of_logs = of_log_alphas(gained, hidden, alphas, weights, alpha_max)
+        hidden -= tl.sum(gained, axis=0)
+        disc = tl.where(on_disc, of_logs, 0.0) * inverse_w
+        of_u, of_v = -disc * u, -disc * v
+        of_w = disc * (u * u + v * v) - of_offset * depths
+        total_u, total_v, total_w = tl.sum(of_u, axis=1), tl.sum(of_v, axis=1), tl.sum(of_w, axis=1)
+        for axis in tl.static_range(2):
+            of_mean = total_u * tl.load(rows + 2 + axis, here, 0.0) + total_v * tl.load(rows + 4 + axis, here, 0.0)
+            of_mean += total_w * tl.load(rows + 6 + axis, here, 0.0)
+            tl.atomic_add(of_rows + axis, -of_mean, here)
+        tl.atomic_add(of_rows + 2, tl.sum(of_u * dx, axis=1), here)
+        tl.atomic_add(of_rows + 3, tl.sum(of_u * dy, axis=1), here)
+        tl.atomic_add(of_rows + 4, tl.sum(of_v * dx, axis=1), here)
+        tl.atomic_add(of_rows + 5, tl.sum(of_v * dy, axis=1), here)
+        tl.atomic_add(of_rows + 6, tl.sum(of_w * dx, axis=1), here)
+        tl.atomic_add(of_rows + 7, tl.sum(of_w * dy, axis=1), here)
+        tl.atomic_add(of_rows + 8, total_w, here)
+        tl.atomic_add(of_rows + 9, tl.sum(of_offset, axis=1), here)
+        filtered = tl.where(on_disc, 0.0, of_logs) * sharpness
+        tl.atomic_add(of_rows + 10, tl.sum(filtered * from_x, axis=1), here)
+        tl.atomic_add(of_rows + 11, tl.sum(filtered * from_y, axis=1), here)
+        tl.atomic_add(of_rows + 12, tl.sum(of_logs, axis=1), here)
+        before = tl.min(behind, axis=0)
+        first += RANKS

@@ -1,0 +1,73 @@
+"""Renderer whose compositing is done by triton kernels, with the outputs of the torch reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import ClassVar
+
+import torch
+
+from coliags_plugin.contracts import Availability
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.renderers.stages import Compositors, draw_view
+from coliags_plugin.renderers.tiles import TileGrid
+
+
+class TritonRendererSettings(CutSettings):
+    """Options of :class:`TritonRenderer`: those of the torch renderer, with its defaults."""
+
+
+class TritonRenderer(SplattingRenderer[TritonRendererSettings]):
+    """Renderer of float32 3D Gaussians and surfels on CUDA: ``docs/rendering.md``, section "The triton backend"."""
+
+    Settings = TritonRendererSettings
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
+    devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
+    name: ClassVar[str] = "triton"
+
+    @classmethod
+    def availability(cls) -> Availability:
+        """Available where triton is installed and a CUDA device is there."""
+        if find_spec("triton") is None:
+            return Availability(False, "triton is not installed; PyTorch for CUDA on Linux brings it")
+        if not torch.cuda.is_available():
+            return Availability(False, "no CUDA device is available")
+        return Availability(True, f"triton kernels on {torch.cuda.get_device_name()}")
+
+    def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
+        """See :func:`render_gaussians`."""
+        return render_gaussians(gaussians, camera, wants, self.settings)
+
+
+def render_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    wants: Sequence[str] = ("rgb", "alpha"),
+    settings: TritonRendererSettings | None = None,
+) -> RenderOutput:
+    """Render float32 3D Gaussians, or surfels where they have two scales, from a camera, on their device.
+
+    Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
+    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. CPU tensors need triton's interpreter
+    (``TRITON_INTERPRET=1``).
+
+    Raises:
+        InputError: An output is unknown or not of these Gaussians, or these are not float32.
+    """
+    from coliags_plugin.renderers.triton_kernels import compositing, tile
+
+    settings = settings or TritonRendererSettings()
+    if gaussians.means.dtype != torch.float32:
+        raise InputError(
+            f"Gaussians of dtype {str(gaussians.means.dtype).removeprefix('torch.')} for the triton renderer",
+            "float32",
+            "Cast them, or choose the torch renderer, which computes in float64 too",
+        )
+    grid = TileGrid(camera.width, camera.height, tile.TILE_SIZE)
+    compositors = Compositors(compositing.composite_gaussians, compositing.composite_surfels)
+    return draw_view(gaussians, camera, wants, settings, grid, compositors)

@@ -1,0 +1,62 @@
+"""The triton kernels compiled for GPUs that are not here, and what the compiler says of them."""
+
+import json
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+pytestmark = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
+#: Compute capabilities: A100, H100, B200.
+TARGETS = (80, 90, 100)
+#: Bytes of shared memory for which every GPU has several programs at work on each multiprocessor.
+SHARED = 16 * 1024
+#: Compiles every kernel in an interpreter of its own, in which kernels are not those of triton's interpreter.
+SCRIPT = """
+import json, pathlib, re, subprocess, sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from coliags_plugin.renderers.triton_kernels import gaussians, surfels
+from coliags_plugin.renderers.triton_kernels.tile import BACKWARD_WARPS, FORWARD_WARPS, RANKS, TILE_SIZE
+
+TYPES = {"gaussian": "*i64", "starts": "*i64"} | {
+    name: "i32" for name in ("columns", "width", "height", "channels")
+} | {name: "fp32" for name in ("alpha_min", "alpha_max", "transmittance_min", "near_plane", "sharpness")}
+CUOBJDUMP = pathlib.Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
+target = GPUTarget("cuda", int(sys.argv[1]), 32)
+found = {}
+for module in (gaussians, surfels):
+    for kernel, warps in ((module.forward, FORWARD_WARPS), (module.backward, BACKWARD_WARPS)):
+        for wide in (16, 32):
+            blocks = {"CHANNELS": wide, "SIZE": TILE_SIZE, "RANKS": RANKS, "WITH_MEDIANS": True, "WITH_DEPTHS": True}
+            blocks = {name: value for name, value in blocks.items() if name in kernel.arg_names}
+            types = {name: TYPES.get(name, "*fp32") for name in kernel.arg_names if name not in blocks}
+            types |= dict.fromkeys(blocks, "constexpr")
+            source = ASTSource(fn=kernel, signature=types, constexprs=blocks)
+            made = triton.compile(source, target=target, options={"num_warps": warps})
+            name = f"{module.__name__.rsplit('.')[-1]}.{kernel.__name__}.{wide}"
+            found[name] = {"shared": made.metadata.shared}
+            cubin = pathlib.Path(sys.argv[2], f"{name}.cubin")
+            cubin.write_bytes(made.asm["cubin"])
+            told = subprocess.run([CUOBJDUMP, "-res-usage", cubin], capture_output=True, text=True, check=True).stdout
+            found[name] |= {key.lower(): int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\\d+)", told)}
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.parametrize("capability", TARGETS)
+def test_every_kernel_compiles_without_a_device(capability, tmp_path, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "cache"))
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(capability), str(tmp_path)],
+        capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout)
+    assert len(found) == 8
+    for name, usage in found.items():
+        assert usage["reg"] > 0 and usage["shared"] <= SHARED, (name, usage)
+        assert not usage["stack"] and not usage["local"], f"{name} spills registers to memory: {usage}"
