@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+import torch
+
 from coliags_plugin.contracts import Field
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.gaussians import Gaussians
@@ -36,6 +38,26 @@ def is_surfels(gaussians: Gaussians) -> bool:
             f"Gaussians with scales of shape {list(scales.shape)}", "three scales each, [N, 3], or two for surfels"
         )
     return scales.shape[1] == 2
+
+
+def check_device(gaussians: Gaussians, devices: Collection[str], renderer: str) -> None:
+    """Refuse Gaussians that are on a device that a renderer does not serve."""
+    if gaussians.means.device.type not in devices:
+        raise InputError(
+            f"Gaussians on {gaussians.means.device.type} for the {renderer} renderer",
+            f"Gaussians on {', '.join(sorted(devices))}",
+            "Move the field there, or choose renderer 'auto'",
+        )
+
+
+def check_float32(gaussians: Gaussians, renderer: str) -> None:
+    """Refuse Gaussians of another dtype."""
+    if gaussians.means.dtype != torch.float32:
+        raise InputError(
+            f"Gaussians of dtype {str(gaussians.means.dtype).removeprefix('torch.')} for the {renderer} renderer",
+            "float32",
+            "Cast them, or choose the torch renderer, which computes in float64 too",
+        )
 
 
 def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:

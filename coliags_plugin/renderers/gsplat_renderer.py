@@ -20,7 +20,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import shortest_axes
 from coliags_plugin.renderers import gsplat_library
-from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
+from coliags_plugin.renderers.checks import check_device, check_float32, check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.projection import facing
 from coliags_plugin.renderers.splatting import DrawnView, SplattingRenderer, SplattingSettings, split_channels
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
@@ -51,12 +51,7 @@ class GsplatRenderer(SplattingRenderer[GsplatRendererSettings]):
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """See :func:`render_with_gsplat`; refuses Gaussians that are not on a CUDA device."""
-        if gaussians.means.device.type not in self.devices:
-            raise InputError(
-                f"Gaussians on {gaussians.means.device.type} for the gsplat renderer",
-                f"Gaussians on {', '.join(sorted(self.devices))}",
-                "Move the field there, or choose renderer 'auto'",
-            )
+        check_device(gaussians, self.devices, self.name)
         return render_with_gsplat(gaussians, camera, wants, self.settings)
 
 
@@ -76,12 +71,7 @@ def render_with_gsplat(
     """
     settings = settings or GsplatRendererSettings()
     check_gaussian_outputs(wants, gaussians)
-    if gaussians.means.dtype != torch.float32:
-        raise InputError(
-            f"Gaussians of {gaussians.means.dtype} for the gsplat renderer",
-            "float32, the only type of its kernels",
-            "Convert the field, or choose renderer 'torch'",
-        )
+    check_float32(gaussians, "gsplat")
     if is_surfels(gaussians):
         raise InputError("surfels for the gsplat renderer", "3D Gaussians", "Choose renderer 'torch'")
     needs = {"depth_accumulated" if name == "depth_expected" else name for name in wants} - {"rgb", "alpha"}

@@ -10,9 +10,9 @@ import torch
 
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.renderers.checks import check_device, check_float32
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.stages import Compositors, draw_view
 from coliags_plugin.renderers.tiles import TileGrid
@@ -40,7 +40,8 @@ class TritonRenderer(SplattingRenderer[TritonRendererSettings]):
         return Availability(True, f"triton kernels on {torch.cuda.get_device_name()}")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """See :func:`render_gaussians`."""
+        """See :func:`render_gaussians`; refuses Gaussians that are not on a CUDA device."""
+        check_device(gaussians, self.devices, self.name)
         return render_gaussians(gaussians, camera, wants, self.settings)
 
 
@@ -59,15 +60,10 @@ def render_gaussians(
     Raises:
         InputError: An output is unknown or not of these Gaussians, or these are not float32.
     """
+    check_float32(gaussians, "triton")
     from coliags_plugin.renderers.triton_kernels import compositing, tile
 
     settings = settings or TritonRendererSettings()
-    if gaussians.means.dtype != torch.float32:
-        raise InputError(
-            f"Gaussians of dtype {str(gaussians.means.dtype).removeprefix('torch.')} for the triton renderer",
-            "float32",
-            "Cast them, or choose the torch renderer, which computes in float64 too",
-        )
     grid = TileGrid(camera.width, camera.height, tile.TILE_SIZE)
     compositors = Compositors(compositing.composite_gaussians, compositing.composite_surfels)
     return draw_view(gaussians, camera, wants, settings, grid, compositors)

@@ -455,3 +455,12 @@ def test_importing_the_component_does_not_load_numba():
     code = "import sys, coliags_plugin.renderers.cpu_renderer; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip() == "False"
+
+
+def test_triton_refuses_what_its_kernels_cannot_take():
+    gaussians, camera = scene("gaussians3d")
+    renderer = triton_renderer.TritonRenderer(triton_renderer.TritonRendererSettings())
+    with pytest.raises(InputError, match="Gaussians on cpu for the triton renderer"):
+        renderer.draw(gaussians, camera, ("rgb",))
+    with pytest.raises(InputError, match="Gaussians of dtype float64 for the triton renderer"):
+        triton_renderer.render_gaussians(cast(gaussians, torch.float64), camera)
