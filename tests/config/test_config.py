@@ -37,10 +37,11 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     ours = load_method("coliags").config.model_dump()
     rival = load_method("scaffold-gs-depth").config.model_dump()
     assert ours.pop("description") != rival.pop("description")
-    assert ours["field"].pop("geometry_head") == {"name": "imve", "hidden": 32, "frequencies": 10}
+    geometry = {"hidden": 32, "initial_opacity": None}
+    assert ours["field"].pop("geometry_head") == {"name": "imve", "frequencies": 10, **geometry}
     appearance = {"hidden": 32, "bias_init": "scene_distances"}
     assert ours["field"].pop("appearance_head") == {"name": "imia", "frequencies": 5, **appearance}
-    assert rival["field"].pop("geometry_head") == {"name": "plain", "hidden": 32}
+    assert rival["field"].pop("geometry_head") == {"name": "plain", **geometry}
     assert rival["field"].pop("appearance_head") == {"name": "plain", "distance": False, **appearance}
     assert ours == rival
 
