@@ -166,35 +166,28 @@ class _Functions(TorchFunctionMode):
             return tensor
         if not to_cuda:
             self.pretended.waited("a copy to the host")
-        moved = _Move.apply(tensor) if tensor.requires_grad else tensor.clone()
+        moved = _Move.apply(tensor, self.pretended) if tensor.requires_grad else tensor.clone()
         self.pretended.mark(moved, to_cuda)
         return moved
 
 
 class _Move(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, tensor):
-        ctx.source = tensor.detach()
+    def forward(ctx, tensor, pretended):
+        ctx.pretended, ctx.came_from_cuda = pretended, pretended.holds(tensor)
         return tensor.clone()
 
     @staticmethod
     def backward(ctx, gradient):
         copy = gradient.clone()
-        pretended = _Dispatch.active
-        pretended.mark(copy, pretended.holds(ctx.source))
-        return copy
+        ctx.pretended.mark(copy, ctx.came_from_cuda)
+        return copy, None
 
 
 class _Dispatch(TorchDispatchMode):
-    active = None
-
     def __init__(self, pretended):
         super().__init__()
         self.pretended = pretended
-
-    def __enter__(self):
-        _Dispatch.active = self.pretended
-        return super().__enter__()
 
     def __torch_dispatch__(self, function, kinds, args=(), kwargs=None):
         kwargs = kwargs or {}

@@ -132,14 +132,14 @@ def _waves(given: int, embedded: int, frequencies: int) -> tuple[Tensor, Tensor]
 
 
 def _missing(count: int) -> int:
-    """How many rows a table of so many lacks to whole vectors."""
+    """Number of zero rows that pad this many rows to whole SIMD vectors."""
     from coliags_plugin.core.numba_kernels.lanes import WIDTH
 
     return -count % WIDTH
 
 
 def _filled(values: Tensor) -> Tensor:
-    """The values with their rows zero-padded to whole vectors."""
+    """Zero-pad the rows of a table to whole SIMD vectors."""
     missing = _missing(len(values))
     return functional.pad(values, (0, 0) * (values.dim() - 1) + (0, missing)) if missing else values
 

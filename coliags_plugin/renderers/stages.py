@@ -30,9 +30,9 @@ _OF_SURFELS = ("depth_accumulated", "inverse_depth_accumulated", "distortion", "
 
 
 class SurfelRules(NamedTuple):
-    """How surfels are composited: they are skipped at pixels where they are nearer than the near plane, a z-depth.
+    """Thresholds of compositing surfels, and whether depths, their distortion and the median are wanted.
 
-    ``depths`` tells whether depths, their distortion and the median are wanted.
+    A surfel is skipped at pixels where its z-depth is below the near plane.
     """
 
     cuts: CutSettings
@@ -69,11 +69,8 @@ def draw_view(
 ) -> RenderOutput:
     """Render 3D Gaussians, or surfels where they have two scales; see :func:`torch_renderer.render_gaussians`."""
     check_gaussian_outputs(wants, gaussians)
-    if is_surfels(gaussians):
-        drawn = _draw_surfels(gaussians, camera, wants, settings, grid, compositors)
-    else:
-        drawn = _draw_gaussians(gaussians, camera, wants, settings, grid, compositors)
-    return drawn.output(gaussians, camera, wants)
+    draw = _draw_surfels if is_surfels(gaussians) else _draw_gaussians
+    return draw(gaussians, camera, wants, settings, grid, compositors).output(gaussians, camera, wants)
 
 
 def _draw_gaussians(

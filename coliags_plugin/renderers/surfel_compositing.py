@@ -36,7 +36,7 @@ def pair_rows(
     log_opacities: Float[Tensor, "M"],
     origins: Float[Tensor, "M 2"],
 ) -> Float[Tensor, "M 13"]:
-    """What :func:`composite_pairs` reads of each pair, from its surfel's ``ProjectedSurfels.intersections``.
+    """Input rows of :func:`composite_pairs`, from the ``ProjectedSurfels.intersections`` of each pair's surfel.
 
     These are the coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, D, the offset from there
     to the filter's centre, and log(opacity). ``origins`` are the midpoints of the tiles, pixels.

@@ -23,7 +23,7 @@ def make_trainer(path, method, steps=4):
     options = [f"schedule.steps={steps}", f"schedule.written_for={steps}", "schedule.checkpoint_every=2"]
     if not method.startswith("reim"):
         options.append("renderer=torch")
-    if "anchors" in str(load_method(method).config.field):
+    if load_method(method).config.field.name == "anchors":
         options += SMALL
     return Trainer(load_method(method, options), wall_scene(), "wall", RunFolder(path), 0, CUDA)
 

@@ -43,8 +43,8 @@ class _Gaussians(torch.autograd.Function):
         ctx: Any, table: Tensor, depths: Tensor | None, pairs: TilePairs, grid: TileGrid, cuts: CutSettings
     ) -> tuple[Tensor, Tensor | None]:
         table = table.contiguous()
-        image = table.new_zeros(table.shape[1] - 6, grid.height, grid.width)
-        medians = None if depths is None else table.new_zeros(grid.height, grid.width)
+        image = table.new_empty(table.shape[1] - gaussians.OWN_COLUMNS.value, grid.height, grid.width)
+        medians = None if depths is None else table.new_empty(grid.height, grid.width)
         unused = table if depths is None else depths.contiguous()
         gaussians.forward[(grid.columns * grid.rows,)](
             *(table, unused, pairs.gaussian, pairs.starts, image, unused if medians is None else medians),
@@ -74,25 +74,11 @@ class _Gaussians(torch.autograd.Function):
         return of_table, None, None, None, None
 
 
-def _sizes(grid: TileGrid, image: Tensor) -> tuple[int, int, int, int]:
-    return grid.columns, grid.width, grid.height, len(image)
-
-
-def _bounds(cuts: CutSettings) -> tuple[float, float, float]:
-    return cuts.alpha_min, cuts.alpha_max, cuts.transmittance_min
-
-
-def _blocks(image: Tensor, grid: TileGrid, warps: int) -> dict[str, int]:
-    """Sizes of the kernels' blocks, and warps of a program."""
-    channels = max(16, triton.next_power_of_2(len(image)))
-    return {"CHANNELS": channels, "SIZE": grid.size, "RANKS": RANKS, "num_warps": warps}
-
-
 class _Surfels(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, pairs: TilePairs, grid: TileGrid, rules: SurfelRules) -> tuple[Tensor, Tensor]:
         table = table.contiguous()
-        image = table.new_zeros(table.shape[1] - 13, grid.height, grid.width)
+        image = table.new_empty(table.shape[1] - surfels.OWN_COLUMNS.value, grid.height, grid.width)
         depths, spread = (table.new_zeros(count, grid.height, grid.width) for count in (4, 3))
         surfels.forward[(grid.columns * grid.rows,)](
             *(table, pairs.gaussian, pairs.starts, image, depths, spread),
@@ -120,6 +106,20 @@ class _Surfels(torch.autograd.Function):
             **_blocks(image, grid, BACKWARD_WARPS),
         )
         return of_table, None, None, None
+
+
+def _sizes(grid: TileGrid, image: Tensor) -> tuple[int, int, int, int]:
+    return grid.columns, grid.width, grid.height, len(image)
+
+
+def _bounds(cuts: CutSettings) -> tuple[float, float, float]:
+    return cuts.alpha_min, cuts.alpha_max, cuts.transmittance_min
+
+
+def _blocks(image: Tensor, grid: TileGrid, warps: int) -> dict[str, int]:
+    """Sizes of the kernels' blocks, and warps of a program."""
+    channels = max(16, triton.next_power_of_2(len(image)))
+    return {"CHANNELS": channels, "SIZE": grid.size, "RANKS": RANKS, "num_warps": warps}
 
 
 def _surfel_bounds(rules: SurfelRules) -> tuple[float, ...]:

@@ -8,25 +8,22 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from coliags_plugin.renderers.triton_kernels.tile import crosses_half, cut, of_log_alphas, tile_pixels, transmittances
+from coliags_plugin.renderers.triton_kernels.tile import blend, crosses_half, cut, of_log_alphas, tile_pixels
 
 #: Columns of the table before the features.
 OWN_COLUMNS = tl.constexpr(6)
 
 
 @triton.jit
-def _whitened_offsets(rows, here, x, y):
-    """Offsets of pixels from the centres, and the same whitened. [R, P] each"""
+def _at_pixels(rows, here, x, y, alpha_min, alpha_max):
+    """Whitening [R] each; offsets of pixels from the centres, the same whitened, and alphas [R, P] each."""
     dx = x[None, :] - tl.load(rows, here, 0.0)[:, None]
     dy = y[None, :] - tl.load(rows + 1, here, 0.0)[:, None]
     u_xx, u_yx, u_yy = tl.load(rows + 2, here, 0.0), tl.load(rows + 3, here, 0.0), tl.load(rows + 4, here, 0.0)
-    return dx, dy, u_xx[:, None] * dx, u_yx[:, None] * dx + u_yy[:, None] * dy
-
-
-@triton.jit
-def _alphas(rows, here, along, across, alpha_min, alpha_max):
+    along, across = u_xx[:, None] * dx, u_yx[:, None] * dx + u_yy[:, None] * dy
     log_opacities = tl.load(rows + 5, here, -1e4)
-    return cut(tl.exp(log_opacities[:, None] - 0.5 * (along * along + across * across)), alpha_min, alpha_max)
+    alphas = tl.exp(log_opacities[:, None] - 0.5 * (along * along + across * across))
+    return u_xx, u_yx, u_yy, dx, dy, along, across, cut(alphas, alpha_min, alpha_max)
 
 
 @triton.jit
@@ -35,7 +32,7 @@ def forward(
     alpha_min, alpha_max, transmittance_min,
     WITH_MEDIANS: tl.constexpr, CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
 ):  # fmt: skip
-    """Sums of weight times feature [channels, H, W], and median depths [H, W] where wanted."""
+    """Alpha-composite features of 3D Gaussians [channels, H, W], and their median depth [H, W] where wanted."""
     tile = tl.program_id(0)
     x, y, pixel, inside = tile_pixels(tile, columns, width, height, SIZE)
     before = inside.to(tl.float32)
@@ -49,10 +46,8 @@ def forward(
         here = ranks < end
         index = tl.load(gaussian + ranks, here, 0)
         rows = table + index * stride
-        _, _, along, across = _whitened_offsets(rows, here, x, y)
-        alphas = _alphas(rows, here, along, across, alpha_min, alpha_max)
-        behind = transmittances(alphas, before, transmittance_min)
-        weights = alphas / (1.0 - alphas) * behind
+        _, _, _, _, _, _, _, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
+        behind, weights = blend(alphas, before, transmittance_min)
         wanted = here[:, None] & (channel < channels)[None, :]
         features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
         sums += tl.dot(tl.trans(features), weights, input_precision="ieee")
@@ -73,7 +68,7 @@ def backward(
     alpha_min, alpha_max, transmittance_min,
     CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
 ):  # fmt: skip
-    """Add to the table's derivatives what follows from those of the image."""
+    """Accumulate the table's gradients from those of the composited image."""
     tile = tl.program_id(0)
     x, y, pixel, inside = tile_pixels(tile, columns, width, height, SIZE)
     before = inside.to(tl.float32)
@@ -89,10 +84,8 @@ def backward(
         here = ranks < end
         index = tl.load(gaussian + ranks, here, 0)
         rows, of_rows = table + index * stride, of_table + index * stride
-        dx, dy, along, across = _whitened_offsets(rows, here, x, y)
-        alphas = _alphas(rows, here, along, across, alpha_min, alpha_max)
-        behind = transmittances(alphas, before, transmittance_min)
-        weights = alphas / (1.0 - alphas) * behind
+        u_xx, u_yx, u_yy, dx, dy, along, across, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
+        behind, weights = blend(alphas, before, transmittance_min)
         wanted = here[:, None] & (channel < channels)[None, :]
         features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
         of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")
@@ -101,7 +94,6 @@ def backward(
         of_logs = of_log_alphas(gained, hidden, alphas, weights, alpha_max)
         hidden -= tl.sum(gained, axis=0)
         of_along, of_across = -of_logs * along, -of_logs * across
-        u_xx, u_yx, u_yy = tl.load(rows + 2, here, 0.0), tl.load(rows + 3, here, 0.0), tl.load(rows + 4, here, 0.0)
         total_along, total_across = tl.sum(of_along, axis=1), tl.sum(of_across, axis=1)
         tl.atomic_add(of_rows, -(total_along * u_xx + total_across * u_yx), here)
         tl.atomic_add(of_rows + 1, -total_across * u_yy, here)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from coliags_plugin.renderers.triton_kernels.tile import crosses_half, cut, of_log_alphas, tile_pixels, transmittances
+from coliags_plugin.renderers.triton_kernels.tile import blend, crosses_half, cut, of_log_alphas, tile_pixels
 
 #: Columns of the table before the features.
 OWN_COLUMNS = tl.constexpr(13)
@@ -23,7 +23,7 @@ def _plane(rows, here, column, dx, dy):
 
 @triton.jit
 def _hits(rows, here, x, y, near_plane):
-    """Where rays meet discs: offset from the centre, 1 / W, intersection, depth, and whether they do. [R, P] each"""
+    """Ray-disc intersections: offset from the centre, 1 / W, u, v, depth, and whether there is one. [R, P] each"""
     dx = x[None, :] - tl.load(rows, here, 0.0)[:, None]
     dy = y[None, :] - tl.load(rows + 1, here, 0.0)[:, None]
     inverse_w = 1.0 / (_plane(rows, here, 6, dx, dy) + tl.load(rows + 8, here, 0.0)[:, None])
@@ -53,7 +53,7 @@ def forward(
     alpha_min, alpha_max, transmittance_min, near_plane, sharpness,
     WITH_DEPTHS: tl.constexpr, CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
 ):  # fmt: skip
-    """Sums of weight times feature [channels, H, W], and where wanted those of depths [4, H, W].
+    """Alpha-composite features of surfels [channels, H, W], and their depths [4, H, W] where wanted.
 
     With these come the weight, mean and sum of squared differences of 1/z that the backward pass needs. [3, H, W]
     """
@@ -72,8 +72,7 @@ def forward(
         rows = table + tl.load(gaussian + ranks, here, 0) * stride
         _, _, _, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
         alphas, _, _, _ = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
-        behind = transmittances(alphas, before, transmittance_min)
-        weights = alphas / (1.0 - alphas) * behind
+        behind, weights = blend(alphas, before, transmittance_min)
         wanted = here[:, None] & (channel < channels)[None, :]
         features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
         sums += tl.dot(tl.trans(features), weights, input_precision="ieee")
@@ -112,7 +111,7 @@ def backward(
     columns, width, height, channels, alpha_min, alpha_max, transmittance_min, near_plane, sharpness,
     WITH_DEPTHS: tl.constexpr, CHANNELS: tl.constexpr, SIZE: tl.constexpr, RANKS: tl.constexpr,
 ):  # fmt: skip
-    """Add to the table's derivatives what follows from those of the images."""
+    """Accumulate the table's gradients from those of the composited images."""
     tile = tl.program_id(0)
     x, y, pixel, inside = tile_pixels(tile, columns, width, height, SIZE)
     before = inside.to(tl.float32)
@@ -143,8 +142,7 @@ def backward(
         rows, of_rows = table + index * stride, of_table + index * stride
         dx, dy, inverse_w, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
         alphas, from_x, from_y, on_disc = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
-        behind = transmittances(alphas, before, transmittance_min)
-        weights = alphas / (1.0 - alphas) * behind
+        behind, weights = blend(alphas, before, transmittance_min)
         wanted = here[:, None] & (channel < channels)[None, :]
         features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
         of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")

@@ -1,4 +1,4 @@
-"""What the kernels of both primitives share: a tile's pixels, and the rules of compositing."""
+"""Device functions of both primitives: pixels of a tile, thresholds, blending weights and their gradients."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ def cut(alphas, alpha_min, alpha_max):
 
 
 @triton.jit
-def transmittances(alphas, before, transmittance_min):
-    """Transmittance behind each pair, 0 from the one on that would bring it below the bound. [R, P]"""
+def blend(alphas, before, transmittance_min):
+    """Transmittance behind each pair, 0 from the one on that would take it below the bound, and weights. [R, P] each"""
     behind = before[None, :] * tl.cumprod(1.0 - alphas, axis=0)
-    return tl.where(behind >= transmittance_min, behind, 0.0)
+    behind = tl.where(behind >= transmittance_min, behind, 0.0)
+    return behind, alphas / (1.0 - alphas) * behind
 
 
 @triton.jit
@@ -46,7 +47,7 @@ def crosses_half(behind, weights, before, RANKS: tl.constexpr):
 
 @triton.jit
 def of_log_alphas(gained, hidden, alphas, weights, alpha_max):
-    """Derivatives of the loss in log(alpha), from what each pair and all pairs from here on add to it. [R, P]"""
+    """Gradients of log(alpha), from first-order contributions to the loss: each pair's, and all from here on. [R, P]"""
     behind = hidden[None, :] - tl.cumsum(gained, axis=0)
     derivative = gained - behind * (alphas / (1.0 - alphas))
     return tl.where((weights > 0.0) & (alphas < alpha_max), derivative, 0.0)
