@@ -39,10 +39,12 @@ class PretendedCuda(contextlib.AbstractContextManager):
 
     Attributes:
         waits: How often the host would have waited, by function and line of the package.
+        made_current: Devices that were made a thread's current one, in order.
     """
 
     def __init__(self):
         self.waits = Counter()
+        self.made_current = []
         self.in_engine = False
         self._on_cuda = {}
         self._stack = contextlib.ExitStack()
@@ -52,6 +54,7 @@ class PretendedCuda(contextlib.AbstractContextManager):
             "is_available": lambda: True,
             "device_count": lambda: 1,
             "get_device_name": lambda *_: "a pretended device",
+            "set_device": self.made_current.append,
             "synchronize": lambda *_: None,
             "reset_peak_memory_stats": lambda *_: None,
             "max_memory_allocated": lambda *_: 0,

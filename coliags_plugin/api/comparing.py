@@ -45,7 +45,7 @@ def compare(
         settings: Changes of all method configs, see :func:`~coliags_plugin.api.training.train`.
         jobs: Runs at a time; None: one per CPU, or per GPU.
         threads: CPU threads of each run; None: the CPUs divided by the runs at a time.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         executor: Where runs are processes: ``local``, or ``ray`` for a Ray cluster.
         ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
         retries: How often a run is resumed whose process was killed or crashed.

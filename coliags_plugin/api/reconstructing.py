@@ -31,7 +31,7 @@ def reconstruct(
         output: Folder of the results.
         settings: Of the stages by key path, for instance ``{"steps": 5000, "diameter": 40.0, "frames.every": 2}``.
         mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         overwrite: Repeat stages that were made with other settings, and what follows them.
         anonymous: Keep absolute paths out of what is written (docs/security.md 4).
 

@@ -34,7 +34,7 @@ class Run:
     Args:
         path: The run folder.
         data: The scene's folder, where it has moved since training.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
 
     Raises:
         InputError: This is no run folder, or a file of it is damaged.
@@ -115,9 +115,9 @@ class Run:
         from coliags_plugin.engine.devices import choose_device
         from coliags_plugin.engine.trained import load_trained
 
-        kept = self._loaded
+        kept, device = self._loaded, choose_device(self.device)
         if kept is None or (kept.lamp is None and kept.step != self.step):
-            self._loaded = kept = load_trained(self.path, choose_device(self.device), self.data)
+            self._loaded = kept = load_trained(self.path, device, self.data)
         return kept
 
     def evaluate(

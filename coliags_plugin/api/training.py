@@ -47,7 +47,7 @@ def train(
         settings: Changes of the method config by key path, for instance ``{"field.voxel_size": 1.0}``.
         renderer: Name of a renderer; None: the method's.
         data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         resume: Continue from the run's latest checkpoint.
         overwrite: Replace an existing run folder.
         anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
@@ -117,7 +117,7 @@ def import_splats(
         data: The scene's folder.
         output: Run folder; None: ``runs/SCENE/imported/STAMP``.
         data_format: Name of a data manager; None: the one that recognises the folder.
-        device: ``auto``, ``cpu`` or ``cuda``.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         overwrite: Replace an existing run folder.
         anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
 import tyro
 
@@ -50,7 +50,9 @@ MovedData = Annotated[
         metavar="PATH", help="The scene's folder, where it has moved since training.", help_behavior_hint=_NO_DEFAULT
     ),
 ]
-Device = Annotated[Literal["auto", "cpu", "cuda"], tyro.conf.arg(help="Device to compute on.")]
+Device = Annotated[
+    str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
+]
 Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
 AnonymousRun = Annotated[
     bool,

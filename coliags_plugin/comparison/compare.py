@@ -22,7 +22,7 @@ from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.engine.devices import choose_device
+from coliags_plugin.engine.devices import find_device
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.reporting.model import Column
 from coliags_plugin.reporting.terminal import DisplayTable
@@ -183,10 +183,12 @@ def _check_name(noun: str, name: str, known: Sequence[str]) -> None:
 
 
 def _gpus(device: str) -> list[str]:
-    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``."""
+    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``: all, or the one that ``device`` numbers."""
     import torch
 
-    if choose_device(device).type != "cuda":
+    chosen = find_device(device)
+    if chosen.type != "cuda":
         return []
     visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
-    return visible or [str(number) for number in range(torch.cuda.device_count())]
+    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
+    return [found[chosen.index]] if ":" in device else found

@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
@@ -110,8 +110,8 @@ class LocalWorker:
     def __init__(self, task: Task, gpu: str | None = None) -> None:
         self.task = task
         environment = task.environment(os.environ)
-        if gpu is not None:
-            environment["CUDA_VISIBLE_DEVICES"] = gpu
+        if gpu is not None:  # the only one that the worker sees, whatever its number was
+            task, environment["CUDA_VISIBLE_DEVICES"] = replace(task, device="cuda"), gpu
         Path(task.log).parent.mkdir(parents=True, exist_ok=True)
         with Path(task.log).open("a", encoding="utf-8") as messages:
             self._process = subprocess.Popen(

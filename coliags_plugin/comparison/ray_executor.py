@@ -51,6 +51,10 @@ class RayExecutor(Executor):
     """
 
     def __init__(self, address: str | None, slots: int | None, threads: int, device: str) -> None:
+        if device not in ("auto", "cpu", "cuda"):
+            raise InputError(
+                f"--device {device} with --executor ray", "auto, cpu or cuda", "Ray gives each run its GPU"
+            )
         self._ray = _library()
         self._connect(address)
         self.threads, self._slots = threads, slots

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from pathlib import Path
 
 import torch
@@ -10,13 +11,41 @@ import torch
 from coliags_plugin.core.errors import InputError
 
 
+def find_device(wanted: str) -> torch.device:
+    """The device of a name: ``cpu``, ``cuda:N``, ``cuda``, which is ``cuda:0``, or ``auto``, ``cuda`` if it is there.
+
+    Raises:
+        InputError: There is no such name, or no such device.
+    """
+    cuda = re.fullmatch(r"cuda(?::(\d+))?", wanted)
+    if wanted == "cpu" or (wanted == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    if wanted != "auto" and cuda is None:
+        raise InputError(f"device '{wanted}'", "auto, cpu, cuda or cuda:N, N being the number of a CUDA device")
+    if not torch.cuda.is_available():
+        seen = f"device {wanted} was requested, but torch finds none"
+        raise InputError(seen, "cpu, or auto", "See `coliags doctor`")
+    index, count = int((cuda and cuda[1]) or 0), torch.cuda.device_count()
+    if index >= count:
+        there = ", ".join(f"cuda:{number} ({torch.cuda.get_device_name(number)})" for number in range(count))
+        raise InputError(f"device {wanted} was requested, but torch finds {there}", "one of these, cpu or auto")
+    return torch.device("cuda", index)
+
+
 def choose_device(wanted: str) -> torch.device:
-    """The torch device; ``auto`` prefers CUDA."""
-    if wanted == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("device cuda was requested, but torch finds none", "cpu, or auto", "See `coliags doctor`")
-    return torch.device(wanted)
+    """:func:`find_device`, made the device that this thread launches kernels on."""
+    device = find_device(wanted)
+    make_current(device)
+    return device
+
+
+def make_current(device: torch.device) -> None:
+    """Have this thread launch kernels on a CUDA device, as those of triton are launched on the current one.
+
+    Every thread has its own; those of automatic differentiation follow the forward pass.
+    """
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
 
 
 def device_name(device: torch.device) -> str:

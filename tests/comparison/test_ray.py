@@ -9,12 +9,15 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 import coliags_plugin as cp
+from coliags_plugin.comparison import ray_executor
 from coliags_plugin.comparison.ray_executor import RayExecutor
+from coliags_plugin.comparison.tasks import Task
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
@@ -192,3 +195,29 @@ def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch)
     monkeypatch.setattr(RayExecutor, "_ask", elsewhere)
     with pytest.raises(InputError, match=r"node .* does not see .*No such file.*storage that all machines share"):
         executor.check(tmp_path, [wall])
+
+
+@pytest.mark.slow
+def test_every_run_gets_a_gpu_of_its_own(cluster, wall, tmp_path, monkeypatch):
+    made, _ = cluster
+    with pytest.raises(InputError, match="the cluster has no GPU"):
+        RayExecutor(made.address, None, 1, "cuda")
+    patiently(lambda: made.add_node(num_cpus=3, num_gpus=2))
+    made.wait_for_nodes(timeout=120)
+    assert RayExecutor(made.address, None, 1, "cpu").slots == 5
+
+    def seen(text):
+        time.sleep(2.0)
+        return {"ending": "done", "reason": os.environ.get("CUDA_VISIBLE_DEVICES", "")}
+
+    monkeypatch.setattr(ray_executor, "_work", seen)
+    monkeypatch.setattr(Task, "to_json", lambda task: "")
+    for device, gpus in (("auto", {"0", "1"}), ("cpu", {""})):
+        executor = RayExecutor(made.address, None, 1, device)
+        for _ in range(2):
+            executor.start(object.__new__(Task))
+        ended = []
+        while len(ended) < 2:
+            ended += executor.wait(60.0)
+        assert {outcome.reason for _, outcome in ended} == gpus
+        assert executor.slots == (2 if device == "auto" else 5)

@@ -86,7 +86,8 @@ class Sleeper(Task):
     """Whose process sleeps until its input is closed, then needs a moment."""
 
     def command(self):
-        code = "import sys, time\nprint('up', file=sys.stderr, flush=True)\nsys.stdin.read()\ntime.sleep(0.2)\n"
+        code = f"# on {self.device}\nimport sys, time\nprint('up', file=sys.stderr, flush=True)\n"
+        code += "sys.stdin.read()\ntime.sleep(0.2)\n"
         code += 'print(\'{"ending": "stopped", "reason": "asked"}\')'
         return [sys.executable, "-c", code]
 
@@ -103,6 +104,8 @@ def test_the_local_executor_runs_as_many_as_it_has_slots_for_and_stops_them(task
     assert [b"CUDA_VISIBLE_DEVICES=%d" % gpu in each for gpu, each in zip((4, 7), environments, strict=True)] == [
         True
     ] * 2
+    # Each sees one GPU, which is cuda whatever its number is, and may not go without.
+    assert task.device == "cpu" and all("# on cuda\n" in each._process.args[-1] for each in executor._workers.values())
     while Path(task.log).read_text().count("up") < 2:
         time.sleep(0.01)
     processes = [worker._process for worker in executor._workers.values()]

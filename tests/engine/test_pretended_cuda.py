@@ -5,13 +5,14 @@ import shutil
 import pytest
 import torch
 
+import coliags_plugin as cp
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
 from tests.pretended_cuda import CUDA, MixedDevicesError, PretendedCuda
-from tests.scenes import SMALL, wall_scene
+from tests.scenes import SMALL, wall_scene, write_wall
 
 #: What runs on the device in training, without renderers: rivals and modules beyond those of `coliags`.
 METHODS = ("3dgs-depth", "2dgs", "gaussian-pancakes", "pr-endo", "scaffold-gs", "reim-nerf-small", "coliags-plus")
@@ -71,3 +72,14 @@ def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
     assert all(torch.equal(tensor, second.tensors[name]) for name, tensor in first.tensors.items())
     if method == "coliags":
         assert {place for place in waits if "renderers/" not in place and "checkpoints" not in place} <= WAITS
+
+
+def test_a_loaded_run_launches_on_its_own_device(tmp_path):
+    write_wall(tmp_path / "wall")
+    options = {"field.voxel_size": 4.0, "datamanager.points_count": 200}
+    run = cp.train("coliags", tmp_path / "wall", tmp_path / "run", steps=1, settings=options, device="cpu")
+    with PretendedCuda() as device:
+        run = cp.load_run(run.path, device="cuda")
+        for _ in range(2):  # another run may have made its own device the current one in between
+            assert run.load().device == CUDA
+    assert device.made_current == [CUDA, CUDA]

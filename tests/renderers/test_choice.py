@@ -9,7 +9,6 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.renderers.choice import choose_renderer
 
 CPU = torch.device("cpu")
@@ -50,10 +49,3 @@ def test_an_unavailable_renderer_says_why(monkeypatch):
     monkeypatch.setattr(renderer, "availability", classmethod(lambda cls: Availability(False, "the moon is full")))
     with pytest.raises(InputError, match="the moon is full"):
         choose_renderer(make_component("renderers", "torch"), "gaussians3d", CPU)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_missing_cuda_is_named():
-    with pytest.raises(InputError, match="torch finds none"):
-        choose_device("cuda")
-    assert choose_device("auto") == CPU

@@ -12,6 +12,7 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.engine.devices import make_current
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.content import ViewerContent, vertical_fov
 from coliags_plugin.export.viewer.controls import FLATTENED, Controls
@@ -124,6 +125,7 @@ class Session:
 
     def run(self) -> None:
         """Keep the browser up to date until it has gone."""
+        make_current(self._content.trained.device)
         while not self._closed:
             wait = self.update()
             if not self._closed:
