@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import traceback
 from collections import Counter
+from types import SimpleNamespace
 from unittest import mock
 
 import torch
@@ -54,6 +55,9 @@ class PretendedCuda(contextlib.AbstractContextManager):
             "is_available": lambda: True,
             "device_count": lambda: 1,
             "get_device_name": lambda *_: "a pretended device",
+            "get_device_properties": lambda *_: SimpleNamespace(
+                name="a pretended device", major=9, minor=0, total_memory=2**34
+            ),
             "set_device": self.made_current.append,
             "synchronize": lambda *_: None,
             "reset_peak_memory_stats": lambda *_: None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import platform
@@ -11,10 +12,11 @@ import torch
 
 from coliags_plugin._version import __version__
 from coliags_plugin.checks.results import CheckResult
+from coliags_plugin.checks.trial_views import Trial, try_renderers
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import is_auto, make_component
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.engine.devices import choose_device
+from coliags_plugin.engine.devices import choose_device, find_device
 from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders
 from coliags_plugin.renderers.choice import choose_renderer
 
@@ -30,26 +32,60 @@ LIBRARIES = {
     "safetensors": "safetensors",
 }
 
+_NO_CUDA = (
+    "no device: everything runs on the CPU. Where there is one, its renderers are tried here: errors against the "
+    "definition, and frames per second, of 3D Gaussians and surfels; with --device cpu, those of the CPU"
+)
 
-def check_installation() -> list[CheckResult]:
-    """Check what training and evaluation depend on; a missing optional part has status ``skipped``."""
+
+def check_installation(device: str = "auto", trial: Trial | None = None) -> list[CheckResult]:
+    """Check what training and evaluation depend on; a missing optional part has status ``skipped``.
+
+    Args:
+        device: Whose renderers are tried on views: ``cpu``, ``cuda`` or ``cuda:N``; ``auto``: of the first CUDA device,
+            or none without.
+        trial: Views to try them on, others than the default.
+
+    Raises:
+        InputError: There is no such device.
+    """
+    chosen = find_device(device)
     threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs"
     results = [
         CheckResult("coliags_plugin", "passed", __version__),
         CheckResult("python", "passed", f"{platform.python_version()} on {platform.machine()}"),
         CheckResult("torch", "passed", f"{torch.__version__}, {threads}"),
-        _cuda(),
+        *_cuda(),
     ]
     results += [_library(name, module) for name, module in LIBRARIES.items()]
-    results += [_renderer(name) for name in registry.renderers]
+    results += [_renderer(name, chosen) for name in registry.renderers]
+    if chosen.type == "cuda" or device == "cpu":
+        results += try_renderers(choose_device(str(chosen)), trial or Trial())
     results += [_lpips(net) for net in DEFAULT_NETS]
     return results
 
 
-def _cuda() -> CheckResult:
-    if torch.cuda.is_available():
-        return CheckResult("cuda", "passed", torch.cuda.get_device_name(0))
-    return CheckResult("cuda", "skipped", "no device: everything runs on the CPU")
+def _cuda() -> list[CheckResult]:
+    """Versions, and a line for each device."""
+    if not torch.cuda.is_available():
+        return [CheckResult("cuda", "skipped", _NO_CUDA)]
+    versions = f"PyTorch for CUDA {torch.version.cuda}, a driver for CUDA {_driver_version() or 'of unknown version'}"
+    results = [CheckResult("cuda", "passed", versions)]
+    for index in range(torch.cuda.device_count()):
+        found = torch.cuda.get_device_properties(index)
+        told = f"{found.name}, compute capability {found.major}.{found.minor}, {found.total_memory / 2**30:.1f} GiB"
+        results.append(CheckResult(f"cuda:{index}", "passed", told))
+    return results
+
+
+def _driver_version() -> str | None:
+    """The newest CUDA that the driver serves; None where it does not tell."""
+    number = ctypes.c_int()
+    try:
+        status = ctypes.CDLL("libcuda.so.1").cuDriverGetVersion(ctypes.byref(number))
+    except (OSError, AttributeError):  # on Windows, or none is installed
+        return None
+    return None if status else f"{number.value // 1000}.{number.value % 1000 // 10}"
 
 
 def _library(name: str, module: str) -> CheckResult:
@@ -64,11 +100,11 @@ def _library(name: str, module: str) -> CheckResult:
     return CheckResult(name, "passed", installed)
 
 
-def _renderer(name: str) -> CheckResult:
+def _renderer(name: str, device: torch.device) -> CheckResult:
     component, title = make_component("renderers", name), f"renderer {name}"
     if is_auto(component.kind, component.name):
         try:
-            chosen = choose_renderer(component, "gaussians3d", choose_device("auto"))
+            chosen = choose_renderer(component, "gaussians3d", device)
         except InputError as error:
             return CheckResult(title, "failed", str(error))
         return CheckResult(title, "passed", f"would use {chosen.name} ({chosen.reason})")
