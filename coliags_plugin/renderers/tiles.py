@@ -18,9 +18,9 @@ from coliags_plugin.renderers.splatting import CutSettings
 from coliags_plugin.renderers.surfel_projection import ProjectedSurfels
 
 #: Slack on the squared Mahalanobis radius, so that rounding here never drops a pixel that compositing would draw.
-_RADIUS_SLACK = 1e-2
+RADIUS_SLACK = 1e-2
 #: Added to the squared half-axes of the ellipses, square pixels: keeps those seen nearly edge-on invertible.
-_ELLIPSE_SLACK = 1e-4
+ELLIPSE_SLACK = 1e-4
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
     # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
     # depth keep the order they came in.
     drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
-    tau = extents.squared_radii[drawn] + _RADIUS_SLACK
+    tau = extents.squared_radii[drawn] + RADIUS_SLACK
     means2d, covariances = projected.means2d[drawn], projected.covariances[drawn]
     halves = (tau[:, None] * covariances[:, ::2]).sqrt()
     owner, column, row = _tiles_of_boxes(means2d - halves, means2d + halves, grid)
@@ -150,7 +150,7 @@ def surfel_extents(
     """Compute the extent of each surfel, and whether it overlaps the rectangle of pixel centres."""
     tau = 2 * torch.log(opacities / settings.alpha_min)
     bright = projected.visible & (tau >= 0)
-    level = tau.clamp_min(0) + _RADIUS_SLACK
+    level = tau.clamp_min(0) + RADIUS_SLACK
     rim = projected.tangents * level.sqrt()[:, None, None]
     x, y, z = projected.places.unbind(-1)
     # With a point of the rim at z (x/z, y/z, 1) + rim^T (cos, sin), the image is a conic: an ellipse if its z-depths,
@@ -165,7 +165,7 @@ def surfel_extents(
     bend = rise / (z[:, None] + span.sqrt())
     images = (row_x / span.sqrt() + along_x * bend, row_y / span.sqrt() + along_y * bend)
     flat_x, flat_y = (torch.nn.functional.pad(row, (0, 1)) for row in images)
-    covariances, whitenings = filtered_covariances(flat_x, flat_y, _ELLIPSE_SLACK)
+    covariances, whitenings = filtered_covariances(flat_x, flat_y, ELLIPSE_SLACK)
     ellipse_centers = projected.means2d - torch.cat([along_x, along_y], dim=-1)
     halves = covariances[:, ::2].sqrt()
     squared_radii = level * settings.surfel_filter**2

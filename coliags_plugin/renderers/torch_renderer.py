@@ -6,18 +6,20 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import pydantic
+import torch
+from torch import Tensor
 
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.renderers.compositing import composite_gaussians
+from coliags_plugin.renderers.projection import facing_normals, project_gaussians
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
-from coliags_plugin.renderers.stages import Compositors, draw_view
+from coliags_plugin.renderers.stages import Placed, Stages, draw_view
 from coliags_plugin.renderers.surfel_compositing import composite_surfels
-from coliags_plugin.renderers.tiles import TileGrid
-
-_COMPOSITORS = Compositors(composite_gaussians, composite_surfels)
+from coliags_plugin.renderers.surfel_projection import project_surfels
+from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, bin_surfels, gaussian_extents, surfel_extents
 
 
 class TorchRendererSettings(CutSettings):
@@ -61,4 +63,34 @@ def render_gaussians(
     """
     settings = settings or TorchRendererSettings()
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return draw_view(gaussians, camera, wants, settings, grid, _COMPOSITORS)
+    return draw_view(gaussians, camera, wants, settings, grid, _STAGES)
+
+
+def _place_gaussians(
+    gaussians: Gaussians, camera: Camera, with_normals: bool, settings: CutSettings, grid: TileGrid
+) -> Placed:
+    projected = project_gaussians(gaussians, camera, settings.eps2d)
+    extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
+    columns = (projected.means2d, projected.whitenings, _log_opacities(gaussians, extents.drawn))
+    normals = facing_normals(projected, gaussians.scales) if with_normals else None
+    radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
+    pairs = bin_gaussians(projected, extents, grid)
+    return Placed(projected.means2d, columns, projected.depths, normals, radii, pairs)
+
+
+def _place_surfels(
+    gaussians: Gaussians, camera: Camera, with_normals: bool, settings: CutSettings, grid: TileGrid
+) -> Placed:
+    projected = project_surfels(gaussians, camera)
+    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings)
+    columns = (projected.intersections, projected.filter_centers, _log_opacities(gaussians, extents.drawn))
+    pairs = bin_surfels(projected, extents, grid)
+    return Placed(projected.means2d, columns, projected.depths, projected.normals, extents.radii, pairs)
+
+
+def _log_opacities(gaussians: Gaussians, drawn: Tensor) -> Tensor:
+    """Logarithms of opacities, 0 where not drawn. [N, 1]"""
+    return torch.where(drawn, gaussians.opacities, 1.0).log()[:, None]
+
+
+_STAGES = Stages(_place_gaussians, composite_gaussians, _place_surfels, composite_surfels)

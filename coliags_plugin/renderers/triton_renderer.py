@@ -1,4 +1,4 @@
-"""Renderer whose compositing is done by triton kernels, with the outputs of the torch reference."""
+"""Renderer of triton kernels, with the outputs of the torch reference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.renderers.checks import check_device, check_float32
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
-from coliags_plugin.renderers.stages import Compositors, draw_view
+from coliags_plugin.renderers.stages import Stages, draw_view
 from coliags_plugin.renderers.tiles import TileGrid
 
 
@@ -61,9 +61,11 @@ def render_gaussians(
         InputError: An output is unknown or not of these Gaussians, or these are not float32.
     """
     check_float32(gaussians, "triton")
-    from coliags_plugin.renderers.triton_kernels import compositing, tile
+    from coliags_plugin.renderers.triton_kernels import compositing, placing, tile
 
     settings = settings or TritonRendererSettings()
     grid = TileGrid(camera.width, camera.height, tile.TILE_SIZE)
-    compositors = Compositors(compositing.composite_gaussians, compositing.composite_surfels)
-    return draw_view(gaussians, camera, wants, settings, grid, compositors)
+    stages = Stages(
+        placing.place_gaussians, compositing.composite_gaussians, placing.place_surfels, compositing.composite_surfels
+    )
+    return draw_view(gaussians, camera, wants, settings, grid, stages)

@@ -281,17 +281,16 @@ def test_repeats_to_the_bit_with_any_number_of_threads(primitive, sort, monkeypa
         assert all(torch.equal(first[1][key], gradients[key]) for key in gradients)
 
 
+@by_each_at_length
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31), size=st.floats(1e-3, 3.0), depth=st.floats(0.21, 4.0), low_pass=st.floats(0.1, 4.0))
-def test_bins_miss_no_pixel_that_a_surfel_reaches(seed, size, depth, low_pass):
+def test_bins_miss_no_pixel_that_a_surfel_reaches(renderer, seed, size, depth, low_pass):
     gaussians = random_gaussians(
         1, seed, depth=(depth, 1.5 * depth), scale=(0.1 * size, size), opacity=(0.005, 1.0), spread=1.5
     )
     gaussians = cast(as_surfels(gaussians), torch.float32)
     camera = pinhole(45, 38, 30.0, 27.0, dtype=torch.float32)
-    ours = cpu_renderer.render_gaussians(
-        gaussians, camera, settings=cpu_renderer.CpuRendererSettings(surfel_filter=low_pass)
-    )
+    ours = renderer.render_gaussians(gaussians, camera, settings=settings_of(renderer)(surfel_filter=low_pass))
     kind = torch_renderer.TorchRendererSettings
     exact, posed = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
     true = torch_renderer.render_gaussians(exact, posed, settings=kind(surfel_filter=low_pass)).alpha

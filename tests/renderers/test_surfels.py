@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.model import Model
-from coliags_plugin.renderers import stages, surfel_compositing, sweeping
+from coliags_plugin.renderers import surfel_compositing, sweeping, torch_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.naive import splat_surfels
@@ -183,7 +183,7 @@ def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
     gaussians = as_surfels(cast(dataclasses.replace(gaussians, quats_wxyz=quats), torch.float32))
     camera = pinhole(61, 52, 60.0, 55.0, dtype=torch.float32)
     plain = render_gaussians(gaussians, camera).alpha
-    extents_of = stages.surfel_extents
+    extents_of = torch_renderer.surfel_extents
 
     def reaching_everywhere(projected, opacities, *rest):
         extents = extents_of(projected, opacities, *rest)
@@ -192,7 +192,7 @@ def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
             extents, everywhere=everywhere, low=0 * edge, high=edge, drawn=projected.visible & (opacities >= 1 / 255)
         )
 
-    monkeypatch.setattr(stages, "surfel_extents", reaching_everywhere)
+    monkeypatch.setattr(torch_renderer, "surfel_extents", reaching_everywhere)
     missed = (render_gaussians(gaussians, camera).alpha - plain).abs().max()
     assert missed < 1e-6  # of 1/255 at least, if any
 

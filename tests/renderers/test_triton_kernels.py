@@ -18,30 +18,48 @@ import json, pathlib, re, subprocess, sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from coliags_plugin.renderers.triton_kernels import gaussians, surfels
-from coliags_plugin.renderers.triton_kernels.tile import BACKWARD_WARPS, FORWARD_WARPS, RANKS, TILE_SIZE
+from coliags_plugin.renderers.triton_kernels import binning, gaussians, geometry, projection, surfel_projection, surfels
+from coliags_plugin.renderers.triton_kernels import tile
 
-TYPES = {"gaussian": "*i64", "starts": "*i64"} | {
-    name: "i32" for name in ("columns", "width", "height", "channels")
-} | {name: "fp32" for name in ("alpha_min", "alpha_max", "transmittance_min", "near_plane", "sharpness")}
+WHOLE = ("columns", "rows", "width", "height", "channels", "count")
+REAL = ("fx", "fy", "cx", "cy", "near_plane", "sharpness", "slack", "ellipse_slack", "eps2d", "surfel_filter")
+REAL += ("alpha_min", "alpha_max", "transmittance_min", "x_min", "x_max", "y_min", "y_max")
+TYPES = dict.fromkeys(WHOLE, "i32") | dict.fromkeys(REAL, "fp32")
+TYPES |= dict.fromkeys(("gaussian", "tiles", "counts", "boxes"), "*i32")
+TYPES |= dict.fromkeys(("starts", "order", "ends"), "*i64")
 CUOBJDUMP = pathlib.Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
 target = GPUTarget("cuda", int(sys.argv[1]), 32)
+composited = [
+    (kernel, warps, {"CHANNELS": wide, "SIZE": tile.TILE_SIZE, "RANKS": tile.RANKS})
+    for module in (gaussians, surfels)
+    for kernel, warps in ((module.forward, tile.FORWARD_WARPS), (module.backward, tile.BACKWARD_WARPS))
+    for wide in (16, 32)
+]
+placed = [
+    (kernel, geometry.WARPS, {"SIZE": tile.TILE_SIZE, "BLOCK": geometry.BLOCK, "EMIT": emit})
+    for kernel, emits in (
+        (projection.forward, [0]), (projection.backward, [0]), (binning.find_pairs, [False, True]),
+        *((kernel, [0]) for kernel in (surfel_projection.centers, surfel_projection.centers_backward)),
+        *((kernel, [0]) for kernel in (surfel_projection.forward, surfel_projection.backward)),
+    )
+    for emit in emits
+]
 found = {}
-for module in (gaussians, surfels):
-    for kernel, warps in ((module.forward, FORWARD_WARPS), (module.backward, BACKWARD_WARPS)):
-        for wide in (16, 32):
-            blocks = {"CHANNELS": wide, "SIZE": TILE_SIZE, "RANKS": RANKS, "WITH_MEDIANS": True, "WITH_DEPTHS": True}
-            blocks = {name: value for name, value in blocks.items() if name in kernel.arg_names}
-            types = {name: TYPES.get(name, "*fp32") for name in kernel.arg_names if name not in blocks}
-            types |= dict.fromkeys(blocks, "constexpr")
-            source = ASTSource(fn=kernel, signature=types, constexprs=blocks)
-            made = triton.compile(source, target=target, options={"num_warps": warps})
-            name = f"{module.__name__.rsplit('.')[-1]}.{kernel.__name__}.{wide}"
-            found[name] = {"shared": made.metadata.shared}
-            cubin = pathlib.Path(sys.argv[2], f"{name}.cubin")
-            cubin.write_bytes(made.asm["cubin"])
-            told = subprocess.run([CUOBJDUMP, "-res-usage", cubin], capture_output=True, text=True, check=True).stdout
-            found[name] |= {key.lower(): int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\\d+)", told)}
+for kernel, warps, blocks in composited + placed:
+    blocks |= dict.fromkeys(("WITH_MEDIANS", "WITH_DEPTHS", "WITH_NORMALS"), True)
+    blocks = {name: value for name, value in blocks.items() if name in kernel.arg_names}
+    types = TYPES | ({"of_pose": "*fp64"} if kernel.__module__.endswith("surfel_projection") else {})
+    types = {name: types.get(name, "*fp32") for name in kernel.arg_names if name not in blocks}
+    types |= dict.fromkeys(blocks, "constexpr")
+    source = ASTSource(fn=kernel, signature=types, constexprs=blocks)
+    made = triton.compile(source, target=target, options={"num_warps": warps, "enable_fp_fusion": True})
+    variant = ".".join(str(blocks[name]) for name in ("CHANNELS", "EMIT") if name in blocks)
+    name = f"{kernel.__module__.rsplit('.')[-1]}.{kernel.__name__}.{variant}"
+    found[name] = {"shared": made.metadata.shared}
+    cubin = pathlib.Path(sys.argv[2], f"{name}.cubin")
+    cubin.write_bytes(made.asm["cubin"])
+    told = subprocess.run([CUOBJDUMP, "-res-usage", cubin], capture_output=True, text=True, check=True).stdout
+    found[name] |= {key.lower(): int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\\d+)", told)}
 print(json.dumps(found))
 """
 
@@ -56,7 +74,7 @@ def test_every_kernel_compiles_without_a_device(capability, tmp_path, monkeypatc
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout)
-    assert len(found) == 8
+    assert len(found) == 16
     for name, usage in found.items():
         assert usage["reg"] > 0 and usage["shared"] <= SHARED, (name, usage)
         assert not usage["stack"] and not usage["local"], f"{name} spills registers to memory: {usage}"

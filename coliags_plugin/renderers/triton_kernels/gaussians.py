@@ -44,7 +44,7 @@ def forward(
     while (first < end) & (tl.max(before) > 0.0):
         ranks = first + tl.arange(0, RANKS)
         here = ranks < end
-        index = tl.load(gaussian + ranks, here, 0)
+        index = tl.load(gaussian + ranks, here, 0).to(tl.int64)
         rows = table + index * stride
         _, _, _, _, _, _, _, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)
@@ -82,7 +82,7 @@ def backward(
     while (first < end) & (tl.max(before) > 0.0):
         ranks = first + tl.arange(0, RANKS)
         here = ranks < end
-        index = tl.load(gaussian + ranks, here, 0)
+        index = tl.load(gaussian + ranks, here, 0).to(tl.int64)
         rows, of_rows = table + index * stride, of_table + index * stride
         u_xx, u_yx, u_yy, dx, dy, along, across, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)

@@ -138,7 +138,7 @@ def backward(
     while (first < end) & (tl.max(before) > 0.0):
         ranks = first + tl.arange(0, RANKS)
         here = ranks < end
-        index = tl.load(gaussian + ranks, here, 0)
+        index = tl.load(gaussian + ranks, here, 0).to(tl.int64)
         rows, of_rows = table + index * stride, of_table + index * stride
         dx, dy, inverse_w, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
         alphas, from_x, from_y, on_disc = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
