@@ -59,7 +59,7 @@ def composite_gaussians(
     grid: TileGrid,
     cuts: CutSettings,
 ) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W"] | None]:
-    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Stages`."""
     # One lookup: its gradient is the most expensive step outside compositing.
     of_pairs = table.index_select(0, pairs.gaussian)
     offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]

@@ -22,7 +22,7 @@ from coliags_plugin.renderers.tiles import TileGrid, TilePairs
 def composite_surfels(
     table: Float[Tensor, "N 13+F"], pairs: TilePairs, grid: TileGrid, rules: SurfelRules
 ) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W 4"]]:
-    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Stages`."""
     of_pairs = table.index_select(0, pairs.gaussian)
     origins = grid.centers(pairs.tile, of_pairs.dtype)
     rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)

@@ -1,4 +1,4 @@
-"""The compositors of ``stages.Compositors`` by triton kernels, with their derivatives."""
+"""Compositing of ``stages.Stages`` by triton kernels, with its gradients."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def composite_gaussians(
     grid: TileGrid,
     cuts: CutSettings,
 ) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W"] | None]:
-    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Stages`."""
     image, medians = _Gaussians.apply(table, depths, pairs, grid, cuts)  # type: ignore[no-untyped-call]
     return image.permute(1, 2, 0), medians
 
@@ -32,7 +32,7 @@ def composite_gaussians(
 def composite_surfels(
     table: Float[Tensor, "N 13+F"], pairs: TilePairs, grid: TileGrid, rules: SurfelRules
 ) -> tuple[Float[Tensor, "H W F"], Float[Tensor, "H W 4"]]:
-    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Compositors`."""
+    """Composite the pairs of each tile: :class:`~coliags_plugin.renderers.stages.Stages`."""
     image, depths = _Surfels.apply(table, pairs, grid, rules)  # type: ignore[no-untyped-call]
     return image.permute(1, 2, 0), depths.permute(1, 2, 0)
 
@@ -117,9 +117,9 @@ def _bounds(cuts: CutSettings) -> tuple[float, float, float]:
 
 
 def _blocks(image: Tensor, grid: TileGrid, warps: int) -> dict[str, int]:
-    """Sizes of the kernels' blocks, and warps of a program."""
+    """Sizes of the kernels' blocks, and options of the compiler."""
     channels = max(16, triton.next_power_of_2(len(image)))
-    return {"CHANNELS": channels, "SIZE": grid.size, "RANKS": RANKS, "num_warps": warps}
+    return {"CHANNELS": channels, "SIZE": grid.size, "RANKS": RANKS, "num_warps": warps, "enable_fp_fusion": True}
 
 
 def _surfel_bounds(rules: SurfelRules) -> tuple[float, ...]:

@@ -1,6 +1,6 @@
 """Compositing of 3D Gaussians, forward and backward.
 
-Rows of the table are means2d (2), whitening (3), log(opacity) and the features (``stages.Compositors``).
+Rows of the table are means2d (2), whitening (3), log(opacity) and the features (``stages.Stages``).
 """
 
 from __future__ import annotations

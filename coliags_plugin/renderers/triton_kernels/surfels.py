@@ -1,7 +1,7 @@
 """Compositing of surfels, forward and backward; their depth differs from pixel to pixel.
 
 Rows of the table are means2d (2), slopes of U, V and W (6), W at the centre, D, the filter's centre (2), log(opacity)
-and the features (``ProjectedSurfels.intersections``, ``stages.Compositors``).
+and the features (``ProjectedSurfels.intersections``, ``stages.Stages``).
 """
 
 from __future__ import annotations
