@@ -9,6 +9,9 @@ all of them; figures are medians. A renderer so slow that all its turns would ta
 Surfels have the first two scales of the 3D Gaussians, and so do flat 3D Gaussians, whose third is a thousandth of the
 smaller: what surfels cost in addition is their ratio to these.
 
+Differences are those of outputs and of gradients to the first renderer's: the root of the sum of squares, as a share of
+that of the first one's values, and the largest of an output or input.
+
 On a machine that is busy with other work, --threads 1 --clock processor counts only the time that it gave to this.
 """
 
@@ -27,14 +30,15 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 import torch
 import tyro
 from machine import CLOCKS, show
+from torch import Tensor
 from train_stages import Handed
 from tube import camera, lining, wall
 
 from coliags_plugin.config.components import make_component
-from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.renderers.choice import choose_renderer
 
 #: What is drawn, and the renderers' name for it.
@@ -53,7 +57,10 @@ class Options:
     counts: str = "20000,50000,100000,200000"
     """Numbers of Gaussians, comma separated."""
     backends: str = "torch,cpu"
-    """Renderers by name, comma separated; gsplat needs a CUDA device. Ratios are to the first."""
+    """Renderers by name, comma separated; triton and gsplat need a CUDA device. Ratios and differences are to the
+    first."""
+    device: str = "cpu"
+    """Where to compute."""
     primitives: str = "gaussians3d"
     """Primitives, comma separated: gaussians3d, flat, surfels. The last column is their time relative to the first."""
     scene: Literal["wall", "lining"] = "wall"
@@ -80,7 +87,7 @@ class Case:
         self.primitive = primitive
         self.device = device
         self.clock = CLOCKS[clock]
-        moved = {name: getattr(gaussians, name).to(device).requires_grad_() for name in INPUTS}
+        moved = {name: getattr(gaussians, name).to(device, copy=True).requires_grad_() for name in INPUTS}
         self.gaussians = replace(gaussians, **moved)
         self.camera = camera().to(device)
         generator = torch.Generator().manual_seed(0)
@@ -98,14 +105,24 @@ class Case:
         began = self._now()
         output = self.renderer.render(Handed(self.gaussians, self.primitive), self.camera, WANTS)
         drawn = self._now()
-        torch.autograd.backward([output[name] for name in WANTS], self.cotangents)
-        return 1e3 * (drawn - began), 1e3 * (self._now() - began)
+        maps = [output[name] for name in WANTS]
+        torch.autograd.backward(maps, self.cotangents)
+        done = self._now()
+        self.maps = [values.detach() for values in maps]
+        return 1e3 * (drawn - began), 1e3 * (done - began)
 
     def take_turn(self) -> None:
         """Draw once, and remember how long that took."""
         forward, both = self.draw()
         self.forward.append(forward)
         self.both.append(both)
+
+    def differences(self, other: Case) -> tuple[float, float]:
+        """Of outputs and of gradients, from those of another renderer."""
+        gradients, theirs = (
+            [torch.as_tensor(getattr(case.gaussians, name).grad) for name in INPUTS] for case in (self, other)
+        )
+        return _difference(self.maps, other.maps), _difference(gradients, theirs)
 
     def medians(self) -> tuple[float, float]:
         """Of all turns: milliseconds until the image, and until the gradients."""
@@ -117,6 +134,10 @@ class Case:
         return self.clock()
 
 
+def _difference(values: list[Tensor], others: list[Tensor]) -> float:
+    return max(float((one - two).norm() / two.norm()) for one, two in zip(values, others, strict=True))
+
+
 def shaped(gaussians: Gaussians, primitive: str) -> Gaussians:
     """The same Gaussians as flat ones or as surfels."""
     scales = gaussians.scales[:, :2].contiguous()
@@ -125,18 +146,13 @@ def shaped(gaussians: Gaussians, primitive: str) -> Gaussians:
     return gaussians if primitive == "gaussians3d" else replace(gaussians, scales=scales)
 
 
-def find_renderers(names: list[str], primitive: str) -> dict[str, tuple[Renderer, torch.device]]:
-    """Each renderer and where it runs: on the CPU if it can.
+def find_renderers(names: list[str], primitive: str, device: torch.device) -> dict[str, Renderer]:
+    """Each renderer.
 
     Raises:
-        InputError: One cannot run here.
+        InputError: One cannot run on the device.
     """
-    found = {}
-    for name in names:
-        devices = getattr(REGISTRIES["renderers"].get(name), "devices", {"cpu"})
-        device = torch.device("cpu" if "cpu" in devices else "cuda")
-        found[name] = (choose_renderer(make_component("renderers", name), primitive, device).renderer, device)
-    return found
+    return {name: choose_renderer(make_component("renderers", name), primitive, device).renderer for name in names}
 
 
 def measure(cases: dict[tuple[str, str], Case], repeats: int, patience: float) -> None:
@@ -160,14 +176,15 @@ def main(options: Options) -> None:
     for primitive in primitives:
         if primitive not in PRIMITIVES:
             raise InputError(f"no primitive '{primitive}'", f"some of {', '.join(PRIMITIVES)}")
-    renderers = {primitive: find_renderers(names, PRIMITIVES[primitive]) for primitive in primitives}
+    device = choose_device(options.device)
+    renderers = {primitive: find_renderers(names, PRIMITIVES[primitive], device) for primitive in primitives}
     rows: list[dict[str, Any]] = []
     shown: list[dict[str, Any]] = []
     for count in map(int, options.counts.split(",")):
         gaussians = {"wall": wall, "lining": lining}[options.scene](count)
         cases = {
             (name, primitive): Case(
-                *renderers[primitive][name], PRIMITIVES[primitive], shaped(gaussians, primitive), options.clock
+                renderers[primitive][name], device, PRIMITIVES[primitive], shaped(gaussians, primitive), options.clock
             )
             for name in names
             for primitive in primitives
@@ -177,6 +194,8 @@ def main(options: Options) -> None:
         for (name, primitive), (forward, both) in medians.items():
             row = {"backend": name, "primitive": primitive, "count": count}
             row |= {"forward_ms": forward, "forward_backward_ms": both}
+            differences = cases[name, primitive].differences(cases[names[0], primitive])
+            row |= dict(zip(("outputs_differ", "gradients_differ"), differences, strict=True))
             rows.append(row)
             first_forward, first_both = medians[names[0], primitive]
             ratios = {"faster, forward": first_forward / forward, "faster, both": first_both / both}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -47,6 +50,13 @@ def test_surfels_beside_3d_gaussians(run, scene):
     assert "| cpu | flat | 300 |" in table and "| cpu | surfels | 300 |" in table and "| both, of flat |" in table
 
 
+def test_differences_between_renderers(run, tmp_path):
+    run("rasterizer", "--backends", "torch,cpu", "--counts", 300, "--repeats", 1, "--json", tmp_path / "rows.json")
+    first, second = json.loads((tmp_path / "rows.json").read_text())
+    assert first["outputs_differ"] == first["gradients_differ"] == 0
+    assert all(0 < second[name] < 1e-3 for name in ("outputs_differ", "gradients_differ"))
+
+
 def test_the_training_step_of_every_method(run):
     table = run("train_step", "--methods", ",".join(METHODS), "--gaussians", 500, "--steps", 1, *SIZE)
     assert [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:] == METHODS
@@ -88,3 +98,35 @@ def test_reading_a_long_sequence(run):
 def test_updates_of_the_browser_view(run):
     pytest.importorskip("viser")
     assert "| 300 anchors |" in run("view", "--anchors", 300, "--repeats", 1)
+
+
+def gpu_script(folder, *argv, **variables):
+    """Exit status, parts by name, and the summary of `gpu.sh` on the CPU."""
+    command = [str(ROOT / "benchmarks" / "gpu.sh"), "--device", "cpu", "--small", "--out", str(folder), *argv]
+    environment = {**os.environ, "PYTHON": sys.executable, **variables}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=900)
+    parts = [json.loads(line) for line in (folder / "parts.jsonl").read_text().splitlines()]
+    return (
+        done.returncode,
+        {part["part"]: part["status"] for part in parts},
+        (folder / "summary").with_suffix(".md").read_text(),
+    )
+
+
+def test_everything_for_a_gpu_runs_on_a_cpu(tmp_path):
+    status, parts, summary = gpu_script(tmp_path / "out")
+    assert status == 0 and set(parts.values()) == {"ok"}, summary
+    assert list(parts)[:4] == ["doctor", "tests", "rasterizer", "against-torch"] and list(parts)[-1] == "report"
+    assert {"step-coliags", "frames-per-second", "comparison", "run-3dgs", "eval-3dgs"} <= parts.keys()
+    assert "| step-coliags | ok |" in summary and "| cpu | surfels | 300 |" in summary and "1 of 1" in summary
+    for name in ("rasterizer", "against-torch", "step-3dgs", "frames-per-second"):
+        assert json.loads((tmp_path / "out" / f"{name}.json").read_text())
+    assert (tmp_path / "out" / "report").with_suffix(".md").is_file()
+
+
+def test_a_part_for_a_gpu_that_fails_is_recorded_and_the_others_run(tmp_path):
+    status, parts, summary = gpu_script(tmp_path / "out", PYTHON="false")
+    assert status == 1 and set(parts.values()) == {"failed (1)"} and len(parts) > 6
+    assert "## doctor: failed (1)" in summary
+    status, parts, _ = gpu_script(tmp_path / "late", "--minutes", "0")
+    assert status == 0 and set(parts.values()) == {"no time left"}
