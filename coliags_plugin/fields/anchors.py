@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import torch
 from jaxtyping import Float, Int
@@ -13,22 +13,24 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
-from coliags_plugin.contracts import GaussianField, LampAware
+from coliags_plugin.contracts import GaussianField, HeadNetworks, LampAware
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.tables import fit_kernels
+from coliags_plugin.core.tables import fit_kernels, fit_triton_kernels
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
-from coliags_plugin.fields.children import AnchorRows, drawn_children, fused_children, visible_anchors
+from coliags_plugin.fields.children import AnchorRows, DrawnChildren, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 from coliags_plugin.fields.rows import unique_rows
 from coliags_plugin.lighting.lamps import HeldLight
 
 logger = logging.getLogger(__name__)
 
+#: What the heads see of anchors: features, directions, distances, cosines, and normals where they use them.
+_Seen: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, "Tensor | None"]
 #: Approximate number of training cameras, evenly spaced, that the range of distances is computed from.
 _DISTANCE_CAMERAS = 16
 
@@ -189,8 +191,45 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
 
     def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:
         camera = camera.to(self.anchors.device, self.anchors.dtype)
+        decoded = self._on_device(camera, light) if fit_triton_kernels(self.anchors) else None
+        drawn, visible = decoded or self._of_visible(camera, light)
+        normals = None
+        if self.normals is not None:
+            normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
+        lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
+        return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)
+
+    def _on_device(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]] | None:
+        """Children by the kernels of triton, which find the visible anchors themselves; None without networks."""
+        seen = self._seen(self.anchors, self.features, self.normals, camera, light)
+        geometry, appearance = self._networks(seen)
+        if geometry is None or appearance is None:
+            return None
+        from coliags_plugin.fields.triton_kernels.children import visible_children
+
+        return visible_children(self._rows, camera, self.features, geometry, appearance)
+
+    def _of_visible(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]]:
+        """Children by the kernels of the CPU, or by the definition."""
         visible = self.visible_anchors(camera)
         anchors, features = (unique_rows(rows, visible) for rows in (self.anchors, self.features))
+        normals = None if self.normals is None else self.normals.index_select(0, visible)
+        seen = self._seen(anchors, features, normals, camera, light)
+        geometry, appearance = self._networks(seen) if self._on_kernels else (None, None)
+        if geometry is not None and appearance is not None:
+            return fused_children(self._rows, visible, features, geometry, appearance), visible
+        opacities, covariances = self.geometry_head(*seen[:2])
+        return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(*seen)), visible
+
+    def _networks(self, seen: _Seen) -> tuple[HeadNetworks | None, HeadNetworks | None]:
+        heads = (self.geometry_head, seen[:2]), (self.appearance_head, seen)
+        geometry, appearance = (head.networks(*inputs) if head.has_networks else None for head, inputs in heads)
+        return geometry, appearance
+
+    @staticmethod
+    def _seen(
+        anchors: Tensor, features: Tensor, normals: Tensor | None, camera: Camera, light: HeldLight | None
+    ) -> _Seen:
         sight = anchors - camera.center
         distances = sight.norm(dim=1, keepdim=True)
         directions = sight / distances
@@ -198,19 +237,4 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         cosines = (directions @ camera.optical_axis).clamp(0.0, 1.0)[:, None]
         if light is not None:
             distances, cosines = (values[:, None] for values in light.incidence(anchors))
-
-        normals = None if self.normals is None else self.normals.index_select(0, visible)
-        seen = (features, directions, distances, cosines, normals)
-        geometry, appearance = (
-            head.networks(*inputs) if self._on_kernels and head.has_networks else None
-            for head, inputs in ((self.geometry_head, seen[:2]), (self.appearance_head, seen))
-        )
-        if geometry is not None and appearance is not None:
-            drawn = fused_children(self._rows, visible, features, geometry, appearance)
-        else:
-            opacities, covariances = self.geometry_head(*seen[:2])
-            drawn = drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(*seen))
-        if self.normals is not None:
-            normals = self.normals.index_select(0, drawn.source_index // self.settings.children)
-        lit = self.appearance_head.apply_light(drawn.colors, drawn.means, normals, camera, light)
-        return Gaussians(**{**drawn._asdict(), "colors": lit}, visible_sources=visible)
+        return features, directions, distances, cosines, normals

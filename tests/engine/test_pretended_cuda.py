@@ -1,6 +1,7 @@
 """Training on a CUDA device that is not there: nothing meets on two devices, and nothing waits unseen."""
 
 import shutil
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from tests.scenes import SMALL, wall_scene, write_wall
 #: What runs on the device in training, without renderers: rivals and modules beyond those of `coliags`.
 METHODS = ("3dgs-depth", "2dgs", "gaussian-pancakes", "pr-endo", "scaffold-gs", "reim-nerf-small", "coliags-plus")
 #: Waits of a step of `coliags` that are not the torch renderer's: the log's, and the lengths of lists.
-WAITS = {"tolist engine/trainer.py", "nonzero fields/anchors.py", "nonzero fields/children.py"}
+WAITS = {"tolist engine/trainer.py", "tolist fields/triton_kernels/children.py"}
 
 
 def make_trainer(path, method, steps=4):
@@ -25,7 +26,7 @@ def make_trainer(path, method, steps=4):
     if not method.startswith("reim"):
         options.append("renderer=torch")
     if load_method(method).config.field.name == "anchors":
-        options += SMALL
+        options += [*SMALL, "field.voxel_size=5.0"]  # few anchors: their kernels are interpreted
     return Trainer(load_method(method, options), wall_scene(), "wall", RunFolder(path), 0, CUDA)
 
 
@@ -70,7 +71,7 @@ def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
         again.train()
     second = read_checkpoint(latest_checkpoint(again.run.checkpoints), method, torch.device("cpu"))
     assert all(torch.equal(tensor, second.tensors[name]) for name, tensor in first.tensors.items())
-    if method == "coliags":
+    if method == "coliags" and find_spec("triton") is not None:
         assert {place for place in waits if "renderers/" not in place and "checkpoints" not in place} <= WAITS
 
 

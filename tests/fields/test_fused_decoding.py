@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from importlib.util import find_spec
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from coliags_plugin.fields import anchors
 from coliags_plugin.fields.appearance_heads import PlainAppearanceHead
-from coliags_plugin.fields.children import visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 from coliags_plugin.fields.geometry_heads import PlainGeometryHead
 from tests.fields.made import make_field
 from tests.scenes import camera_at
 
 OUTPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
-CAMERA = camera_at(1.0, 0.5, 2.0, yaw=0.1)
+#: Sees a part of the anchors.
+CAMERA = camera_at(4.0, 0.5, 8.0, yaw=0.4)
 FIELDS = {
     "coliags": {"geometry_head": "imve", "appearance_head": "imia"},
-    "scaffold": {"geometry_head": "plain", "appearance_head": {"name": "plain", "distance": True}},
+    "scaffold": {"geometry_head": "plain", "appearance_head": {"name": "plain", "distance": True}, "children": 3},
     "odd sizes": {
         "geometry_head": {"name": "imve", "hidden": 20, "frequencies": 1},
         "appearance_head": {"name": "imia-glints", "hidden": 41},
@@ -31,38 +35,59 @@ FIELDS = {
         "geometry_head": "plain",
         "appearance_head": {"name": "attenuated", "head": "imia", "incidence_exponent": 0.3},
     },
-    "one channel": {"geometry_head": "plain", "appearance_head": {"name": "attenuated", "head": "imia", "channels": 1}},
+    "one channel": {
+        "geometry_head": "plain",
+        "appearance_head": {"name": "attenuated", "head": "imia", "channels": 1},
+        "children": 5,
+    },
 }
 
 
-def made(name):
-    """A field whose children overlap the image in part, float32."""
-    field = make_field(name="anchors", **FIELDS[name])
+def make(name, **options):
+    """A field of some hundred anchors, of four tiles of triton's kernels, float32."""
+    field = make_field(**{"name": "anchors", "voxel_size": 2.5, **FIELDS[name], **options})
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         field.offsets.uniform_(-1, 1, generator=generator)
         field.features.uniform_(-1, 1, generator=generator)
+        field.scalings.uniform_(-1, 0, generator=generator)
         for parameter in (*field.geometry_head.parameters(), *field.appearance_head.parameters()):
             parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.1)
     return field
 
 
+@pytest.fixture(params=["numba", "triton", pytest.param("cuda", marks=pytest.mark.gpu)])
+def made(request, monkeypatch):
+    """:func:`make`, of fields that either kernels decode: triton's in its interpreter, or on a device."""
+    if request.param == "numba":
+        return make
+    if find_spec("triton") is None:
+        pytest.skip("triton is not installed")
+    from coliags_plugin.fields.triton_kernels import children
+
+    monkeypatch.setattr(children, "SLABS", 2)  # fewer programs than tiles
+    if request.param == "triton":
+        monkeypatch.setattr(anchors, "fit_triton_kernels", lambda tensor: tensor.dtype == torch.float32)
+        return make
+    return lambda *names, **options: make(*names, **options).to(request.param)
+
+
 def derived(field, camera):
     """Gaussians, and derivatives of a random weighting of all that they have."""
     drawn = field.gaussians(camera)
+    moved = {name: getattr(drawn, name).cpu() for name in (*OUTPUTS, "source_index", "visible_sources")}
+    drawn = replace(drawn, **moved)
     generator = torch.Generator().manual_seed(2)
     values = [getattr(drawn, name).double() for name in OUTPUTS]
     weights = [torch.randn(value.shape, generator=generator, dtype=torch.float64) for value in values]
     torch.stack([(value * weight).sum() for value, weight in zip(values, weights, strict=True)]).sum().backward()
-    return drawn, {name: parameter.grad for name, parameter in field.named_parameters()}
+    return drawn, {name: parameter.grad.cpu() for name, parameter in field.named_parameters()}
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_gaussians_and_derivatives_are_those_of_the_definition(name):
-    field = made(name)
-    wide = copy.deepcopy(field).double()
-    (drawn, found), (expected, expected_found) = derived(field, CAMERA), derived(wide, CAMERA)
-    assert 0 < len(drawn) < field.element_count * field.slots_per_element
+def assert_as_defined(field, camera=CAMERA):
+    """Its Gaussians and gradients are those of the definition in float64; return the Gaussians."""
+    wide = copy.deepcopy(field).cpu().double()
+    (drawn, found), (expected, expected_found) = derived(field, camera), derived(wide, camera)
     assert torch.equal(drawn.source_index, expected.source_index)
     assert torch.equal(drawn.visible_sources, expected.visible_sources)
     for output in OUTPUTS:
@@ -73,13 +98,53 @@ def test_gaussians_and_derivatives_are_those_of_the_definition(name):
     for key, wanted in expected_found.items():
         scale = wanted.abs().max().clamp_min(1e-6)
         torch.testing.assert_close(found[key].double() / scale, wanted / scale, rtol=0, atol=1e-4)
+    return drawn
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_gaussians_and_derivatives_are_those_of_the_definition(name, made):
+    field = made(name)
+    drawn = assert_as_defined(field)
+    assert 0 < len(drawn.visible_sources) < field.element_count
+    assert 0 < len(drawn) < len(drawn.visible_sources) * field.slots_per_element
+
+
+@pytest.mark.parametrize(("opacity", "share"), [(-1.0, 0.0), (1.0, 1.0)])
+def test_all_or_none_of_the_children_are_drawn(opacity, share, made):
+    field = made("scaffold")
+    with torch.no_grad():
+        field.geometry_head.opacity_mlp[2].weight.mul_(0.1)
+        field.geometry_head.opacity_mlp[2].bias.fill_(opacity)
+    drawn = assert_as_defined(field)
+    assert len(drawn) == share * len(drawn.visible_sources) * field.slots_per_element
+    assert len(drawn.visible_sources) > 0
+
+
+def test_a_single_anchor(made):
+    field = made("scaffold", voxel_size=100.0)
+    assert field.element_count == 1
+    assert len(assert_as_defined(field, camera_at(0.0, 0.0, -20.0))) > 0
+
+
+@pytest.mark.thorough
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    children=st.integers(1, 20), features=st.integers(1, 50), units=st.tuples(st.integers(1, 70), st.integers(1, 70)),
+    frequencies=st.integers(0, 10), yaw=st.floats(-2.0, 2.0),
+    appearance=st.sampled_from(["imia", "imia-glints", "plain"]),
+)  # fmt: skip
+def test_any_sizes(children, features, units, frequencies, yaw, appearance, made):
+    geometry = {"name": "imve", "hidden": units[0], "frequencies": frequencies}
+    heads = {"geometry_head": geometry, "appearance_head": {"name": appearance, "hidden": units[1]}}
+    field = made("scaffold", children=children, features=features, voxel_size=4.0, **heads)
+    assert_as_defined(field, camera_at(4.0, 0.5, 8.0, yaw=yaw))
 
 
 @pytest.mark.parametrize("name", ["coliags", "scaffold", "with incidence"])
-def test_derivatives_with_respect_to_the_pose(name):
+def test_derivatives_with_respect_to_the_pose(name, made):
     """They reach the viewing directions, distances and cosines, and gamma of them."""
     found = []
-    for field in (made(name), made(name).double()):
+    for field in (made(name), make(name).double()):
         pose = CAMERA.camera_to_world.to(field.anchors.dtype, copy=True).requires_grad_()
         derived(field, replace(CAMERA, camera_to_world=pose))
         found.append(pose.grad.double())
@@ -93,7 +158,7 @@ def test_any_number_of_threads_gives_the_same_bits():
     try:
         for count in (1, 2, 3, 5):
             torch.set_num_threads(count)
-            results.append(derived(made("coliags"), CAMERA))
+            results.append(derived(make("coliags"), CAMERA))
     finally:
         torch.set_num_threads(threads)
     for drawn, found in results[1:]:
@@ -103,7 +168,7 @@ def test_any_number_of_threads_gives_the_same_bits():
 
 def test_the_law_is_bounded_close_to_the_lamp_and_beside_it():
     """Where distance, cosine or incidence are at their bounds, neither the law nor its derivatives depend on them."""
-    fields = [made("with incidence"), made("with incidence").double()]
+    fields = [make("with incidence"), make("with incidence").double()]
     results = []
     for field in fields:
         head = field.appearance_head
@@ -121,7 +186,7 @@ def test_the_law_is_bounded_close_to_the_lamp_and_beside_it():
         assert torch.isclose(actual.double(), wanted, rtol=1e-4, atol=atol).all(), name
 
 
-def test_nothing_visible_is_nothing_drawn():
+def test_nothing_visible_is_nothing_drawn(made):
     field = made("coliags")
     behind = replace(CAMERA, camera_to_world=camera_at(0.0, 0.0, 1e4).camera_to_world)
     drawn, found = derived(field, behind)
@@ -129,7 +194,7 @@ def test_nothing_visible_is_nothing_drawn():
     assert not any(gradient.any() for gradient in found.values())
 
 
-def test_what_is_not_a_number_is_not_hidden():
+def test_what_is_not_a_number_is_not_hidden(made):
     field = made("coliags")
     first = int(field.visible_anchors(CAMERA)[0])
     kept = field.gaussians(CAMERA).source_index // field.slots_per_element
@@ -143,23 +208,23 @@ def test_what_is_not_a_number_is_not_hidden():
     assert field.gaussians(CAMERA).colors.isnan().any()
 
 
-def test_visible_anchors_are_those_whose_sphere_is_in_the_frustum():
+def test_visible_anchors_are_those_whose_sphere_is_in_the_frustum(made):
     field = made("coliags")
     with torch.no_grad():
         field.scalings.uniform_(-2.0, 1.0, generator=torch.Generator().manual_seed(3))
     for camera in (CAMERA, camera_at(0.0, 0.0, 0.0), camera_at(4.0, 3.0, 1.0, yaw=1.0)):
-        wide = copy.deepcopy(field).double()
+        wide = copy.deepcopy(field).cpu().double()
         reach = (wide.offsets * wide.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         radii = reach + DRAWN_SIGMAS * wide.scalings[:, 3:].amax(dim=1).exp()
         near = spheres_in_frustum(wide.anchors, radii - 1e-3, camera)
         far = spheres_in_frustum(wide.anchors, radii + 1e-3, camera)
         seen = torch.zeros_like(near)
-        seen[visible_anchors(field._rows, camera)] = True
+        seen[field.gaussians(camera).visible_sources.cpu()] = True
         assert near.any() and not far.all()
         assert (near <= seen).all() and (seen <= far).all()
 
 
-def test_a_head_that_decodes_in_another_way_is_asked():
+def test_a_head_that_decodes_in_another_way_is_asked(made):
     """A subclass with a ``forward`` of its own does not decode by the networks of the class above."""
 
     class Halved(PlainGeometryHead):
