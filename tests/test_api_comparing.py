@@ -6,9 +6,9 @@ import pytest
 from rich.console import Console
 
 import coliags_plugin as cp
-from coliags_plugin.comparison import runner
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.execution import queue
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
 from tests.engine.test_progress import Shown
@@ -110,6 +110,6 @@ def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
 def test_a_notebook_shows_one_line(wall, tmp_path, inline, monkeypatch):
     shown = Shown()
     monkeypatch.setattr("IPython.display.display", shown)
-    monkeypatch.setattr(runner, "log_console", lambda: Console(force_jupyter=True))
+    monkeypatch.setattr(queue, "log_console", lambda: Console(force_jupyter=True))
     cp.compare("coliags", wall, tmp_path / "new", steps=3, settings=SETTINGS)
     assert shown.text.startswith("compare 3/3, took") and shown.text.endswith("1 done")

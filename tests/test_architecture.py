@@ -22,7 +22,7 @@ LAYERS = (
     {"reporting"},
     {"results"},
     {"engine", "phantom", "reconstruction"},
-    {"surface"},
+    {"surface", "execution"},
     {"export"},
     {"checks", "comparison"},
     {"pipeline"},

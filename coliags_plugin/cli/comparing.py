@@ -54,8 +54,8 @@ class ComparisonArguments:
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""
         from coliags_plugin.comparison.compare import carry_out, dry_run, make_request
-        from coliags_plugin.comparison.executors import ExecutionOptions
         from coliags_plugin.comparison.folder import ComparisonFolder
+        from coliags_plugin.execution.choice import ExecutionOptions
 
         request = make_request(
             methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 from coliags_plugin.comparison.dry_run import DryRun, RunSizes, forecast
-from coliags_plugin.comparison.executors import ExecutionOptions, Executor, LocalExecutor
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
-from coliags_plugin.comparison.ray_executor import RayExecutor
-from coliags_plugin.comparison.runner import CellQueue
+from coliags_plugin.comparison.runner import CellRuns
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config.method_config import method_name
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name, check_number, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.engine.devices import find_device
 from coliags_plugin.engine.progress import progress_callback
+from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.reporting.model import Column
 from coliags_plugin.reporting.terminal import DisplayTable
 from coliags_plugin.results.record import Result
 
 log = logging.getLogger(__name__)
 
-ExecutorName = Literal["local", "ray"]
 #: Metrics of a summary unless others are chosen.
 COLUMNS = ("psnr", "ssim", "depth_mse")
 
@@ -113,7 +109,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
         if scenes:
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
-        failures = CellQueue(folder, executor, options, cells, finished, sizes).run()
+        failures = CellRuns(folder, executor, options, cells, finished, sizes).run()
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
 
@@ -150,45 +146,9 @@ def make_request(
         raise InputError(f"more than one method is named {', '.join(twice)}", "methods of different names")
     if not scenes:
         raise InputError("no scene", "at least one", "--scenes phantoms-8 needs no dataset")
-    _check_number("seeds", seeds)
-    _check_number("steps", steps)
+    check_number("seeds", seeds)
+    check_number("steps", steps)
     for split in splits:
-        _check_name("split", split, get_args(Split))
+        check_name("split", split, get_args(Split))
     sources = find_scenes([str(scene) for scene in scenes], None if data is None else Path(data))
     return Request(variants, sources, range(seeds), protocol, tuple(dict.fromkeys(splits)), steps, tuple(overrides))
-
-
-def make_executor(options: ExecutionOptions) -> Executor:
-    """The executor of a comparison."""
-    _check_number("jobs", options.jobs)
-    _check_number("threads", options.threads)
-    _check_number("retries", options.retries, least=0)
-    _check_name("executor", options.executor, get_args(ExecutorName))
-    if options.executor == "ray":
-        return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    gpus = _gpus(options.device)
-    jobs = options.jobs or len(gpus) or cpus
-    return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
-
-
-def _check_number(option: str, number: int | None, least: int = 1) -> None:
-    if number is not None and number < least:
-        raise InputError(f"--{option} {number}", f"at least {least}")
-
-
-def _check_name(noun: str, name: str, known: Sequence[str]) -> None:
-    if name not in known:
-        raise InputError(f"no {noun} '{name}'", f"one of {', '.join(known)}", did_you_mean(name, known))
-
-
-def _gpus(device: str) -> list[str]:
-    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``: all, or the one that ``device`` numbers."""
-    import torch
-
-    chosen = find_device(device)
-    if chosen.type != "cuda":
-        return []
-    visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
-    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
-    return [found[chosen.index]] if ":" in device else found

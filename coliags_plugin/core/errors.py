@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 
@@ -69,3 +69,15 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     renamed = RENAMED_OPTIONS.get(word, "")
     close = [renamed] if renamed in words else get_close_matches(word, words, n=1, cutoff=0.5)
     return f"Did you mean '{close[0]}'?" if close else ""
+
+
+def check_number(option: str, number: int | None, least: int = 1) -> None:
+    """Refuse a number of an option that is too small; None is none."""
+    if number is not None and number < least:
+        raise InputError(f"--{option} {number}", f"at least {least}")
+
+
+def check_name(noun: str, name: str, known: Sequence[str]) -> None:
+    """Refuse a name that is none of those known."""
+    if name not in known:
+        raise InputError(f"no {noun} '{name}'", f"one of {', '.join(known)}", did_you_mean(name, known))

@@ -15,10 +15,11 @@ import torch
 
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
-from coliags_plugin.comparison.executors import ExecutionOptions, Executor
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.comparison.worker import work
+from coliags_plugin.execution.choice import ExecutionOptions
+from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.tasks import Task, TaskOutcome
 
 #: Overrides that make the anchor methods small, whose steps then take some milliseconds.
 TINY = (

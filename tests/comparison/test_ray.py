@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.comparison import ray_executor
-from coliags_plugin.comparison.ray_executor import RayExecutor
-from coliags_plugin.comparison.tasks import Task
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.execution import ray_executor
+from coliags_plugin.execution.ray_executor import RayExecutor
+from coliags_plugin.execution.tasks import Task
 from tests.commands import refused
 from tests.comparison.small import OFTEN, TINY, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
 
@@ -185,7 +185,7 @@ def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch)
     assert executor.slots == 2
     executor.check(tmp_path, [wall])
     assert not list(tmp_path.glob(".storage-*"))
-    with pytest.raises(InputError, match=r"node .* does not see the scenes .*/gone\. Expected scenes on storage"):
+    with pytest.raises(InputError, match=r"node .* does not see .*/gone\. Expected inputs on storage"):
         executor.check(tmp_path, [wall, tmp_path / "gone"])
     seen = RayExecutor._ask
 
@@ -206,12 +206,11 @@ def test_every_run_gets_a_gpu_of_its_own(cluster, wall, tmp_path, monkeypatch):
     made.wait_for_nodes(timeout=120)
     assert RayExecutor(made.address, None, 1, "cpu").slots == 5
 
-    def seen(text):
+    def seen(task):
         time.sleep(2.0)
         return {"ending": "done", "reason": os.environ.get("CUDA_VISIBLE_DEVICES", "")}
 
     monkeypatch.setattr(ray_executor, "_work", seen)
-    monkeypatch.setattr(Task, "to_json", lambda task: "")
     for device, gpus in (("auto", {"0", "1"}), ("cpu", {""})):
         executor = RayExecutor(made.address, None, 1, device)
         for _ in range(2):

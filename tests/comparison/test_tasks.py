@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.comparison.executors import LocalExecutor
-from coliags_plugin.comparison.tasks import Task, TaskOutcome, outcome_line, read_outcome
-from coliags_plugin.comparison.worker import work
+from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.execution.executors import LocalExecutor
+from coliags_plugin.execution.tasks import TaskOutcome, outcome_line, read_outcome
 
 
 @pytest.fixture
 def task(tmp_path):
     places = {name: str(tmp_path / name) for name in ("data", "run", "result", "log")}
-    return Task(
+    return CellTask(
         title="wall coliags seed 0",
         name="coliags",
         method="coliags",
@@ -30,7 +30,7 @@ def task(tmp_path):
         seed=0,
         device="cpu",
         protocol="paper",
-        result_key="0" * 16,
+        key="0" * 16,
         threads=3,
         variables={"COLIAGS_LPIPS_WEIGHTS": "here"},
         **places,
@@ -38,7 +38,7 @@ def task(tmp_path):
 
 
 def test_a_task_travels_as_json(task):
-    assert Task.from_json(task.to_json()) == task
+    assert CellTask.from_json(task.to_json()) == task
 
 
 def test_the_environment_names_threads_package_and_variables(task):
@@ -82,7 +82,7 @@ def test_a_run_that_another_process_has_is_left_alone(task):
     assert outcome.reason.startswith(owner)
 
 
-class Sleeper(Task):
+class Sleeper(CellTask):
     """Whose process sleeps until its input is closed, then needs a moment."""
 
     def command(self):

@@ -334,4 +334,4 @@ def test_nothing_else_in_the_package_reaches_for_the_network():
             if isinstance(node, ast.ImportFrom) and node.module == "coliags_plugin.core.download":
                 assert path.name == "lpips_install.py"
     # The executor only asks whether the cluster that the user named answers, the viewer whether its own port is free.
-    assert users == {"core/download.py", "comparison/ray_executor.py", "export/viewer/serving.py"}
+    assert users == {"core/download.py", "execution/ray_executor.py", "export/viewer/serving.py"}

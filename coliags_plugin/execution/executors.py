@@ -1,4 +1,4 @@
-"""Executors: where the worker processes of a comparison run."""
+"""Executors: where worker processes run."""
 
 from __future__ import annotations
 
@@ -8,28 +8,15 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
-from coliags_plugin.comparison.tasks import Task, TaskOutcome, read_outcome
+from coliags_plugin.execution.tasks import Task, TaskOutcome, read_outcome
 
 #: For workers to save and end once they were asked to, seconds; then they are killed.
 STOPPING = 45.0
 _PAUSE = 0.1
-
-
-@dataclass(frozen=True)
-class ExecutionOptions:
-    """How a comparison is carried out."""
-
-    jobs: int | None = None  # runs at a time; None: one per CPU, or per GPU
-    threads: int | None = None  # CPU threads of each; None: the CPUs divided by the runs at a time
-    device: str = "auto"
-    executor: str = "local"
-    ray_address: str | None = None  # HOST:PORT of the head; None: RAY_ADDRESS, or the cluster of this machine
-    retries: int = 2  # how often a cell whose process died is tried again
-    save_seconds: float = 60.0  # largest time between two checkpoints of a run
 
 
 class Executor(ABC):
@@ -39,8 +26,8 @@ class Executor(ABC):
     threads: int  # CPU threads of each
 
     @abstractmethod
-    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        """Refuse a folder that tasks will not see or cannot write, and scenes that they will not see."""
+    def check(self, folder: Path, inputs: Sequence[Path]) -> None:
+        """Refuse a folder that tasks will not see or cannot write, and files and folders that they will not see."""
 
     @abstractmethod
     def start(self, task: Task) -> None:
@@ -67,7 +54,7 @@ class LocalExecutor(Executor):
         self._gpus = tuple(gpus)
         self._workers: dict[int, LocalWorker] = {}  # by slot
 
-    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+    def check(self, folder: Path, inputs: Sequence[Path]) -> None:
         """See :class:`Executor`; this machine always does."""
 
     def start(self, task: Task) -> None:
@@ -120,7 +107,7 @@ class LocalWorker:
                 stdout=subprocess.PIPE,
                 stderr=messages,
                 env=environment,
-                start_new_session=True,  # Ctrl-C reaches the comparison alone, which then asks its workers to stop
+                start_new_session=True,  # Ctrl-C reaches this process alone, which then asks its workers to stop
             )
 
     @property

@@ -1,7 +1,7 @@
 """Executor on a Ray cluster: plain Ray tasks, each of which starts the same worker process as on one machine.
 
-Ray's own retries are off: its retries when memory runs out have no end, and a comparison counts its own, whatever ends
-a worker. What a task has done is in its run folder, which all nodes must see.
+Ray's own retries are off: its retries when memory runs out have no end, and the queue counts its own, whatever ends a
+worker. What a task has done is in its folder, which all nodes must see.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin._version import __version__
-from coliags_plugin.comparison.executors import STOPPING, Executor, LocalWorker
-from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.execution.executors import STOPPING, Executor, LocalWorker
+from coliags_plugin.execution.tasks import Task, TaskOutcome
 
 log = logging.getLogger(__name__)
 
@@ -71,14 +71,14 @@ class RayExecutor(Executor):
         room = min(of_cpus, int(self._resource("GPU"))) if self._gpus else of_cpus
         return max(1, room if self._slots is None else min(room, self._slots))
 
-    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        """Have every node read and write in the folder, and see the scenes."""
+    def check(self, folder: Path, inputs: Sequence[Path]) -> None:
+        """Have every node read and write in the folder, and see the inputs."""
         token = uuid.uuid4().hex
         file = folder / f".storage-{token}"
         atomic_write(file, token)
         try:
             for node in self._nodes():
-                report = self._ask(node, file, scenes)
+                report = self._ask(node, file, inputs)
                 if report is not None:
                     _check_node(node, report, file, token)
         finally:
@@ -87,7 +87,7 @@ class RayExecutor(Executor):
 
     def start(self, task: Task) -> None:
         """See :class:`Executor`."""
-        self._tasks[self._work.remote(task.to_json())] = task
+        self._tasks[self._work.remote(task)] = task
 
     def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """See :class:`Executor`."""
@@ -129,13 +129,13 @@ class RayExecutor(Executor):
     def _nodes(self) -> list[Mapping[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
-    def _ask(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any] | None:
-        """What a node sees of a file and of scenes; None where it is gone meanwhile."""
+    def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> Mapping[str, Any] | None:
+        """What a node sees of a file and of inputs; None where it is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
         inspect = self._ray.remote(_inspect_node).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
-        question = inspect.remote(str(file), [str(path) for path in scenes])
+        question = inspect.remote(str(file), [str(path) for path in inputs])
         try:
             report: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
         except self._ray.exceptions.RayError as error:
@@ -186,14 +186,14 @@ def _check_node(node: Mapping[str, Any], report: Mapping[str, Any], file: Path, 
         )
     if report["missing"]:
         raise InputError(
-            f"{name} does not see the scenes {', '.join(report['missing'])}",
-            "scenes on storage that all machines share, under the same paths",
+            f"{name} does not see {', '.join(report['missing'])}",
+            "inputs on storage that all machines share, under the same paths",
             "Copy them there, or name their folder with --data",
         )
 
 
-def _inspect_node(file: str, scenes: Sequence[str]) -> dict[str, Any]:
-    """On a node: read a token, write it into a file beside it, and look for scenes."""
+def _inspect_node(file: str, inputs: Sequence[str]) -> dict[str, Any]:
+    """On a node: read a token, write it into a file beside it, and look for inputs."""
     import ray
 
     path, node = Path(file), ray.get_runtime_context().get_node_id()
@@ -203,13 +203,13 @@ def _inspect_node(file: str, scenes: Sequence[str]) -> dict[str, Any]:
         path.with_name(f"{path.name}-{node}").write_text(token, encoding="utf-8")
     except OSError as problem:
         error = problem.strerror or str(problem)
-    missing = [scene for scene in scenes if not Path(scene).is_dir()]
+    missing = [path for path in inputs if not Path(path).exists()]
     return {"version": __version__, "token": token, "error": error, "missing": missing}
 
 
-def _work(text: str) -> dict[str, Any]:
+def _work(task: Task) -> dict[str, Any]:
     """On a node: run a worker process to its end, or until the task is cancelled."""
-    worker = LocalWorker(Task.from_json(text))
+    worker = LocalWorker(task)
     try:
         while not worker.ended:
             time.sleep(_PAUSE)

@@ -6,9 +6,11 @@ import json
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
+
+from typing_extensions import Self
 
 #: How a worker ended. ``died``: without a word, killed or crashed; ``stopped``: asked to, with its state saved.
 Ending = Literal["done", "failed", "stopped", "died"]
@@ -17,43 +19,36 @@ Ending = Literal["done", "failed", "stopped", "died"]
 STOPPED = 130
 
 
-@dataclass(frozen=True)
-class Task:
-    """One cell, as a worker process is told of it."""
+def own_variables() -> dict[str, str]:
+    """Environment variables of this package."""
+    return {name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")}
 
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Work as a worker process is told of it; each kind of work has fields of its own."""
+
+    worker: ClassVar[str]  # module that is run
     title: str
-    name: str  # of the method, in tables
-    method: str  # name or path of the method config
-    overrides: tuple[str, ...]  # ``key.path=value`` changes of it
-    scene: str  # name of the scene, in tables
-    data: str
-    data_format: str | None
-    seed: int
+    key: str  # that no other task of the same queue has
     device: str
-    protocol: str
-    run: str
-    result: str  # where the results file goes
-    result_key: str  # key that the result must have
     log: str  # file of the worker's messages
-    threads: int  # CPU threads for a run that begins; one that goes on keeps its number
-    variables: Mapping[str, str] = field(default_factory=dict)  # this package's, for machines without them
-    save_seconds: float = 60.0  # largest time between two checkpoints
-    lock_seconds: float = 120.0  # how long to wait for another process that has the run
+    threads: int  # CPU threads for work that begins; what goes on may keep its number
+    variables: Mapping[str, str] = field(default_factory=own_variables)  # this package's, for machines without them
 
     def to_json(self) -> str:
         """As the argument of a worker."""
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str) -> Task:
-        """What :meth:`to_json` wrote."""
-        values = json.loads(text)
-        values["overrides"] = tuple(values["overrides"])
-        return cls(**{each.name: values[each.name] for each in fields(cls)})
+    def from_json(cls, text: str) -> Self:
+        """What :meth:`to_json` wrote, lists as tuples."""
+        values: Any = {name: tuple(each) if isinstance(each, list) else each for name, each in json.loads(text).items()}
+        return cls(**values)
 
     def command(self) -> list[str]:
         """Command line of the worker process."""
-        return [sys.executable, "-m", "coliags_plugin.comparison.worker", self.to_json()]
+        return [sys.executable, "-m", self.worker, self.to_json()]
 
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
         """Environment of the worker process: this package, and the number of threads of every library that asks."""

@@ -1,0 +1,157 @@
+"""A queue of jobs, each a task of a worker process: retries, failures, and a clean stop."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.progress import ProgressReport, log_console
+from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.tasks import Task, TaskOutcome
+
+log = logging.getLogger(__name__)
+
+Phase = Literal["waiting", "running", "done", "failed"]
+
+#: Between two reports of progress, seconds.
+POLL_INTERVAL_S = 1.0
+#: Between lines of progress besides those of the jobs, where there is neither a terminal nor a notebook, seconds.
+_PLAIN_LINE_EVERY_S = 60.0
+
+
+class Job(ABC):
+    """Work of a queue."""
+
+    key: str  # of its task, and of no other job
+    title: str  # what messages call it
+    size: int  # its share of the whole, in a unit of its queue
+
+    @abstractmethod
+    def task(self) -> Task:
+        """The task to start, with this job's key.
+
+        Raises:
+            InputError: It cannot be done.
+        """
+
+    @abstractmethod
+    def progress(self) -> int:
+        """How much of its size is over while it runs."""
+
+    @abstractmethod
+    def finish(self) -> Sequence[Job]:
+        """Take what the task has made; returns jobs that are now to be done.
+
+        Raises:
+            InputError: It is not what it should be.
+        """
+
+    @abstractmethod
+    def fail(self, reason: str, attempts: int) -> None:
+        """Record that it cannot be done."""
+
+
+class JobQueue:
+    """Jobs that are waiting or running, and how many have ended.
+
+    Args:
+        executor: Where tasks run.
+        retries: How often a task is tried again whose process died.
+        total: Size of all jobs together, those that are done before and those found later included.
+        done: Size of those done before.
+    """
+
+    def __init__(self, executor: Executor, retries: int, jobs: Sequence[Job], total: int, done: int = 0) -> None:
+        self._executor, self._retries, self._total, self._over = executor, retries, total, done
+        self._waiting, self._running = deque(jobs), dict[str, Job]()
+        self._attempts: Counter[str] = Counter()
+
+    def run(self, title: str, told: Callable[[], str]) -> None:
+        """Do all jobs; ``told`` are the facts beside the progress.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, or the system's request to end; all tasks have saved their state.
+        """
+        with (
+            _sigterm_as_interrupt(),
+            ProgressReport(title, self._total, self._done, _PLAIN_LINE_EVERY_S, log_console()) as progress,
+        ):
+            try:
+                while self._start_next():
+                    progress.update(self._done, told())
+                    for task, outcome in self._executor.wait(POLL_INTERVAL_S):
+                        self._take(self._running.pop(task.key), outcome)
+                progress.update(self._done, told())
+            except KeyboardInterrupt:
+                log.info("stopping: the state is saved; Ctrl-C again to stop at once")
+                raise
+            finally:
+                self._executor.stop()
+
+    @property
+    def running(self) -> Sequence[Job]:
+        """Jobs whose tasks run."""
+        return tuple(self._running.values())
+
+    @property
+    def _done(self) -> int:
+        """Size of what is over, of running jobs as far as they are."""
+        return self._over + sum(job.progress() for job in self._running.values())
+
+    def _start_next(self) -> bool:
+        """Start what can be started; whether there is anything left to wait for."""
+        while self._waiting and len(self._running) < self._executor.slots:
+            self._start(self._waiting.popleft())
+        return bool(self._running)
+
+    def _start(self, job: Job) -> None:
+        self._attempts[job.key] += 1
+        try:
+            self._executor.start(job.task())
+        except InputError as error:
+            self._fail(job, str(error))
+        except OSError as error:
+            self._fail(job, f"cannot be started: {error.strerror or error}")
+        else:
+            self._running[job.key] = job
+
+    def _take(self, job: Job, outcome: TaskOutcome) -> None:
+        """Take the result of a job whose worker has ended; retry or fail it, or take up what comes after it."""
+        reason, attempts = outcome.reason or outcome.ending, self._attempts[job.key]
+        if outcome.ending == "done":
+            try:
+                self._waiting.extendleft(reversed(job.finish()))
+                self._over += job.size
+            except InputError as error:
+                self._fail(job, str(error))
+        elif outcome.ending == "failed":
+            self._fail(job, outcome.reason)
+        elif attempts > self._retries:
+            self._fail(job, f"{reason}, {attempts} times")
+        else:
+            log.warning("%s: %s; trying again", job.title, reason)
+            self._waiting.appendleft(job)
+
+    def _fail(self, job: Job, reason: str) -> None:
+        self._over += job.size
+        job.fail(reason, self._attempts[job.key])
+
+
+@contextmanager
+def _sigterm_as_interrupt() -> Iterator[None]:
+    """Have the system's request to end (SIGTERM) do as Ctrl-C does."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
