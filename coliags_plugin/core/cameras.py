@@ -10,6 +10,7 @@ from torch import Tensor
 
 from coliags_plugin.core.intrinsics import NEAR_PLANE, Intrinsics
 from coliags_plugin.core.rotations import rotation_of_vector
+from coliags_plugin.core.transfers import constant, sent
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class Camera(Intrinsics):
     @property
     def intrinsics_matrix(self) -> Float[Tensor, "3 3"]:
         """K for pixel centres at integers + 0.5. [3, 3]"""
-        matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
-        return torch.tensor(matrix, dtype=self.camera_to_world.dtype, device=self.camera_to_world.device)
+        matrix = ((self.fx, 0.0, self.cx), (0.0, self.fy, self.cy), (0.0, 0.0, 1.0))
+        return constant(matrix, self.camera_to_world).clone()
 
     def rays(self) -> Float[Tensor, "H W 3"]:
         """World directions through the pixel centres, scaled to z-depth 1: the point at depth z is center + z * ray."""
@@ -96,7 +97,7 @@ class Camera(Intrinsics):
 
     def is_inside(self, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Which points, projected to columns and rows at z-depths, are in front of the camera and inside its image."""
-        inside = ((pixels >= 0) & (pixels < pixels.new_tensor([self.width, self.height]))).all(dim=-1)
+        inside = ((pixels >= 0) & (pixels < constant((self.width, self.height), pixels))).all(dim=-1)
         return inside & (depth > 0)
 
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
@@ -126,4 +127,5 @@ class Camera(Intrinsics):
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its pose on another device or of another dtype."""
-        return replace(self, camera_to_world=self.camera_to_world.to(device=device, dtype=dtype))
+        pose = self.camera_to_world if device is None else sent(self.camera_to_world, device)
+        return replace(self, camera_to_world=pose.to(dtype=dtype))

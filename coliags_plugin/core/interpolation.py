@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from coliags_plugin.core.transfers import constant
+
 
 def interpolated(
     values: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], pixels: Float[Tensor, "K 2"]
@@ -16,7 +18,7 @@ def interpolated(
     pixels may be NaN, and affect no value and no gradient; samples of unusable points mean nothing.
     """
     height, width = values.shape
-    size = pixels.new_tensor([width, height])
+    size = constant((width, height), pixels)
     inside = ((pixels >= 0) & (pixels <= size)).all(dim=1)
     # Pixel centres at integers from here on; the border is replicated.
     place = torch.minimum((torch.where(inside[:, None], pixels, 0.5) - 0.5).clamp_min(0.0), size - 1)

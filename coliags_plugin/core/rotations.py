@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -22,7 +24,13 @@ def rotation_of_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The rotation of a rotation vector (axis times angle, radians), smooth about zero. [3, 3]"""
     x, y, z = vector.unbind()
     zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    if vector.device.type == "cpu":
+        return torch.linalg.matrix_exp(cross)
+    # On CUDA the host would wait for that. Rodrigues' formula: the sinc is smooth, and the norm has gradient 0 at zero.
+    turns = vector.double().norm() / math.tau
+    once, half = torch.sinc(2.0 * turns).to(vector.dtype), torch.sinc(turns).to(vector.dtype)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + once * cross + 0.5 * half.square() * cross @ cross
 
 
 def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:

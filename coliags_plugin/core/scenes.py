@@ -15,6 +15,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.pixel_ids import pixel_ids
+from coliags_plugin.core.transfers import sent
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class SparseDepth:
 
     def to(self, device: torch.device | str) -> SparseDepth:
         """The same points on another device."""
-        return SparseDepth(self.pixels.to(device), self.depth.to(device))
+        return SparseDepth(sent(self.pixels, device), sent(self.depth, device))
 
 
 @dataclass(frozen=True)
@@ -186,10 +187,11 @@ class Frame(_MaskedImage):
 
     def to(self, device: torch.device | str) -> Frame:
         """The same frame on another device."""
-        names = ("image", "camera", "depth", "mask", "seen", "depth_at_least", "sparse_depth", "depth_confidence")
-        values = {name: getattr(self, name) for name in names}
-        moved: dict[str, Any] = {name: value if value is None else value.to(device) for name, value in values.items()}
-        return Frame(self.name, self.index, **moved)
+        names = ("image", "depth", "mask", "seen", "depth_at_least", "depth_confidence")
+        moved: dict[str, Any] = {name: getattr(self, name) for name in names}
+        moved = {name: values if values is None else sent(values, device) for name, values in moved.items()}
+        sparse = None if self.sparse_depth is None else self.sparse_depth.to(device)
+        return Frame(self.name, self.index, camera=self.camera.to(device), sparse_depth=sparse, **moved)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from coliags_plugin.core.masked import masked_mean, zero_outside
 from coliags_plugin.core.tables import fit_kernels, tables
+from coliags_plugin.core.transfers import constant
 
 SIGMA = 1.5
 #: Half width of the window, pixels.
@@ -135,7 +136,7 @@ def _blur_by_kornia(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
     """Blur by kornia's separable filter, on any device."""
     from kornia.filters import filter2d_separable
 
-    weights = _window().to(images)[None]
+    weights = constant(tuple(_window().tolist()), images)[None]
     blurred: Tensor = filter2d_separable(images.permute(2, 0, 1)[None], weights, weights, border_type="constant")
     return blurred[0].permute(1, 2, 0)
 

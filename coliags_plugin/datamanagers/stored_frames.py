@@ -105,14 +105,8 @@ class StoredFrame(Frame):
             "depth_at_least": self._bound(pixels.depth),
             "depth_confidence": _share(pixels.confidence),
         }
-        return Frame(
-            self.name,
-            self.index,
-            torch.from_numpy(pixels.image).to(device),
-            self.camera.to(device),
-            sparse_depth=None if self.sparse_depth is None else self.sparse_depth.to(device),
-            **{name: None if tensor is None else tensor.to(device) for name, tensor in tensors.items()},
-        )
+        image = torch.from_numpy(pixels.image)
+        return Frame(self.name, self.index, image, self.camera, sparse_depth=self.sparse_depth, **tensors).to(device)
 
     def __repr__(self) -> str:
         return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"

@@ -22,6 +22,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
+from coliags_plugin.core.transfers import sent
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
@@ -214,9 +215,10 @@ class Trainer:
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
+            pixels = None if draw.pixels is None else sent(draw.pixels, self.device)
             generator = self.generators["rendering"]
-            views.append((view, self.model.render_stages(frame.camera, self.wants, view, draw.pixels, generator)))
-            targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
+            views.append((view, self.model.render_stages(frame.camera, self.wants, view, pixels, generator)))
+            targets.append(frame.target if pixels is None else frame.target_at(pixels))
         output = concatenate_pixels([stages[-1] for _, stages in views])
         return output, concatenate_targets(targets), views
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -40,6 +40,8 @@ class ExplicitField(GaussianField[ExplicitT]):
     elements: ClassVar[str] = "gaussians"
     #: Parameter groups, each with one row per Gaussian; named as in gsplat.
     row_parameters: ClassVar[tuple[str, ...]] = ("means", "scales", "quats", "opacities")
+    #: Buffers that the host reads at every step: they stay on the CPU.
+    host_buffers: ClassVar[tuple[str, ...]] = ()
     #: Trained scales of a Gaussian.
     scale_count: ClassVar[int] = 3
 
@@ -104,6 +106,15 @@ class ExplicitField(GaussianField[ExplicitT]):
         return None if self.references is None else (self.normals(), self.references.of_rows)
 
     @torch.no_grad()
-    def _visible(self, camera: Camera) -> Tensor:
+    def _in_view(self, camera: Camera) -> Bool[Tensor, "N"]:
+        """Which Gaussians may overlap the image."""
         reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
-        return spheres_in_frustum(self.means, reach, camera).nonzero().squeeze(1)
+        return spheres_in_frustum(self.means, reach, camera)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Self:
+        """Move or convert all but ``host_buffers``."""
+        kept = {name: self.get_buffer(name) for name in self.host_buffers}
+        super()._apply(*args, **kwargs)  # type: ignore[no-untyped-call]
+        for name, value in kept.items():
+            setattr(self, name, value)
+        return self

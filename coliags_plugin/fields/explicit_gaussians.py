@@ -39,6 +39,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     Settings: ClassVar[type[Settings]] = ExplicitGaussiansSettings
     primitive: ClassVar[str] = "gaussians3d"
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "sh0", "shN")
+    host_buffers: ClassVar[tuple[str, ...]] = ("degree",)
 
     degree: Tensor
 
@@ -66,7 +67,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians in the camera's view with their colours from there."""
         camera = camera.to(self.means.device, self.means.dtype)
-        visible = self._visible(camera)
+        visible = self._in_view(camera).nonzero().squeeze(1)
         means, scales, quats, opacities = (
             unique_rows(self.get_parameter(name), visible) for name in ExplicitField.row_parameters
         )

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.transfers import constant
 
 #: A Gaussian of opacity one is drawn up to alpha = 1/255, at sqrt(2 ln 255) standard deviations.
 DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
@@ -19,7 +20,7 @@ def frustum_planes(camera: Camera) -> Float[Tensor, "5 3"]:
     # Each side plane goes through one image border; f and the distance of the border from the principal point are the
     # components of its normal up to length.
     sides = ((fx, 0, cx), (-fx, 0, camera.width - cx), (0, fy, cy), (0, -fy, camera.height - cy))
-    local = camera.camera_to_world.new_tensor([(0, 0, 1), *sides])
+    local = constant(((0, 0, 1), *sides), camera.camera_to_world)
     return nn.functional.normalize(local, dim=1) @ camera.camera_to_world[:3, :3].T
 
 

@@ -20,6 +20,7 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import sent
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.diffuse_network import DiffuseNetwork
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
@@ -84,6 +85,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
     Settings: ClassVar[type[Settings]] = LitGaussiansSettings
     primitive: ClassVar[str] = "gaussians3d"
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")
+    host_buffers: ClassVar[tuple[str, ...]] = ("network_on",)
     scale_count: ClassVar[int] = 2
 
     extent: Tensor
@@ -167,8 +169,8 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
 
     def _gaussians(self, camera: Camera, generator: torch.Generator | None, held: HeldLight | None = None) -> Gaussians:
         camera = camera.to(self.means.device, self.means.dtype)
-        visible = self._visible(camera)
-        visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
+        bright = self.opacities.detach().sigmoid() >= MIN_OPACITY
+        visible = (self._in_view(camera) & bright).nonzero().squeeze(1)
         means, log_scales, quats, logits, albedos, roughness, f0 = (
             unique_rows(self.get_parameter(name), visible) for name in self.row_parameters
         )
@@ -236,7 +238,8 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         if not self.network_on:
             return torch.ones_like(albedos)
         if generator is not None and self.settings.input_noise > 0:
-            noise = self.settings.input_noise * torch.randn(len(albedos), 7, generator=generator).to(albedos)
+            drawn = sent(torch.randn(len(albedos), 7, generator=generator), albedos.device)
+            noise = self.settings.input_noise * drawn.to(albedos.dtype)
             distances = distances + noise[:, :1]
             normals = nn.functional.normalize(normals + noise[:, 1:4], dim=1)
             lamps = nn.functional.normalize(lamps + noise[:, 4:], dim=1)

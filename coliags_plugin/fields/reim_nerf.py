@@ -21,6 +21,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import sent
 from coliags_plugin.fields.mlp import cosine_embedding, first_layer, glorot_linear
 from coliags_plugin.fields.normalisation import SceneNormalisation, surface_distances
 from coliags_plugin.fields.precision import Precision, reduced_dtype
@@ -161,7 +162,8 @@ class _NetworkLevel(RadianceLevel):
         raw = network.raw_density(hidden, rays)
         strength = network.settings.density_noise
         if generator is not None and strength > 0:
-            raw = raw + strength * torch.randn(raw.shape, generator=generator, dtype=raw.dtype).to(raw.device)
+            noise = torch.randn(raw.shape, generator=generator, dtype=raw.dtype)
+            raw = raw + strength * sent(noise, raw.device)
         return raw.relu() / normalisation.unit
 
 

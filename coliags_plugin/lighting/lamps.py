@@ -15,6 +15,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import constant
 
 #: Shortest distance to a lamp, scene units.
 _MIN_DISTANCE = 1e-6
@@ -44,7 +45,7 @@ class Lamp(Settings):
 
     def position(self, camera: Camera) -> Float[Tensor, "3"]:
         """Position of the lamp in the world, scene units."""
-        return camera.center + camera.camera_to_world[:3, :3] @ camera.camera_to_world.new_tensor(self.offset)
+        return camera.center + camera.camera_to_world[:3, :3] @ constant(self.offset, camera.camera_to_world)
 
     def axis(self, camera: Camera) -> Float[Tensor, "3"]:
         """Axis of the lamp, the direction of most light, as a unit vector in the world.
@@ -54,7 +55,7 @@ class Lamp(Settings):
         """
         up, right = (math.radians(angle) for angle in self.turn)
         local = (math.sin(right) * math.cos(up), -math.sin(up), math.cos(right) * math.cos(up))
-        return camera.camera_to_world[:3, :3] @ camera.camera_to_world.new_tensor(local)
+        return camera.camera_to_world[:3, :3] @ constant(local, camera.camera_to_world)
 
     def spread(self, directions: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N"]:
         """Share of its light that goes in each direction, a unit vector in the world frame, intensity included."""

@@ -100,10 +100,10 @@ def wall_weights(
     inside = valid.to(error.dtype)[None, None]
     near, counted = (functional.avg_pool2d(values, 5, 1, 2) for values in (error * inside, inside))
     smooth = (near / counted.clamp_min(1e-6))[0, 0]
-    if not valid.any():
-        return torch.ones_like(smooth)
-    limit = outliers * smooth[valid].median().clamp_min(1.0 / 255.0)
-    return (limit / smooth.clamp_min(1e-6)).clamp_max(1.0).square()
+    # NaN, where no pixel is valid.
+    median = torch.where(valid, smooth, torch.nan).flatten().nanmedian(0).values
+    limit = outliers * median.clamp_min(1.0 / 255.0)
+    return torch.where(valid.any(), (limit / smooth.clamp_min(1e-6)).clamp_max(1.0).square(), 1.0)
 
 
 def _difference(rgb: Float[Tensor, "H W 3"], target: Target) -> Float[Tensor, "H W 3"]:

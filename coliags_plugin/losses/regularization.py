@@ -14,6 +14,7 @@ from coliags_plugin.contracts import GainModule, Loss, LossSettings, TrainedMode
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.transfers import constant
 
 
 class OpacityLoss(Loss):
@@ -115,7 +116,7 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
         log_gains = module.log_gains()
         if len(log_gains) < 3:
             return log_gains.sum() * 0.0
-        gaps = log_gains.new_tensor(module.times).diff().clamp_min(1.0)[:, None]
+        gaps = constant(tuple(module.times), log_gains).diff().clamp_min(1.0)[:, None]
         slopes = log_gains.diff(dim=0) / gaps
         return slopes.diff(dim=0).square().mean()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from coliags_plugin.core.scenes import Scene
@@ -35,13 +35,17 @@ class Metering(nn.Module):
         self.register_buffer("brightness", torch.zeros(len(frames)))
 
     @cached_property
-    def _valid(self) -> Bool[Tensor, "H W"] | None:
-        """Where all training frames are valid; None where that is everywhere, nowhere, or their sizes differ."""
+    def _common(self) -> tuple[torch.Size, Int[Tensor, "P"]] | None:
+        """Size of the training frames, and which pixels, row by row, are valid in all of them.
+
+        None where these are all or none, or the sizes differ. The pixels are on the device of ``brightness``.
+        """
         masks = [frame.mask.cpu() for frame in self._scene.train if frame.mask is not None]
         if not masks or any(mask.shape != masks[0].shape for mask in masks):
             return None
         common = torch.stack(masks).all(0)
-        return common if common.any() else None
+        pixels = common.flatten().nonzero().squeeze(1)
+        return (common.shape, pixels.to(self.brightness.device)) if len(pixels) else None
 
     @torch.no_grad()
     def remember(self, row: int, rgb: Float[Tensor, "H W 3"]) -> None:
@@ -50,8 +54,9 @@ class Metering(nn.Module):
 
     def _measure(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """Mean colour over the pixels that are valid in every training frame."""
-        valid = self._valid
-        colors = rgb if valid is None or valid.shape != rgb.shape[:2] else rgb[valid.to(rgb.device)]
+        colors, common = rgb, self._common
+        if common is not None and common[0] == rgb.shape[:2]:
+            colors = rgb.reshape(-1, 3).index_select(0, common[1].to(rgb.device))
         return colors.mean().clamp_min(_DARKEST)
 
     def correction(

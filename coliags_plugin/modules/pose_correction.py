@@ -15,6 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import constant
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Approximate number of scene points that the median depth is computed from.
@@ -93,7 +94,7 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
         0 for the ``fixed`` frames; without any, they are zero on average.
         """
         if self._fixed:
-            free = self.rotation.new_tensor([[row not in self._fixed] for row in range(len(self.frames))])
+            free = constant(tuple((row not in self._fixed,) for row in range(len(self.frames))), self.rotation)
             return self.rotation * free, self.translation * free
         return self.rotation - self.rotation.mean(0), self.translation - self.translation.mean(0)
 
@@ -108,5 +109,5 @@ def _median_depth(camera: Camera, scene: Scene) -> float:
     """Median z-depth of some of the scene's points in view, scene units; 0 where none is."""
     points = scene.points.positions[:: max(1, len(scene.points) // _DEPTH_POINTS)]
     pixels, depths = camera.project(points.to(camera.camera_to_world))
-    inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([camera.width, camera.height]))).all(dim=1) & (depths > 0)
+    inside = ((pixels >= 0) & (pixels <= constant((camera.width, camera.height), pixels))).all(dim=1) & (depths > 0)
     return float(depths[inside].median()) if inside.any() else 0.0

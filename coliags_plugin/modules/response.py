@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import ClassVar
 
@@ -16,6 +17,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import constant
 
 #: Brightest colour, relative to full scale, up to which the slope changes; glints and near walls lie beyond 1.
 _TOP = 1.5
@@ -67,8 +69,13 @@ class CameraResponse(ResponseModule[ResponseSettings]):
         knee, segments = self.settings.knee, self.settings.segments
         length = (_TOP - knee) / segments
         slopes = self.log_slope.exp().clamp(_LEAST_SLOPE, 1.0 / _LEAST_SLOPE)
-        starts = torch.cat([slopes.new_tensor([knee]), (knee + length * slopes.cumsum(0))[:-1]])
         flat = colors.reshape(-1)
+        if flat.device.type != "cpu":  # what lies in each segment, without a list of which colours are bright
+            lengths = constant((*[length] * (segments - 1), math.inf), flat)
+            edges = constant(tuple(knee + length * index for index in range(segments)), flat)
+            within = (flat[:, None] - edges).relu().clamp(max=lengths)
+            return torch.where(flat > knee, knee + within @ slopes, flat).view_as(colors)
+        starts = torch.cat([slopes.new_tensor([knee]), (knee + length * slopes.cumsum(0))[:-1]])
         bent = (flat > knee).nonzero().squeeze(1)
         bright = flat.index_select(0, bent)
         with torch.no_grad():

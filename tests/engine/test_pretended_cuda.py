@@ -1,33 +1,89 @@
 """Training on a CUDA device that is not there: nothing meets on two devices, and nothing waits unseen."""
 
 import shutil
-from importlib.util import find_spec
+from collections import Counter
+from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
 
 import coliags_plugin as cp
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.renderers import torch_renderer
 from tests.pretended_cuda import CUDA, MixedDevicesError, PretendedCuda
+from tests.renderers.test_torch_renderer import INPUTS, cast, scene
 from tests.scenes import SMALL, wall_scene, write_wall
 
 #: What runs on the device in training, without renderers: rivals and modules beyond those of `coliags`.
 METHODS = ("3dgs-depth", "2dgs", "gaussian-pancakes", "pr-endo", "scaffold-gs", "reim-nerf-small", "coliags-plus")
-#: Waits of a step of `coliags` that are not the torch renderer's: the log's, and the lengths of lists.
-WAITS = {"tolist engine/trainer.py", "tolist fields/triton_kernels/children.py"}
+#: Waits of a step that are not the renderers': for losses and checks, and for the lengths of the lists of elements in
+#: view and of those drawn.
+WAITS = Counter(
+    {
+        "tolist engine/trainer.py": 1,
+        "tolist fields/triton_kernels/children.py": 1,
+        "nonzero fields/explicit_gaussians.py": 1,
+        "nonzero fields/lit_gaussians.py": 1,
+    }
+)
+#: Methods and options whose steps are counted: every component that steps use is in one of them.
+STEPS = {
+    "coliags": ("losses.l1.outliers=3", "losses.l1.outliers_from=0"),
+    "coliags-in-vivo": ("modules.poses.fixed=['0001']",),
+    "coliags-plus-sparse-depth": (),
+    "2dgs": (),
+    "3dgs-depth": (),
+    "coliags-fast": (),
+    "gaussian-pancakes": (),
+    "pr-endo": ("field.network_from=0",),
+    "reim-nerf-small": ("field.width=16", "sampler.pixels=64"),
+    "scaffold-gs-distance": (),
+}
+QUICK = ("coliags", "coliags-in-vivo", "pr-endo")
 
 
-def make_trainer(path, method, steps=4):
-    options = [f"schedule.steps={steps}", f"schedule.written_for={steps}", "schedule.checkpoint_every=2"]
+def make_trainer(path, method, steps=4, more=(), scene=None):
+    options = [f"schedule.steps={steps}", f"schedule.written_for={steps}", "schedule.checkpoint_every=2", *more]
     if not method.startswith("reim"):
-        options.append("renderer=torch")
+        options.insert(0, "renderer=torch")
     if load_method(method).config.field.name == "anchors":
-        options += [*SMALL, "field.voxel_size=5.0"]  # few anchors: their kernels are interpreted
-    return Trainer(load_method(method, options), wall_scene(), "wall", RunFolder(path), 0, CUDA)
+        options = [*SMALL, "field.voxel_size=5.0", *options]  # few anchors: their kernels are interpreted
+    return Trainer(load_method(method, options), scene or wall_scene(), "wall", RunFolder(path), 0, CUDA)
+
+
+def waits_of_a_step(path, method, *options):
+    """How often a step in the middle of a run waits, by what for and file."""
+    with PretendedCuda() as device:
+        trainer = make_trainer(path, method, 40, options, rich_scene())
+        trainer.step = 20
+        for _ in range(2):
+            device.waits.clear()
+            trainer.take_step()
+    found = Counter()
+    for place, count in device.waits.items():
+        found[place.rsplit(":", 1)[0]] += count
+    return found
+
+
+def rich_scene(width=16, height=12):
+    """The wall with everything that a frame can have."""
+
+    def enriched(frame):
+        mask = torch.ones(frame.image.shape[:2], dtype=torch.bool)
+        mask[:5, :4] = False
+        points = SparseDepth(torch.tensor([[10.5, 10.5], [12.2, 5.1]]), torch.tensor([19.0, 19.0]))
+        return replace(frame, mask=mask, sparse_depth=points, depth_confidence=torch.ones(mask.shape))
+
+    scene = wall_scene(width=width, height=height)
+    tests = {name: [enriched(frame) for frame in frames] for name, frames in scene.test_sets.items()}
+    points = PointCloud(scene.points.positions, torch.full((len(scene.points), 3), 128, dtype=torch.uint8))
+    return replace(scene, train=[enriched(frame) for frame in scene.train], test_sets=tests, points=points)
 
 
 def test_operands_on_two_devices_are_refused():
@@ -42,6 +98,81 @@ def test_operands_on_two_devices_are_refused():
         torch.testing.assert_close(there.cpu() + here, torch.full((3,), 2.0))
 
 
+def test_what_cuda_refuses_is_refused():
+    with PretendedCuda():
+        there, here = torch.ones(3, device="cuda"), torch.ones(3)
+        number, index = torch.tensor(2.0), torch.tensor([0, 2])
+        assert (there * number).is_cuda and there[index].is_cuda  # a number and an index of the host are allowed
+        there[torch.tensor([1])] = number
+        generator = torch.Generator()
+        for wrong in (
+            lambda: torch.stack([there[0], number]),
+            lambda: here[index.to("cuda")],
+            lambda: there.index_put_((index,), here[:2]),
+            lambda: torch.rand(3, device="cuda", generator=generator),
+            lambda: there.normal_(generator=generator),
+            lambda: torch.nn.functional.normalize(there, dim=0) + here,
+        ):
+            with pytest.raises(MixedDevicesError):
+                wrong()
+        whole = torch.ones(2, 2, dtype=torch.int64, device="cuda")
+        with pytest.raises(NotImplementedError):
+            whole @ whole
+
+
+def test_kernels_are_given_tensors_of_the_device_alone():
+    pytest.importorskip("triton")
+    from coliags_plugin.renderers.triton_renderer import render_gaussians
+
+    here, camera = scene("random")
+    here = cast(here, torch.float32)
+    expected = torch_renderer.render_gaussians(here, camera).rgb
+    with PretendedCuda():
+        there = replace(here, **{name: getattr(here, name).to("cuda") for name in (*INPUTS, "source_index")})
+        drawn = render_gaussians(there, camera).rgb
+        assert drawn.is_cuda
+        torch.testing.assert_close(drawn.cpu(), expected, atol=1e-5, rtol=1e-5)
+        with pytest.raises(MixedDevicesError, match=r"argument \w+ of kernel"):
+            render_gaussians(here, camera)
+
+
+@pytest.mark.parametrize(
+    ("waits", "act"),
+    [
+        (1, lambda there, here: there.item()),
+        (1, lambda there, here: bool(there)),
+        (1, lambda there, here: there.cpu()),
+        (1, lambda there, here: here.to("cuda")),
+        (1, lambda there, here: here.to("cuda", non_blocking=True)),  # pageable memory
+        (0, lambda there, here: here.pin_memory().to("cuda", non_blocking=True)),
+        (1, lambda there, here: here.pin_memory().to("cuda")),
+        (0, lambda there, here: here.to("cpu")),
+        (1, lambda there, here: torch.tensor([1.0], device="cuda")),
+        (1, lambda there, here: there.new_tensor([1.0])),
+        (0, lambda there, here: there.new_full((3,), 1.0)),
+        (0, lambda there, here: torch.arange(3, device="cuda")),
+        (1, lambda there, here: there.copy_(here)),
+        (1, lambda there, here: torch.arange(3, device="cuda")[torch.tensor([0])]),
+        (1, lambda there, here: there[there > 0]),
+        (1, lambda there, here: there.masked_select(there > 0)),
+        (0, lambda there, here: torch.where(there > 0, there, 0.0)),
+        (0, lambda there, here: there.masked_fill_(there > 0, 0.0)),
+        (0, lambda there, here: there.__setitem__(there > 0, 0.0)),
+        (1, lambda there, here: there.__setitem__(there > 0, there)),
+        (1, lambda there, here: torch.equal(there, there)),
+        (1, lambda there, here: torch.repeat_interleave(there.long())),
+        (0, lambda there, here: torch.repeat_interleave(there.long(), output_size=1)),
+        (1, lambda there, here: torch.cuda.synchronize()),
+    ],
+)
+def test_waits_of_the_host_are_counted(waits, act):
+    with PretendedCuda() as device:
+        there, here = torch.ones(1, device="cuda"), torch.ones(1)
+        device.waits.clear()
+        act(there, here)
+    assert device.waits.total() == waits
+
+
 def test_gradients_cross_devices_and_stay_on_theirs():
     with PretendedCuda():
         here = torch.ones(3, requires_grad=True)
@@ -54,12 +185,10 @@ def test_gradients_cross_devices_and_stay_on_theirs():
 
 @pytest.mark.parametrize("method", ["coliags", *(pytest.param(name, marks=pytest.mark.thorough) for name in METHODS)])
 def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
-    with PretendedCuda() as device:
+    with PretendedCuda():
         trainer = make_trainer(tmp_path / "run", method)
         trainer.start()
-        device.waits.clear()
         trainer.train()
-        waits = {place.rsplit(":", 1)[0] for place in device.waits}
         scorer = Scorer("paper", only=("psnr",))
         compared = scorer.compare(trainer.model, trainer.scene.test_sets["test"][0], CUDA)
         assert scorer.score(compared).values["psnr"] > 0
@@ -71,8 +200,6 @@ def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
         again.train()
     second = read_checkpoint(latest_checkpoint(again.run.checkpoints), method, torch.device("cpu"))
     assert all(torch.equal(tensor, second.tensors[name]) for name, tensor in first.tensors.items())
-    if method == "coliags" and find_spec("triton") is not None:
-        assert {place for place in waits if "renderers/" not in place and "checkpoints" not in place} <= WAITS
 
 
 def test_a_loaded_run_launches_on_its_own_device(tmp_path):
@@ -84,3 +211,23 @@ def test_a_loaded_run_launches_on_its_own_device(tmp_path):
         for _ in range(2):  # another run may have made its own device the current one in between
             assert run.load().device == CUDA
     assert device.made_current == [CUDA, CUDA]
+
+
+@pytest.mark.parametrize(
+    "method", [pytest.param(name, marks=() if name in QUICK else pytest.mark.thorough) for name in STEPS]
+)
+def test_a_step_waits_for_its_losses_and_for_lists_only(method, tmp_path):
+    pytest.importorskip("triton")  # without it, anchors are decoded by PyTorch, with more lists
+    # The device has no room for the frames: they are sent at every step.
+    with mock.patch.object(torch.cuda, "mem_get_info", lambda *_: (0, 0)):
+        found = waits_of_a_step(tmp_path / "run", method, *STEPS[method])
+    found = Counter({place: count for place, count in found.items() if "renderers/" not in place})
+    assert found <= WAITS and found["tolist engine/trainer.py"] == 1
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", ["coliags", "2dgs"])
+def test_triton_kernels_wait_for_the_number_of_pairs_besides(method, tmp_path):
+    pytest.importorskip("triton")
+    found = waits_of_a_step(tmp_path / "run", method, "renderer=triton")
+    assert found <= WAITS + Counter({"local_scalar_dense renderers/triton_kernels/placing.py": 1})

@@ -225,7 +225,7 @@ def test_parameters_return_from_beyond_their_bounds_with_a_gradient():
         field.albedos.fill_(-0.1)
         field.scales.fill_(9.0)
         field.lamp_parameters[1] = -1.0
-    field._visible = lambda camera: torch.arange(len(field.means))
+    field._in_view = lambda camera: torch.ones(len(field.means), dtype=torch.bool)
     drawn = field.gaussians(camera)
     assert drawn.features["f0"].max().item() == pytest.approx(0.035)
     assert drawn.features["roughness"].max().item() == pytest.approx(0.7)

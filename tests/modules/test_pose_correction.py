@@ -16,6 +16,7 @@ from coliags_plugin.core.scenes import PointCloud, Scene, View
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.modules.pose_correction import PoseCorrection, PoseCorrectionSettings
+from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 from tests.textured_tube import tube_frames
 
@@ -36,11 +37,22 @@ METHOD = (
 )
 
 
-def test_rotation_of_vector_is_scipys():
-    vectors = 3.0 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    for vector in (*vectors, torch.zeros(3, dtype=torch.float64)):
+def test_rotation_of_vector_is_scipys_and_alike_on_every_device():
+    generator = torch.Generator().manual_seed(0)
+    vectors = 3.0 * torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    weights = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    for vector in (*vectors, 1e-4 * vectors[0], 1e-30 * vectors[0], torch.zeros(3, dtype=torch.float64)):
         expected = torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
         torch.testing.assert_close(rotation_of_vector(vector), expected)
+        gradients = []
+        for device in ("cpu", "cuda"):
+            with PretendedCuda():
+                seen = vector.clone().to(device).requires_grad_()
+                turned = rotation_of_vector(seen)
+                (turned * weights.to(device)).sum().backward()
+                torch.testing.assert_close(turned.detach().cpu(), expected)
+                gradients.append(seen.grad.cpu())
+        torch.testing.assert_close(*gradients)
 
 
 def make(frames=9, **options):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
 from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.modules.response import CameraResponse, ResponseSettings
+from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 
 
@@ -36,6 +39,23 @@ def test_it_is_numpys_interpolation_of_its_points():
     expected = np.interp(asked, [0.0, *colors], [0.0, *values])
     np.testing.assert_allclose(module.curve(asked).detach(), expected, atol=1e-6)
     assert module.curve(torch.tensor(2.5)).item() == pytest.approx(values[-1] + np.exp(-0.5), abs=1e-6)  # goes on
+
+
+def test_the_curve_of_a_device_is_that_of_the_cpu():
+    module = make(knee=0.4, segments=5)
+    with torch.no_grad():
+        module.log_slope.copy_(torch.tensor([0.3, -1.0, -3.0, 1.0, -0.5]))
+    colors, weights = torch.linspace(-0.1, 2.0, 200), torch.rand(200)
+    results = []
+    for device in ("cpu", "cuda"):
+        with PretendedCuda():
+            seen = colors.clone().to(device).requires_grad_()
+            there = copy.deepcopy(module).to(device)
+            values = there.curve(seen)
+            (values * weights.to(device)).sum().backward()
+            results.append([values.detach().cpu(), seen.grad.cpu(), there.log_slope.grad.cpu()])
+    for of_cpu, of_device in zip(*results, strict=True):
+        torch.testing.assert_close(of_device, of_cpu, atol=2e-6, rtol=2e-6)
 
 
 def test_colours_that_are_not_finite_stay_so():
