@@ -19,6 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import shortest_axes
+from coliags_plugin.core.transfers import constant
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.checks import check_device, check_float32, check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.projection import facing
@@ -76,7 +77,7 @@ def render_with_gsplat(
         raise InputError("surfels for the gsplat renderer", "3D Gaussians", "Choose renderer 'torch'")
     needs = {"depth_accumulated" if name == "depth_expected" else name for name in wants} - {"rgb", "alpha"}
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
-    # gsplat 1.5 divides by the number of Gaussians, which crashes the process if there are none.
+    # gsplat 1.5.3 divides by the number of Gaussians, which crashes the process if there are none.
     draw = _draw_nothing if len(gaussians) == 0 else _draw_gaussians
     return draw(gaussians, camera, needs, settings).output(gaussians, camera, wants)
 
@@ -113,7 +114,7 @@ def _draw_gaussians(
         parts["normals"] = _facing_normals(gaussians, sight, camera)
     parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
     features = torch.cat(list(parts.values()), dim=-1)
-    backgrounds = features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
+    backgrounds = constant(((*settings.background, *[0.0] * (features.shape[-1] - 3)),), features)
     image, alpha = library.rasterize_to_pixels(
         means2d[None],
         conics,
@@ -144,7 +145,7 @@ def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], setting
     maps = {name: alpha[..., None].expand(-1, -1, widths[name]) if name in widths else alpha for name in needs}
     if "depth_median" in maps:
         maps["depth_median"] = alpha.detach()
-    rgb = alpha[..., None] + alpha.new_tensor(settings.background)
+    rgb = alpha[..., None] + constant(settings.background, alpha)
     return DrawnView(rgb, alpha, maps, means2d, gaussians.opacities.detach())
 
 
