@@ -12,14 +12,16 @@ from torch.autograd.function import once_differentiable
 from coliags_plugin.contracts import HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS, frustum_planes
+from coliags_plugin.fields.frustum import DRAWN_SIGMAS
 from coliags_plugin.fields.triton_kernels import decoding
 from coliags_plugin.fields.triton_kernels.networks import OUTPUTS, ROWS, Network
 
 #: Programs of the backward pass, and slabs in which each adds up gradients of the networks: about two for each
 #: multiprocessor of current GPUs, but as many on all of them, so that sums have one order.
 SLABS = 256
-_OPTIONS = {"num_warps": 8, "num_stages": 1, "enable_fp_fusion": True}
+#: How kernels are compiled. Two programs of the backward pass share a multiprocessor's registers.
+OPTIONS = {"num_warps": 8, "num_stages": 1, "enable_fp_fusion": True}
+BACKWARD_OPTIONS = {**OPTIONS, "num_warps": 4}
 
 
 def visible_children(
@@ -65,11 +67,12 @@ class _Decode(torch.autograd.Function):
         counts = torch.zeros(2, tiles + 1, dtype=torch.int32, device=positions.device)
         decoding.decode_opacities[(tiles,)](
             *(positions, offsets, scalings, features, of_geometry, table),
-            *(camera.center.contiguous(), frustum_planes(camera).contiguous(), visible, opacities, counts),
-            *(anchors, tiles, camera.near_plane, DRAWN_SIGMAS),
+            *(camera.camera_to_world.contiguous(), visible, opacities, counts),
+            *(anchors, tiles, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
+            *(camera.near_plane, DRAWN_SIGMAS),
             NETWORK=opacity,
             SLOTS=block_of(children),
-            **_OPTIONS,
+            **OPTIONS,
         )
         starts = counts.cumsum(1)
         seen, count = starts[:, -1].tolist()
@@ -83,7 +86,7 @@ class _Decode(torch.autograd.Function):
             COVARIANCE=covariance,
             COLOR=color,
             SLOTS=block_of(children),
-            **_OPTIONS,
+            **OPTIONS,
         )
         ctx.save_for_backward(*tables[1:], visible, opacities, starts, quats, inverse_lengths, scales, colors)
         ctx.networks = networks
@@ -105,24 +108,28 @@ class _Decode(torch.autograd.Function):
             *(of_offsets, of_scalings, of_outputs, anchors, tiles),
             CHILDREN=children,
             SLOTS=block_of(children),
-            **_OPTIONS,
+            **OPTIONS,
         )
-        of_features, *of_inputs = (torch.zeros_like(values) for values in (features, of_geometry, of_appearance))
+        of_features = torch.zeros_like(features)
+        wanted = ctx.needs_input_grad[6:8]
+        of_inputs = [
+            torch.zeros_like(inputs) if want else None
+            for inputs, want in zip((of_geometry, of_appearance), wanted, strict=True)
+        ]
         programs = min(SLABS, tiles)
         sums = table.new_zeros(programs, len(table))
-        with_geometry, with_appearance = ctx.needs_input_grad[6:8]
         decoding.networks_backward[(programs,)](
             *(features, of_geometry, of_appearance, table, visible, opacities, starts, of_outputs),
-            *(of_features, *of_inputs, sums, anchors, tiles),
+            *(of_features, *(sums if found is None else found for found in of_inputs), sums, anchors, tiles),
             OPACITY=opacity,
             COVARIANCE=covariance,
             COLOR=color,
             LENGTH=len(table),
-            WITH_GEOMETRY=with_geometry,
-            WITH_APPEARANCE=with_appearance,
+            WITH_GEOMETRY=wanted[0],
+            WITH_APPEARANCE=wanted[1],
             SLOTS=block_of(children),
             INPUTS=block_of(max(of_geometry.shape[1], of_appearance.shape[1])),
-            **_OPTIONS,
+            **BACKWARD_OPTIONS,
         )
         return None, None, None, of_offsets, of_scalings, of_features, *of_inputs, sums.sum(0)
 

@@ -16,7 +16,9 @@ SHORTEST = tl.constexpr(1e-12)
 
 
 @triton.jit
-def _in_frustum(positions, offsets, scalings, rows, inside, slots, is_child, center, planes, near_plane, sigmas):
+def _in_frustum(
+    positions, offsets, scalings, rows, inside, slots, is_child, pose, fx, fy, cx, cy, width, height, near_plane, sigmas
+):
     """Whether an anchor's children may overlap the image, as ``spheres_in_frustum`` finds of their sphere. [R]"""
     farthest = tl.zeros(slots.shape, tl.float32)
     largest = tl.full(rows.shape, float("-inf"), tl.float32)
@@ -26,13 +28,21 @@ def _in_frustum(positions, offsets, scalings, rows, inside, slots, is_child, cen
         farthest += shift * shift
         largest = tl.maximum(largest, tl.load(scalings + 6 * rows + 3 + axis, inside, 0.0))
     radius = tl.sqrt(tl.max(farthest, axis=1)) + sigmas * tl.exp(largest)
-    for plane in tl.static_range(5):
-        distance = radius - (near_plane if plane == 0 else 0.0)
-        for axis in tl.static_range(3):
-            position = tl.load(positions + 3 * rows + axis, inside, 0.0) - tl.load(center + axis)
-            distance += position * tl.load(planes + 3 * plane + axis)
-        inside &= distance > 0.0
-    return inside
+    x, y, z = tl.zeros(rows.shape, tl.float32), tl.zeros(rows.shape, tl.float32), tl.zeros(rows.shape, tl.float32)
+    for axis in tl.static_range(3):
+        sight = tl.load(positions + 3 * rows + axis, inside, 0.0) - tl.load(pose + 4 * axis + 3)
+        x += sight * tl.load(pose + 4 * axis)
+        y += sight * tl.load(pose + 4 * axis + 1)
+        z += sight * tl.load(pose + 4 * axis + 2)
+    inside &= z + radius > near_plane
+    inside &= _passes_side(x, z, radius, fx, cx) & _passes_side(-x, z, radius, fx, width - cx)
+    return inside & _passes_side(y, z, radius, fy, cy) & _passes_side(-y, z, radius, fy, height - cy)
+
+
+@triton.jit
+def _passes_side(x, z, radius, focal_length, border):
+    """Whether spheres reach across the plane through an image border, so far from the principal point. [R]"""
+    return focal_length * x + border * z + radius * tl.sqrt(focal_length * focal_length + border * border) > 0.0
 
 
 @triton.jit
@@ -54,8 +64,8 @@ def _numbers(first, drawn):
 
 @triton.jit
 def decode_opacities(
-    positions, offsets, scalings, features, inputs, table, center, planes, visible, opacities, counts,
-    anchors, tiles, near_plane, sigmas,
+    positions, offsets, scalings, features, inputs, table, pose, visible, opacities, counts,
+    anchors, tiles, fx, fy, cx, cy, width, height, near_plane, sigmas,
     NETWORK: tl.constexpr, SLOTS: tl.constexpr,
 ):  # fmt: skip
     """Write which anchors are visible [M], opacities [M, K], 0 of those not visible, and counts by tile. [2, 1 + tiles]
@@ -64,7 +74,10 @@ def decode_opacities(
     """
     tile = tl.program_id(0)
     rows, inside, child, slots, is_child = _tile(tile, anchors, NETWORK.children, SLOTS)
-    seen = _in_frustum(positions, offsets, scalings, rows, inside, slots, is_child, center, planes, near_plane, sigmas)
+    seen = _in_frustum(
+        positions, offsets, scalings, rows, inside, slots, is_child,
+        pose, fx, fy, cx, cy, width, height, near_plane, sigmas,
+    )  # fmt: skip
     tl.store(visible + rows, seen, inside)
     count = tl.sum(seen.to(tl.int32))
     values = tl.zeros(slots.shape, tl.float32)
