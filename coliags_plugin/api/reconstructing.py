@@ -21,6 +21,10 @@ def reconstruct(
     device: str = "auto",
     overwrite: bool = False,
     anonymous: bool = False,
+    executor: str | None = None,
+    jobs: int | None = None,
+    threads: int | None = None,
+    ray_address: str | None = None,
 ) -> Record:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
@@ -34,6 +38,11 @@ def reconstruct(
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         overwrite: Repeat stages that were made with other settings, and what follows them.
         anonymous: Keep absolute paths out of what is written (docs/security.md 4).
+        executor: ``local``: in worker processes of this machine, sub-maps at the same time; ``ray``: of a Ray cluster.
+            None: in this process, one after the other, unless ``jobs`` are given.
+        jobs: Worker processes at a time; None: one per CPU, or per GPU.
+        threads: CPU threads of each; None: the CPUs divided by the jobs.
+        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
 
     Returns:
         The record: what each stage made, with which options, in what time.
@@ -45,10 +54,14 @@ def reconstruct(
     from coliags_plugin.config.assignments import settings_of
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.progress import progress_callback
+    from coliags_plugin.execution.choice import ExecutionOptions
     from coliags_plugin.pipeline.reconstruct import reconstruct as run
     from coliags_plugin.pipeline.settings import ReconstructionSettings
 
     chosen = settings_of(ReconstructionSettings, assignments(settings))
+    by_workers = executor is not None or jobs is not None
+    execution = ExecutionOptions(jobs, threads, device, executor or "local", ray_address) if by_workers else None
     masked = None if mask is None else Path(mask)
     with progress_callback() as progress:
-        return run(Path(video), Path(output), chosen, choose_device(device), masked, overwrite, progress, anonymous)
+        where = choose_device("cpu" if by_workers else device)
+        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, anonymous, execution)

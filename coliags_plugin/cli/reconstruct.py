@@ -31,7 +31,7 @@ class ReconstructCommand:
     diameter: arguments.OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
     every: arguments.OptionalInt = None
-    """Use the sharpest of every n frames; default: such that at most 300 are left."""
+    """Use the sharpest of every n frames; default: such that at most 1500 are left."""
     mask: arguments.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
     size: arguments.OptionalText = None
@@ -40,6 +40,15 @@ class ReconstructCommand:
     """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
     steps: arguments.OptionalInt = None
     """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
+    executor: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="local|ray")] = None
+    """Have sub-maps done at the same time, by processes of this machine or of a Ray cluster; default: one after the
+    other, unless --jobs is given."""
+    jobs: arguments.OptionalInt = None
+    """Processes at a time; default: one per CPU, or per GPU."""
+    threads: arguments.OptionalInt = None
+    """CPU threads of each process; default: the CPUs divided by the processes at a time."""
+    ray_address: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Head of the Ray cluster; default: RAY_ADDRESS, or the cluster of this machine."""
     set: arguments.Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""
@@ -78,6 +87,10 @@ class ReconstructCommand:
             device=self.device,
             overwrite=self.overwrite,
             anonymous=self.anonymous,
+            executor=self.executor,
+            jobs=self.jobs,
+            threads=self.threads,
+            ray_address=self.ray_address,
         )
         stages, results = record.stages, results_of(record)
         told = {name: stage for name, stage in stages.items() if "/" not in name}

@@ -6,7 +6,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from coliags_plugin.core.errors import (
 )
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
+from coliags_plugin.core.locks import locked
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
@@ -32,6 +33,17 @@ RECORD_FILE, _FORMAT = "reconstruction.json", 1
 PAGE_FILE = "index.html"
 #: Lock that a process holds while it works in the folder.
 LOCK_FILE = ".lock"
+#: For a worker that was asked to end, seconds.
+LOCK_SECONDS = 120.0
+#: How the names of records by workers begin.
+_WORKER_FILES = ".reconstruction-"
+#: A part of the stages that one process works on: those that all others need (None), or those of one sub-map.
+Part = int | None
+
+
+def part_name(part: Part) -> str:
+    """For keys and files: the number of a sub-map, or ``plan`` of the stages that all need."""
+    return "plan" if part is None else str(part)
 
 
 @dataclass(frozen=True)
@@ -48,37 +60,63 @@ class StageRecord:
 
 
 class Record:
-    """The record in a folder, written after every change: its stages by their names."""
+    """The record in a folder, written after every change: its stages by their names.
 
-    def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
+    That of a worker, which works on one part beside others, has a file of its own for the stages that it puts.
+    """
+
+    def __init__(
+        self, folder: Path, stages: Mapping[str, StageRecord] | None = None, worker: str | None = None
+    ) -> None:
         self.folder, self.stages = folder, dict(stages or {})
         self.is_anonymous = False  # whether absolute paths are kept out of what stages say
+        self._is_worker, self._own = worker is not None, set[str]()
+        self._file = folder / (RECORD_FILE if worker is None else _worker_file(worker))
 
     @classmethod
-    def of(cls, folder: Path) -> Record:
+    def of(cls, folder: Path, worker: str | None = None) -> Record:
         """The record of a folder; empty for one that is new or empty, and refused for one of something else."""
-        file = folder / RECORD_FILE
-        if file.is_file():
-            try:
-                content = parse_json(json_text(file))
-                return cls(folder, {name: StageRecord(**stage) for name, stage in content["stages"].items()})
-            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-                raise InputError(
-                    f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --output"
-                ) from error
+        if (folder / RECORD_FILE).is_file():
+            record = cls(folder, worker=worker)
+            for file in (folder / RECORD_FILE, *sorted(folder.glob(_worker_file("*")))):
+                stages = _read(file)
+                record.stages |= stages
+                if file == record._file:
+                    record._own |= set(stages)
+            return record
         if folder.exists() and (not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir())):
             raise InputError(
                 f"{folder} already exists and is no reconstruction",
                 "a new or empty folder, or one that `coliags reconstruct` made",
                 "Choose another --output",
             )
-        return cls(folder)
+        return cls(folder, worker=worker)
+
+    def take_over_all(self) -> None:
+        """Take what the workers of an earlier call have written; one that has not ended is waited for.
+
+        Raises:
+            LockedError: It does not end.
+        """
+        for file in sorted(self.folder.glob(_worker_file("*"))):
+            worker = file.stem.removeprefix(_WORKER_FILES)
+            with locked(self.folder / f"{LOCK_FILE}-{worker}", self.folder, LOCK_SECONDS):
+                self.take_over(worker)
+
+    def take_over(self, worker: str) -> None:
+        """Take what a worker that has ended has written."""
+        file = self.folder / _worker_file(worker)
+        if file.is_file():
+            self.stages |= _read(file)
+            self.write()
+            file.unlink()
 
     def put(self, name: str, stage: StageRecord) -> None:
         """Set a stage, in the place it has."""
         if self.is_anonymous:
             stage = replace(stage, summary=without_places(stage.summary), warnings=without_places(stage.warnings))
         self.stages[name] = stage
+        self._own.add(name)
         self.write()
 
     def forget(self, names: Sequence[str], outputs: Sequence[str]) -> None:
@@ -96,8 +134,21 @@ class Record:
 
     def write(self) -> None:
         """Write the file atomically."""
-        stages = {name: asdict(stage) for name, stage in self.stages.items()}
-        write_json(self.folder / RECORD_FILE, {"format": _FORMAT, "version": __version__, "stages": stages})
+        stages = {n: asdict(stage) for n, stage in self.stages.items() if not self._is_worker or n in self._own}
+        write_json(self._file, {"format": _FORMAT, "version": __version__, "stages": stages})
+
+
+def _worker_file(name: str) -> str:
+    return f"{_WORKER_FILES}{name}.json"
+
+
+def _read(file: Path) -> dict[str, StageRecord]:
+    try:
+        return {name: StageRecord(**stage) for name, stage in parse_json(json_text(file))["stages"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --output"
+        ) from error
 
 
 def _is_ours(path: Path) -> bool:
@@ -126,7 +177,7 @@ class Stage:
     options: Mapping[str, Any]  # all that it depends on apart from the stages before it, as JSON
     run: Callable[[], StageOutcome]
     outputs: Sequence[str] = ()  # files and folders that it writes, relative to the reconstruction's folder
-    part: int | None = None  # which of several parts, independent of each other, it is of; None: all need it
+    part: Part = None  # which of several parts, independent of each other, it is of; None: all need it
     is_plan: bool = False  # whether the stages after it are known only once it is done
 
 
@@ -135,19 +186,20 @@ def run_stages(
     record: Record,
     overwrite: bool = False,
     plan: Callable[[], Sequence[Stage]] | None = None,
+    parts: Container[Part] | None = None,
 ) -> ReportedError | None:
-    """Run the stages that are not done; ``plan`` gives them anew after one that decides on others.
+    """Run the stages that are not done, all or those of some parts; ``plan`` gives them anew after one that decides.
 
     A stage that was begun with other options is an error, or with ``overwrite`` removed and repeated, along with those
     that need it. The options of one that failed may change. A stage of a part that fails ends that part alone: the
     error of part 0 is returned, those of others are in the record.
     """
     number, failed = 0, dict[int, ReportedError]()
-    _check_options(stages, record, overwrite)
+    check_options(stages, record, overwrite)
     while number < len(stages):
         stage = stages[number]
         number += 1
-        if stage.part in failed:
+        if stage.part in failed or (parts is not None and stage.part not in parts):
             continue
         before = [other.name for other in stages[: number - 1] if other.part in (None, stage.part)]
         try:
@@ -163,7 +215,7 @@ def run_stages(
                 log.warning("%s; the others go on", str(told).rstrip("."))
         if stage.is_plan and plan is not None:
             stages = plan()
-            _check_options(stages, record, overwrite)
+            check_options(stages, record, overwrite)
     return failed.get(0)
 
 
@@ -192,7 +244,7 @@ def _run_stage(stage: Stage, title: str, record: Record) -> None:
     log.info("%s: %s; took %s", title, made.summary, duration(seconds))
 
 
-def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
+def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
     """Refuse, or remove, what was made with other options."""
     for number, stage in enumerate(stages):
         known = record.stages.get(stage.name)

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -16,10 +15,10 @@ import torch
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.worker import work
+from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.execution.choice import ExecutionOptions
-from coliags_plugin.execution.executors import Executor
-from coliags_plugin.execution.tasks import Task, TaskOutcome
+from coliags_plugin.execution.tasks import TaskOutcome
+from tests.task_list import TaskList
 
 #: Overrides that make the anchor methods small, whose steps then take some milliseconds.
 TINY = (
@@ -31,32 +30,11 @@ TINY = (
 OFTEN = (*TINY, "schedule.checkpoint_every=10")
 
 
-class InlineExecutor(Executor):
-    """Works on tasks in this process, one after the other; remembers which."""
+class InlineExecutor(TaskList):
+    """Works on cells in this process."""
 
-    slots, threads = 1, 1
-
-    def __init__(self) -> None:
-        self.tasks: list[Task] = []
-        self._next: list[Task] = []
-
-    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        pass
-
-    def start(self, task: Task) -> None:
-        self.tasks.append(task)
-        self._next.append(task)
-
-    def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
-        ended = [(task, self.outcome(task)) for task in self._next]
-        self._next.clear()
-        return ended
-
-    def outcome(self, task: Task) -> TaskOutcome:
+    def outcome(self, task: CellTask) -> TaskOutcome:
         return work(task)
-
-    def stop(self) -> None:
-        self._next.clear()
 
 
 def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=()):

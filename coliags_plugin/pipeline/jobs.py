@@ -1,0 +1,152 @@
+"""Parts of a reconstruction as jobs for worker processes: what all sub-maps need, then each sub-map by itself."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+from coliags_plugin.execution.choice import ExecutionOptions
+from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.queue import Job
+from coliags_plugin.pipeline.chain import stages_of
+from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.page import write_index
+from coliags_plugin.pipeline.stages import Part, Record, Stage, StageRecord, check_options, part_name
+from coliags_plugin.pipeline.worker import PartTask
+from coliags_plugin.reporting.numbers import duration
+
+log = logging.getLogger(__name__)
+
+#: Folder of the workers' messages.
+LOGS = "logs"
+#: Share of the work that comes before the sub-maps.
+_PLAN_SHARE = 0.2
+_NOT_BEGUN = StageRecord({})
+
+
+class PartJobs:
+    """A reconstruction whose parts are jobs; its page is written when the last has ended.
+
+    Args:
+        context: Of the reconstruction.
+        executor: Where the jobs run.
+        options: How.
+        overwrite: Whether stages that were made with other options are removed.
+        size: Of all jobs together, in the queue's unit.
+
+    Raises:
+        InputError: A stage was made with other options, and ``overwrite`` is not given; or a worker of an earlier call
+            does not end.
+    """
+
+    def __init__(
+        self, context: StageContext, executor: Executor, options: ExecutionOptions, overwrite: bool, size: int
+    ) -> None:
+        self.context, self.executor, self.options, self._overwrite = context, executor, options, overwrite
+        self.record = Record.of(context.out)
+        self.record.is_anonymous = context.anonymous
+        self.record.write()
+        self.record.take_over_all()
+        self.failures: dict[Part, str] = {}
+        self._left, self._size = set[Part](), size
+        check_options(stages_of(context), self.record, overwrite)
+
+    def jobs(self) -> list[Job]:
+        """What is to be done now: the stages that all need, or where these are done each sub-map.
+
+        Their sizes are what is left of that of all jobs.
+        """
+        parts: dict[Part, list[Stage]] = {}
+        for stage in stages_of(self.context):
+            parts.setdefault(stage.part, []).append(stage)
+        waiting = [part for part, stages in parts.items() if not all(self.is_done(stage) for stage in stages)]
+        if None in waiting:
+            waiting = [None]
+        self._left = set(waiting)
+        if not waiting:
+            self.write_page()
+            return []
+        frames = {context.submap.number: context.submap.frames or 1 for context in self.context.submaps()}
+        shares = {part: 1.0 if part is None else frames[part] / sum(frames.values()) for part in waiting}
+        whole = self._size * (_PLAN_SHARE if None in waiting else 1.0)
+        return [PartJob(self, part, parts[part], round(shares[part] * whole)) for part in waiting]
+
+    def is_done(self, stage: Stage) -> bool:
+        """Whether a stage is."""
+        return self.record.stages.get(stage.name, _NOT_BEGUN).state == "done"
+
+    def end(self, job: PartJob, reason: str = "") -> list[Job]:
+        """Take what the worker of a part has written, or why it failed; returns what is to be done after it."""
+        self.record.take_over(part_name(job.part))
+        for stage in job.stages:
+            if (record := self.record.stages.get(stage.name)) is not None:
+                if reason and record.state == "begun":  # its process died
+                    record = replace(record, state="failed", summary=reason)
+                    self.record.put(stage.name, record)
+                what = record.state if record.state != "done" else f"took {duration(record.seconds)}"
+                log.info("%s: %s; %s", stage.name, record.summary, what)
+        self._left.discard(job.part)
+        self._size -= job.size
+        if reason:
+            self.failures[job.part] = reason
+        elif job.part is None:
+            check_options(stages_of(self.context), self.record, self._overwrite)
+            return self.jobs()
+        if not self._left:
+            self.write_page()
+        return []
+
+    def write_page(self) -> None:
+        """Write the page of the reconstruction, and the record in the order of its stages."""
+        context, record = self.context, self.record
+        places = {stage.name: place for place, stage in enumerate(stages_of(context))}
+        record.stages = dict(sorted(record.stages.items(), key=lambda item: places.get(item[0], len(places))))
+        record.write()
+        write_index(record, context.posed, f"Reconstruction of {context.source.resolve().name}")
+
+
+class PartJob(Job):
+    """One part of a reconstruction."""
+
+    def __init__(self, jobs: PartJobs, part: Part, stages: Sequence[Stage], size: int) -> None:
+        self._jobs, self.part, self.stages, self.size = jobs, part, stages, size
+        out = jobs.context.out.resolve()
+        self.key, self.title = (
+            f"{out} {part_name(part)}",
+            f"{out.name}, {'poses' if part is None else f'sub-map {part}'}",
+        )
+
+    def task(self) -> PartTask:
+        """See :class:`Job`."""
+        jobs, context = self._jobs, self._jobs.context
+        out = context.out.resolve()
+        log.info("%s: started", self.title)
+        return PartTask(
+            title=self.title,
+            key=self.key,
+            device=jobs.options.device,
+            log=str(out / LOGS / f"{part_name(self.part)}.log"),
+            threads=jobs.executor.threads,
+            source=str(context.source.resolve()),
+            out=str(out),
+            settings=context.settings.model_dump_json(),
+            mask=None if context.mask is None else str(context.mask.resolve()),
+            data_format=context.data_format,
+            anonymous=context.anonymous,
+            part=self.part,
+        )
+
+    def progress(self) -> int:
+        """Share of the stages that are done; the rest is over when the process has ended."""
+        record = Record.of(self._jobs.context.out)
+        done = sum(record.stages.get(stage.name, _NOT_BEGUN).state == "done" for stage in self.stages)
+        return self.size * done // (len(self.stages) + 1)
+
+    def finish(self) -> Sequence[Job]:
+        """See :class:`Job`."""
+        return self._jobs.end(self)
+
+    def fail(self, reason: str, attempts: int) -> None:
+        """See :class:`Job`."""
+        self._jobs.end(self, reason or "it failed")

@@ -1,0 +1,179 @@
+"""Sub-maps of a reconstruction done by worker processes: what comes out is what one process makes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+import coliags_plugin as cp
+from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.execution.tasks import TaskOutcome
+from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
+from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome
+from coliags_plugin.pipeline.worker import PartTask, work
+from tests.comparison.small import until
+from tests.pipeline.conftest import TRAINING, write_atlas
+from tests.task_list import TaskList
+
+SUBMAP = ("check_data", "estimate_depth", *TRAINING)
+
+
+class Workers(TaskList):
+    """Work as the processes do, in this one; the first tasks end in some other way instead."""
+
+    def __init__(self, *endings):
+        super().__init__()
+        self.endings = list(endings)
+
+    def outcome(self, task):
+        assert PartTask.from_json(task.to_json()) == task
+        ending = self.endings.pop(0) if self.endings else None
+        if isinstance(ending, BaseException):
+            raise ending
+        return ending or work(task)
+
+
+@pytest.fixture
+def workers(monkeypatch):
+    def use(*endings):
+        executor = Workers(*endings)
+        monkeypatch.setattr(reconstruct, "make_executor", lambda options: executor)
+        return executor
+
+    return use
+
+
+def told(folder):
+    """All that the record says but times."""
+    return {name: replace(stage, seconds=0.0) for name, stage in Record.of(folder).stages.items()}
+
+
+def parts(executor):
+    return [task.part for task in executor.tasks]
+
+
+@pytest.fixture
+def posed(done, monkeypatch):
+    """Poses in three models, two of which are reconstructed."""
+
+    def poses(context):
+        done.append("make_poses")
+        write_atlas(context.posed)
+        return StageOutcome("posed")
+
+    monkeypatch.setattr(capture_stages, "make_poses", poses)
+
+
+def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, workers, done):
+    cp.reconstruct(video, tmp_path / "alone")
+    alone = list(done)
+    done.clear()
+    executor = workers()
+    record = cp.reconstruct(video, tmp_path / "out", jobs=2)
+    assert parts(executor) == [None, 0, 1] and done == alone
+    assert told(tmp_path / "out") == told(tmp_path / "alone") and list(record.stages) == list(told(tmp_path / "alone"))
+    assert (tmp_path / "out" / PAGE_FILE).is_file()
+    assert not list((tmp_path / "out").glob(".reconstruction-*")), "all is in one record at the end"
+    executor = workers()
+    cp.reconstruct(video, tmp_path / "out", jobs=2)
+    assert parts(executor) == [], "what is done is not done again"
+    cp.reconstruct(video, tmp_path / "out")
+    assert done == alone
+
+
+def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, atlas, tmp_path, workers, caplog):
+    died = TaskOutcome("died", "the process was ended by SIGKILL")
+    executor = workers(died)
+    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert parts(executor) == [0, 1, 0] or parts(executor) == [0, 0, 1]
+    assert caplog.text.count("trying again") == 1
+    executor = workers(None, died, died, died)
+    record = cp.reconstruct(atlas, tmp_path / "again", jobs=1)
+    assert parts(executor) == [0, 1, 1, 1]
+    assert all(stage.state == "done" for name, stage in record.stages.items() if "/" not in name)
+    assert "3 times" in caplog.text or (tmp_path / "again" / PAGE_FILE).is_file()
+    with pytest.raises(InputError, match="SIGKILL, 3 times"):
+        workers(died, died, died)
+        cp.reconstruct(atlas, tmp_path / "third", jobs=1)
+
+
+def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, workers, monkeypatch):
+    mesh, failing = training_stages.mesh, [1]
+
+    def fails(context):
+        if context.submap.number in failing:
+            raise InputError("no surface")
+        return mesh(context)
+
+    monkeypatch.setattr(training_stages, "mesh", fails)
+    workers()
+    record = cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert record.stages["submap-1/mesh"].state == "failed" and record.stages["report"].state == "done"
+    failing[:] = [0]
+    with pytest.raises(InputError, match="stage mesh: no surface"):
+        cp.reconstruct(atlas, tmp_path / "first", jobs=1)
+    failing.clear()
+    done.clear()
+    cp.reconstruct(atlas, tmp_path / "first", jobs=1)
+    assert done == list(TRAINING[2:])
+
+
+def test_it_stops_and_goes_on(done, atlas, tmp_path, workers):
+    workers(None, KeyboardInterrupt())
+    with pytest.raises(InterruptedRunError, match="goes on where it stopped"):
+        cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert done == list(SUBMAP)
+    workers()
+    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert done == [*SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
+
+
+def test_what_a_worker_of_a_killed_call_has_written_is_taken_over(done, atlas, tmp_path, workers, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(Record, "take_over", lambda *_: None)
+        executor = workers()
+        cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert len(list((tmp_path / "out").glob(".reconstruction-*.json"))) == 2
+    assert len(Record.of(tmp_path / "out").stages) == 16
+    executor = workers()
+    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    assert parts(executor) == [] and not list((tmp_path / "out").glob(".reconstruction-*.json"))
+
+
+def test_other_options_are_refused_or_repeated(done, atlas, tmp_path, workers):
+    workers()
+    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
+    with pytest.raises(InputError, match="stage train was made with steps 2000, not 4000"):
+        cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, jobs=1)
+    done.clear()
+    cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, jobs=1, overwrite=True)
+    assert done == [*TRAINING, *(f"submap-1/{name}" for name in TRAINING)]
+
+
+@pytest.mark.thorough
+def test_workers_are_processes_and_one_that_is_killed_is_replaced(atlas, tmp_path):
+    """On the real stages, of which the check of the data is done and depth cannot be: its one point says nothing."""
+    code = "from coliags_plugin.cli import main; main()"
+    argv = ["reconstruct", str(atlas), "--output", str(tmp_path / "out"), "--jobs", "2"]
+    with (tmp_path / "told.txt").open("w") as messages:
+        driver = subprocess.Popen([sys.executable, "-c", code, *argv], stderr=messages, stdout=messages)
+
+    def worker():
+        for file in (tmp_path / "out").glob(".lock-*"):
+            words = file.read_text().split()
+            if len(words) > 1:
+                return int(words[1])
+        return None
+
+    os.kill(until("worker", worker), signal.SIGKILL)
+    driver.wait()
+    text = (tmp_path / "told.txt").read_text()
+    assert "SIGKILL" in text and "trying again" in text
+    stages = Record.of(tmp_path / "out").stages
+    assert {stages[name].state for name in ("check", "submap-1/check")} == {"done"}
+    assert (tmp_path / "out" / "logs" / "0.log").is_file() and (tmp_path / "out" / "logs" / "1.log").is_file()
