@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 import triton
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -25,9 +26,13 @@ BACKWARD_OPTIONS = {**OPTIONS, "num_warps": 4}
 
 
 def visible_children(
-    rows: AnchorRows, camera: Camera, features: Tensor, geometry: HeadNetworks, appearance: HeadNetworks
-) -> tuple[DrawnChildren, Tensor]:
-    """:func:`~coliags_plugin.fields.children.drawn_children` of the anchors that a camera sees, and these. [V]
+    rows: AnchorRows,
+    camera: Camera,
+    features: Float[Tensor, "M F"],
+    geometry: HeadNetworks,
+    appearance: HeadNetworks,
+) -> tuple[DrawnChildren, Int[Tensor, "V"]]:
+    """:func:`~coliags_plugin.fields.children.drawn_children` of the anchors that a camera sees, and these anchors. [V]
 
     The networks' inputs and ``features`` are those of all M anchors, of which the visible ones are read. The host waits
     once, for both numbers. Differentiable once, and not in the anchors' positions.
