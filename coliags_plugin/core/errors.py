@@ -52,6 +52,10 @@ class NothingDrawnError(ReportedError):
     """Nothing was drawn for many steps: the field is not where the cameras look."""
 
 
+class DeviceMemoryError(ReportedError):
+    """The memory of a device ran out."""
+
+
 class UnavailableError(Exception):
     """A quantity cannot be computed (missing weights, missing ground truth); the message is the reason.
 

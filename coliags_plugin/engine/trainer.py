@@ -16,7 +16,7 @@ import torch
 
 from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.contracts import Draw, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
-from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, NothingDrawnError
+from coliags_plugin.core.errors import DeviceMemoryError, InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.masked import masked_mean
@@ -28,6 +28,7 @@ from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.following import Followers
+from coliags_plugin.engine.memory import LESS, check_memory, forecast, frames_size
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
@@ -70,13 +71,13 @@ class Trainer:
             config.strategy.settings, self.generators["densification"], self.schedule, scene.extent
         )
         check_components(config, self.chosen, scene, self.losses, self.schedule)
-        self.frames = _resident(scene.train, device)
         field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
         modules = make_view_modules(config, scene, self.generators["initialisation"])
         for module in modules.values():
             module.prepare(scene)
-        self.model = Model(field, self.chosen.renderer, modules, config.near_plane).to(device)
+        self.model = Model(field, self.chosen.renderer, modules, config.near_plane)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
+        self.frames = self._prepare_device()
         self.model.check_outputs(self.wants, "the losses")
         for loss in self.losses.values():
             loss.check(self.model)
@@ -142,7 +143,10 @@ class Trainer:
             closing(Followers(followers)) as following,
         ):
             while self.step < self.steps:
-                row = self.take_step()
+                try:
+                    row = self.take_step()
+                except torch.OutOfMemoryError as error:
+                    raise self._out_of_memory(error) from error
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
                     row = {**row, "seconds": round(self.seconds, 3)}
                     log(row)
@@ -240,6 +244,11 @@ class Trainer:
         """Provenance of the run."""
         return run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
 
+    def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
+        count, first = self.model.field.element_count, str(error).partition("\n")[0]
+        at = f"step {self.step + 1}, {count:,} elements: the memory of {self.device} ran out"
+        return DeviceMemoryError(f"{at} ({first.rstrip('.')}). The last checkpoint is whole. {LESS}.")
+
     def _check_drawn(self, alpha: float, step: int) -> None:
         self.blank_views = 0 if alpha >= BLANK_ALPHA else self.blank_views + 1
         if self.blank_views >= MAX_BLANK_VIEWS:
@@ -249,6 +258,21 @@ class Trainer:
                 f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
                 "into poses and units."
             )
+
+    def _prepare_device(self) -> list[Frame]:
+        """Move the model to the device if it fits, and the frames if they fill at most half of what it leaves free.
+
+        Images stay uint8 there too. Returns the frames.
+        """
+        frames, device = self.scene.train, self.device
+        if device.type == "cuda":
+            needed = forecast(self.model, self.wants, frames)
+            pixels = max(frame.camera.width * frame.camera.height for frame in frames)
+            check_memory(needed, self.strategy.most_added(pixels), device)
+            if frames_size(frames) < (torch.cuda.mem_get_info(device)[0] - needed.total) / 2:
+                frames = [frame.to(device) for frame in frames]
+        self.model.to(device)
+        return frames
 
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
@@ -276,15 +300,6 @@ def _check_finite(sums: dict[str, float], terms: dict[str, float], step: int, fr
                 f"step {step}, frame {frame}: loss term '{key}' is {term}. "
                 "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
             )
-
-
-def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
-    """The frames, moved to the device if they fill at most half of its free memory; images stay uint8 there too."""
-    if device.type != "cuda":
-        return frames
-    tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen, f.depth_confidence) for f in frames]
-    size = sum(tensor.nbytes for group in tensors for tensor in group if tensor is not None)
-    return [frame.to(device) for frame in frames] if size < torch.cuda.mem_get_info(device)[0] / 2 else frames
 
 
 #: Ctrl-C, what clusters send before they kill, and what a terminal sends when it is closed.
