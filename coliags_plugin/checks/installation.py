@@ -69,7 +69,8 @@ def _cuda() -> list[CheckResult]:
     """Versions, and a line for each device."""
     if not torch.cuda.is_available():
         return [CheckResult("cuda", "skipped", _NO_CUDA)]
-    versions = f"PyTorch for CUDA {torch.version.cuda}, a driver for CUDA {_driver_version() or 'of unknown version'}"
+    built = f"CUDA {torch.version.cuda}" if torch.version.cuda else f"ROCm {torch.version.hip}"
+    versions = f"PyTorch for {built}; the driver serves CUDA {_driver_version() or 'of unknown version'}"
     results = [CheckResult("cuda", "passed", versions)]
     for index in range(torch.cuda.device_count()):
         found = torch.cuda.get_device_properties(index)

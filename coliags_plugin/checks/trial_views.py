@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,10 +14,13 @@ from torch import Tensor
 
 from coliags_plugin.checks.results import CheckFailedError, CheckResult
 from coliags_plugin.config.components import make_component
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS, RenderOutput
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -30,6 +34,8 @@ INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 _JUMPS = frozenset({"depth_median"})
 #: How far thresholds are moved to find the pixels where rounding decides, relative to themselves.
 _THRESHOLD_MARGIN = 2e-5
+#: Share of the children of anchors that are drawn by both, at least.
+_SAME_CHILDREN = 0.99
 #: Turns of the trial of speed at least, however slow.
 _FEWEST = 3
 #: Outputs of the trial of speed.
@@ -81,10 +87,10 @@ class Trial:
 
 
 def try_renderers(device: torch.device, trial: Trial) -> Iterator[CheckResult]:
-    """Try the renderers that training would use on a device, and gsplat where it is available.
+    """Try the renderers that training would use on a device, gsplat where it works, and the field of ``coliags``.
 
-    Errors are those of float32 on the device against the ``torch`` renderer in float64 on the CPU, each relative to the
-    largest value of the output or gradient; whatever goes wrong is the reason of a failed check.
+    Errors are those of float32 on the device against the definition in PyTorch, in float64 on the CPU, each relative to
+    the largest value of the output or gradient; whatever goes wrong is the reason of a failed check.
     """
     for primitive in PRIMITIVES:
         for chosen in _chosen(primitive, device):
@@ -92,6 +98,7 @@ def try_renderers(device: torch.device, trial: Trial) -> Iterator[CheckResult]:
             if isinstance(renderer, SplattingRenderer):
                 yield _result(f"{name}: errors", partial(_errors, renderer, primitive, device, trial.accuracy))
                 yield _result(f"{name}: speed", partial(_speed, renderer, primitive, device, trial))
+    yield _result("anchors of coliags: errors", partial(_decoding_errors, device, trial.accuracy))
 
 
 def _chosen(primitive: str, device: torch.device) -> Iterator[ChosenRenderer]:
@@ -127,6 +134,15 @@ def _errors(renderer: SplattingRenderer, primitive: str, device: torch.device, v
     ours = _values(renderer.draw, gaussians, view.camera, wants, device, torch.float32, unsettled)
     seconds = time.perf_counter() - began
     exact = _values(render_gaussians, gaussians, view.camera, wants, torch.device("cpu"), torch.float64, unsettled)
+    return _compared(ours, exact, seconds)
+
+
+#: Outputs and gradients by name, float64 on the CPU.
+Values = tuple[dict[str, Tensor], dict[str, Tensor]]
+
+
+def _compared(ours: Values, exact: Values, seconds: float) -> str:
+    """The largest errors in words; CheckFailedError where one is larger than its tolerance."""
     told, wrong = [], []
     for kind, tolerance, found, true in zip(
         ("outputs", "gradients"), (OUTPUT_TOLERANCE, GRADIENT_TOLERANCE), ours, exact, strict=True
@@ -135,10 +151,46 @@ def _errors(renderer: SplattingRenderer, primitive: str, device: torch.device, v
         wrong += [f"{name} of {kind}" for name, error in errors.items() if not error <= tolerance]  # NaN is wrong
         listed = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
         told.append(f"{kind}, at most {tolerance:g}: {listed}")
-    text = f"{'; '.join(told)}; drawn first in {seconds:.1f} s, compilation included"
+    text = f"{'; '.join(told)}; first computed in {seconds:.1f} s, compilation included"
     if wrong:
         raise CheckFailedError(f"wrong: {', '.join(wrong)}. Largest errors of {text}")
     return f"largest errors of {text}"
+
+
+def _decoding_errors(device: torch.device, view: TrialView) -> str:
+    """The same of the Gaussians that a field of anchors decodes, with fresh networks."""
+    frame = Frame("trial", 0, torch.zeros(view.height, view.width, 3, dtype=torch.uint8), view.camera)
+    points = PointCloud(view.strewn("gaussians3d").means)
+    node = load_method("coliags", ["field.voxel_size=0.01"]).config.field  # one anchor for each point
+    scene = Scene("trial", [frame], {}, points, {})
+    field = node.target.from_scene(scene, node.settings, torch.Generator().manual_seed(0))
+    exact, ours = copy.deepcopy(field).double(), field.to(device)
+    began = time.perf_counter()
+    found = ours.gaussians(view.camera)
+    seconds, true = time.perf_counter() - began, exact.gaussians(view.camera)
+    slots, wanted = found.source_index.cpu(), true.source_index
+    both = slots[torch.isin(slots, wanted)]  # an opacity of about 0 may be drawn by one alone
+    if len(both) < _SAME_CHILDREN * max(len(slots), len(wanted)):
+        raise CheckFailedError(
+            f"wrong: {len(slots)} children drawn, {len(wanted)} expected, {len(both)} of them the same"
+        )
+    return _compared(_of_children(ours, found, both), _of_children(exact, true, both), seconds)
+
+
+def _of_children(field: GaussianField, gaussians: Gaussians, slots: Tensor) -> Values:
+    """Values of the Gaussians of some slots, and the gradients of a sum of all with random weights."""
+    kept = torch.isin(gaussians.source_index, slots.to(gaussians.source_index.device))
+    outputs = {name: getattr(gaussians, name)[kept] for name in INPUTS}
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.randn(value.shape, generator=generator).to(value) for value in outputs.values()]
+    torch.autograd.backward(list(outputs.values()), weights)
+    groups = field.parameter_groups().items()
+    gradients = {name: torch.cat([torch.as_tensor(value.grad).flatten() for value in group]) for name, group in groups}
+    return _exactly(outputs), _exactly(gradients)
+
+
+def _exactly(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().to("cpu", torch.float64) for name, value in values.items()}
 
 
 Drawing = Callable[[Gaussians, Camera, tuple[str, ...]], RenderOutput]
@@ -152,7 +204,7 @@ def _values(
     device: torch.device,
     dtype: torch.dtype,
     unsettled: Tensor,
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+) -> Values:
     """Outputs, and the gradients of a sum of all with random weights, without some pixels: float64, on the CPU."""
     inputs = {name: getattr(gaussians, name).to(device, dtype, copy=True).requires_grad_() for name in INPUTS}
     pose = camera.camera_to_world.to(device, dtype, copy=True).requires_grad_()
@@ -164,9 +216,8 @@ def _values(
         drawn = torch.randn(values.shape, generator=generator)
         weights[name] = (drawn * settled.view(*settled.shape, *[1] * (drawn.ndim - 2))).to(device, dtype)
     torch.autograd.backward(list(maps.values()), list(weights.values()))
-    shown = {name: values.detach().to("cpu", torch.float64)[settled] for name, values in maps.items()}
-    leaves = {**inputs, "pose": pose}.items()
-    return shown, {name: torch.as_tensor(value.grad).to("cpu", torch.float64) for name, value in leaves}
+    shown = {name: values[settled] for name, values in _exactly(maps).items()}
+    return shown, _exactly({name: torch.as_tensor(value.grad) for name, value in {**inputs, "pose": pose}.items()})
 
 
 def _unsettled(gaussians: Gaussians, camera: Camera) -> Tensor:

@@ -7,11 +7,12 @@ from importlib.util import find_spec
 import pytest
 import torch
 
+from coliags_plugin.checks import trial_views
 from coliags_plugin.checks.installation import check_installation
 from coliags_plugin.checks.trial_views import PRIMITIVES, Trial, TrialView, try_renderers
 from coliags_plugin.renderers import cpu_renderer, triton_renderer
 from tests.commands import refused, run
-from tests.pretended_cuda import PretendedCuda
+from tests.pretended_cuda import CUDA, PretendedCuda
 
 needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
 CPU = torch.device("cpu")
@@ -24,10 +25,13 @@ def tried(device=CPU):
 
 def test_the_renderers_of_a_cpu():
     results = tried()
-    assert list(results) == [f"cpu, {name}: {what}" for name in PRIMITIVES for what in ("errors", "speed")]
+    drawn = [f"cpu, {name}: {what}" for name in PRIMITIVES for what in ("errors", "speed")]
+    assert list(results) == [*drawn, "anchors of coliags: errors"]
     assert {result.status for result in results.values()} == {"passed"}
     errors, speed = results["cpu, surfels: errors"].detail, results["cpu, surfels: speed"].detail
     assert all(word in errors for word in ("rgb", "distortion", "normals", "means", "pose", "compilation included"))
+    decoded = results["anchors of coliags: errors"].detail
+    assert all(f"{word} " in decoded for word in ("opacities", "colors", "offsets", "features", "scalings"))
     assert "20 Gaussians, 16x8" in speed and speed.count("frames/s") == 2
 
 
@@ -40,8 +44,9 @@ def test_a_device_that_is_not_there(monkeypatch):
     assert results["cuda:0"].detail == "a pretended device, compute capability 9.0, 16.0 GiB"
     assert "would use triton" in results["renderer auto"].detail
     of_triton = {name: result for name, result in results.items() if name.startswith("triton,")}
-    assert len(of_triton) == 4 and {result.status for result in of_triton.values()} == {"passed"}
-    assert device.made_current == [torch.device("cuda", 0)]
+    of_triton |= {"anchors": results["anchors of coliags: errors"]}
+    assert len(of_triton) == 5 and {result.status for result in of_triton.values()} == {"passed"}
+    assert device.made_current == [CUDA]
 
 
 def test_without_a_device_it_says_what_it_would_do(monkeypatch):
@@ -90,8 +95,35 @@ def test_a_wrong_kernel_fails(monkeypatch):
 
     monkeypatch.setattr(triton_renderer, "render_gaussians", wrong)
     with PretendedCuda():
-        results = tried(torch.device("cuda", 0))
+        results = tried(CUDA)
     assert [results[f"triton, {primitive}: errors"].status for primitive in PRIMITIVES] == ["failed"] * 2
+
+
+def opacities_off(drawn):
+    return drawn._replace(opacities=drawn.opacities * 1.001)
+
+
+def other_children(drawn):
+    return drawn._replace(source_index=drawn.source_index + 1)
+
+
+@needs_triton
+@pytest.mark.parametrize(
+    ("spoiled", "told"), [(opacities_off, "wrong: opacities of outputs"), (other_children, "of them the same")]
+)
+def test_wrong_decoding_fails(monkeypatch, spoiled, told):
+    from coliags_plugin.fields.triton_kernels import children
+
+    right = children.visible_children
+
+    def wrong(*args):
+        drawn, visible = right(*args)
+        return spoiled(drawn), visible
+
+    monkeypatch.setattr(children, "visible_children", wrong)
+    with PretendedCuda():
+        result = trial_views._result("anchors", lambda: trial_views._decoding_errors(CUDA, SMALL.accuracy))
+    assert result.status == "failed" and told in result.detail
 
 
 def test_an_exception_is_a_failed_check(monkeypatch, capsys):
@@ -114,4 +146,4 @@ def test_a_device_that_cannot_be_is_refused(capsys):
 
 @pytest.mark.gpu
 def test_a_device_passes():
-    assert {result.status for result in try_renderers(torch.device("cuda", 0), Trial())} == {"passed"}
+    assert {result.status for result in try_renderers(CUDA, Trial())} == {"passed"}
