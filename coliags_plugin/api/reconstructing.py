@@ -31,7 +31,7 @@ def reconstruct(
     What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
 
     Args:
-        video: Video file, folder of images, or folder of a scene with poses.
+        video: Video file, folder of one with its calibration, folder of images, or folder of a scene with poses.
         output: Folder of the results.
         settings: Of the stages by key path, for instance ``{"steps": 5000, "diameter": 40.0, "frames.every": 2}``.
         mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.

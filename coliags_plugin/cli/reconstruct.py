@@ -20,12 +20,13 @@ class ReconstructCommand:
     """
 
     video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
-    """Video file, folder of images ordered by the numbers in their names, or folder of a scene with poses."""
+    """Video file, folder of one with its calibration, folder of images ordered by the numbers in their names, or folder
+    of a scene with poses."""
     output: arguments.Output
     """Folder of the results."""
     camera: arguments.OptionalText = None
-    """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP;
-    default: found from the frames."""
+    """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
+    file), or a camera model of COLMAP; default: of the calibration file in the folder, else found from the frames."""
     params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
     diameter: arguments.OptionalFloat = None

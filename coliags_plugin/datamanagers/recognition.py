@@ -9,12 +9,15 @@ from pathlib import Path
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import candidates
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.files import inventory
+from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, TIFF_SUFFIXES, first_few, inventory
+from coliags_plugin.geometry.lenses.vicalib import calibration_files
 
 log = logging.getLogger(__name__)
 
 #: Suffixes of video files, in lower case.
 _VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
+#: Of images that may be the frames of one, in lower case.
+_FRAME_SUFFIXES = IMAGE_SUFFIXES | TIFF_SUFFIXES | {".bmp"}
 
 
 def formats() -> list[str]:
@@ -30,6 +33,8 @@ def find_format(path: Path) -> str:
     if path.is_file():
         raise _no_folder(path)
     found = recognised(path)
+    if not found and (video := video_in(path)) is not None:
+        raise _no_scene(path, f"{path} holds the video {video.name}, and no scene")
     if not found:
         raise InputError(
             f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
@@ -45,14 +50,38 @@ def find_format(path: Path) -> str:
     return name
 
 
+def video_in(folder: Path) -> Path | None:
+    """The video of a recording's folder; None where there is none, or images are there and no calibration file.
+
+    Raises:
+        InputError: There are several videos.
+    """
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+    if not videos or (any(path.suffix.lower() in _FRAME_SUFFIXES for path in files) and not calibration_files(folder)):
+        return None
+    if len(videos) > 1:
+        raise InputError(
+            f"{folder} holds the videos {first_few([path.name for path in videos])}",
+            "a recording's folder, with one video",
+            "Give the video, with its calibration file if there is one: --camera NAME.xml",
+        )
+    return videos[0]
+
+
+def _no_scene(path: Path, seen: str) -> InputError:
+    """What to do about a recording that was given in the place of a scene's folder."""
+    quoted = shlex.quote(str(path))
+    makes = f"coliags reconstruct {quoted} --output FOLDER reconstructs it; coliags poses sfm {quoted} --output FOLDER"
+    return InputError(seen, "a scene's folder", f"{makes} makes a scene with poses")
+
+
 def _no_folder(path: Path) -> InputError:
     """What to do about a file that was given in the place of a scene's folder."""
-    folder, file = (shlex.quote(str(each)) for each in (path.parent, path))
     if path.suffix.lower() in _VIDEO_SUFFIXES:
-        makes = f"coliags reconstruct {file} --output FOLDER reconstructs it; coliags poses sfm {file} --output FOLDER"
-        return InputError(f"{path} is a video", "a scene's folder", f"{makes} makes a scene with poses")
+        return _no_scene(path, f"{path} is a video")
     if recognised(path.parent):
-        return InputError(f"{path} is a file of a scene", "the scene's folder", f"Give {folder}")
+        return InputError(f"{path} is a file of a scene", "the scene's folder", f"Give {shlex.quote(str(path.parent))}")
     return InputError(f"{path} is a file", "a scene's folder, as docs/data.md describes", "")
 
 

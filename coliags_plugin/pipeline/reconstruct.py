@@ -15,9 +15,9 @@ from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.execution.queue import JobQueue
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.jobs import PartJobs
 from coliags_plugin.pipeline.page import write_index
+from coliags_plugin.pipeline.recordings import opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -49,7 +49,8 @@ def reconstruct(
         raise InputError(f"no file {mask}", "an image, black where pixels are ignored", "Check --mask")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
     if data_format is None:
-        frame_source(source)
+        source, sfm = opened_recording(source, settings.sfm)
+        settings = settings.model_copy(update={"sfm": sfm})
     else:
         _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written

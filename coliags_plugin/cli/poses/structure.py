@@ -101,12 +101,13 @@ class PosesSfmCommand:
     """Estimate poses, intrinsics and surface points from a video's images alone; write them as a scene."""
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
-    """Video, or folder of images ordered by the numbers in their names."""
+    """Video, folder of one with its calibration, or folder of images ordered by the numbers in their names."""
     output: arguments.Output
     """Folder to create, in COLMAP's layout."""
     camera: arguments.OptionalText = None
-    """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
-    for instance PINHOLE or OPENCV_FISHEYE; default: the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
+    """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
+    file), or a camera model of COLMAP, for instance PINHOLE or OPENCV_FISHEYE; default: of the calibration file in the
+    folder, else the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
     params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
     diameter: arguments.OptionalFloat = None
@@ -131,6 +132,7 @@ class PosesSfmCommand:
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.pipeline.frame_sources import image_files
         from coliags_plugin.pipeline.frames import FrameSurvey
+        from coliags_plugin.pipeline.recordings import opened_recording
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for, read_image
         from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
@@ -143,15 +145,15 @@ class PosesSfmCommand:
         known_distance = self._known_distance()
         given = [] if self.camera is None else [f"camera.model={self.camera}"]
         given += [] if self.params is None else [f"camera.params=[{self.params}]"]
-        settings = settings_of(SfmSettings, [*given, *self.set])
-        survey = FrameSurvey(self.frames)
-        with progress_callback() as progress, image_files(self.frames, progress, survey.add) as files:
+        frames, settings = opened_recording(self.frames, settings_of(SfmSettings, [*given, *self.set]))
+        survey = FrameSurvey(frames)
+        with progress_callback() as progress, image_files(frames, progress, survey.add) as files:
             images = files[:: self.every][: self.max_frames]
             masks: Masks = None
             if self.mask is not None:
                 masks = masks_for(self.mask, images)
             else:
-                for path in images if self.frames.is_dir() else ():
+                for path in images if frames.is_dir() else ():
                     survey.add(read_image(path))
                 if (found := survey.mask()) is not None:
                     share = 100.0 * (1.0 - found.mean())

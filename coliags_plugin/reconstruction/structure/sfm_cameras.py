@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -112,10 +112,14 @@ def is_refined(settings: CameraSettings) -> bool:
 
 def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
     """COLMAP's model and parameters of a known camera, scaled to the size of images that show its whole frame."""
-    whole = LENSES[CALIBRATED[name]]
+    return camera_of_lens(LENSES[CALIBRATED[name]], f"--camera {name}", width, height)
+
+
+def camera_of_lens(whole: Lens, said: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a lens, scaled to images of its whole frame; ``said`` names it in errors."""
     if abs((width / height) / (whole.width / whole.height) - 1.0) > _ASPECT_TOLERANCE:
         raise InputError(
-            f"--camera {name}, and images of {width} x {height}",
+            f"{said}, and images of {width} x {height}",
             f"the whole frame, {whole.width} x {whole.height} or scaled from it",
             "For cropped images, subtract the crop's corner from the principal point and pass --camera OPENCV_FISHEYE "
             "and --params",

@@ -17,7 +17,8 @@ class CameraSettings(Settings):
     model: str | None = Field(
         default=None,
         description="COLMAP camera model, for instance OPENCV_FISHEYE; or a calibrated camera, scaled to the images: "
-        "c3vd, c3vd-undistorted. None: SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL are tried.",
+        "c3vd, c3vd-undistorted, or that of a calibration file, NAME.xml. None: SIMPLE_RADIAL_FISHEYE and "
+        "SIMPLE_RADIAL are tried.",
     )
     params: tuple[float, ...] | None = Field(
         default=None,
