@@ -30,7 +30,7 @@ def describe_machine() -> dict[str, Any]:
         "torch": torch.__version__,
     }
     if torch.cuda.is_available():
-        found["gpu"] = torch.cuda.get_device_name(0)
+        found["gpu"] = torch.cuda.get_device_name()  # of the current device
     return found
 
 

@@ -125,8 +125,10 @@ def test_everything_for_a_gpu_runs_on_a_cpu(tmp_path):
 
 
 def test_a_part_for_a_gpu_that_fails_is_recorded_and_the_others_run(tmp_path):
-    status, parts, summary = gpu_script(tmp_path / "out", PYTHON="false")
+    status, parts, summary = gpu_script(tmp_path / "out", "--device", "cuda", PYTHON="false")
     assert status == 1 and set(parts.values()) == {"failed (1)"} and len(parts) > 6
     assert "## doctor: failed (1)" in summary
+    status, parts, _ = gpu_script(tmp_path / "idle", "--device", "cuda", PYTHON="true")
+    assert status == 0 and set(parts.values()) == {"ok"} and list(parts)[-1] == "report"
     status, parts, _ = gpu_script(tmp_path / "late", "--minutes", "0")
     assert status == 0 and set(parts.values()) == {"no time left"}
