@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.assignments import assignments
 
 if TYPE_CHECKING:
+    from coliags_plugin.pipeline.procedure.run import FinishedProcedure
     from coliags_plugin.pipeline.stages import Record
 
 
@@ -25,7 +26,7 @@ def reconstruct(
     jobs: int | None = None,
     threads: int | None = None,
     ray_address: str | None = None,
-) -> Record:
+) -> Record | FinishedProcedure:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
     What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
@@ -45,7 +46,8 @@ def reconstruct(
         ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
 
     Returns:
-        The record: what each stage made, with which options, in what time.
+        The record: what each stage made, with which options, in what time. Of a video that is longer than a segment
+        (``frames.segment``): its segments, each with a record.
 
     Raises:
         InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, view_command
+
+if TYPE_CHECKING:
+    from coliags_plugin.pipeline.procedure.run import FinishedProcedure
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,12 @@ class ReconstructCommand:
     """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
     diameter: arguments.OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
+    start: Annotated[arguments.OptionalText, tyro.conf.arg(name="from", metavar="[H:]M:SS")] = None
+    """Time in the video of the first frame, for instance 3:20; default: the beginning."""
+    end: Annotated[arguments.OptionalText, tyro.conf.arg(name="to", metavar="[H:]M:SS")] = None
+    """Time of the last frame; default: the end."""
     every: arguments.OptionalInt = None
-    """Use the sharpest of every n frames; default: such that at most 1500 are left."""
+    """Use the sharpest of every n frames; default: all."""
     mask: arguments.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
     size: arguments.OptionalText = None
@@ -64,7 +71,9 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.pipeline.frame_sources import frame_at, frame_source
         from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
+        from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE
         from coliags_plugin.reporting.terminal import terminal_text
 
@@ -74,13 +83,15 @@ class ReconstructCommand:
             if self.params is None
             else parse_assignments([f"params=[{self.params}]"])["params"],
             "diameter": self.diameter,
+            "frames.first": None if self.start is None else frame_at(frame_source(self.video), self.start),
+            "frames.last": None if self.end is None else frame_at(frame_source(self.video), self.end),
             "frames.every": self.every,
             "size": None if self.size is None else arguments.parse_size(self.size),
             "method": self.method,
             "steps": self.steps,
         }
         settings = {key: value for key, value in given.items() if value is not None}
-        record = reconstruct(
+        made = reconstruct(
             self.video,
             self.output,
             settings={**settings, **parse_assignments(self.set)},
@@ -93,6 +104,10 @@ class ReconstructCommand:
             threads=self.threads,
             ray_address=self.ray_address,
         )
+        if isinstance(made, FinishedProcedure):
+            self._tell(made)
+            return
+        record = made
         stages, results = record.stages, results_of(record)
         told = {name: stage for name, stage in stages.items() if "/" not in name}
         lines = [f"{name}: {stage.summary}" for name, stage in told.items()]
@@ -108,5 +123,29 @@ class ReconstructCommand:
             {"stages": {name: asdict(stage) for name, stage in stages.items()}},
             written=[self.output / PAGE_FILE],
             then=[view_command(self.output / "run")],
+            as_json=self.json,
+        )
+
+    def _tell(self, made: FinishedProcedure) -> None:
+        """Print what became of the segments of a long video."""
+        from coliags_plugin.pipeline.page import held_out_text, results_of
+        from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE
+
+        lines = []
+        for (name, record), segment in zip(made.segments.items(), made.procedure.segments, strict=True):
+            told = [record.stages["poses"].summary.partition("\n")[0]] if "poses" in record.stages else ["not begun"]
+            told += [f"held-out PSNR: {held_out_text(results_of(record))}"] if "evaluate" in record.stages else []
+            lines.append(f"{name}, frames {segment.first} to {segment.last}: {'; '.join(told)}")
+        lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
+        for each in made.procedure.joins:
+            what = "joined" if each["joined"] else f"not joined: {each['reason']}"
+            lines.append(f"{' and '.join(each['segments'])}: {what}")
+        stages = {
+            name: {stage: asdict(one) for stage, one in record.stages.items()} for name, record in made.segments.items()
+        }
+        print_summary(
+            "\n".join(lines),
+            {"segments": stages, "joins": list(made.procedure.joins)},
+            written=[self.output / PROCEDURE_FILE],
             as_json=self.json,
         )

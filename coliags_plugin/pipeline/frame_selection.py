@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -38,14 +37,9 @@ INTERLACED = 1.3
 THINNED, EMPTY, RESTING = "thinned out", "black or without any texture", "the camera rests"
 
 
-def interval(count: int, settings: FrameSettings) -> int:
-    """Of so many frames one is used, in a video of ``count``."""
-    return settings.every or max(1, math.ceil(count / settings.at_most))
-
-
 def sharpest_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[list[int], dict[int, str]]:
     """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped."""
-    values, step = np.asarray(sharpness), interval(len(sharpness), settings)
+    values, step = np.asarray(sharpness), settings.every
     best = [first + int(np.argmax(values[first : first + step])) for first in range(0, len(values), step)]
     dropped = dict.fromkeys(set(range(len(values))) - set(best), THINNED)
     some = [index for index in best if values[index] > 0.0]
@@ -121,7 +115,14 @@ def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
 def motion(
     before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> float:
-    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few.
+    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few."""
+    return motion_and_survival(before, after, mask)[0]
+
+
+def motion_and_survival(
+    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
+) -> tuple[float, float]:
+    """Median displacement of corners as a share of the larger side, infinity for too few, and the share followed.
 
     ``mask``, of the frames before they were reduced, is False where corners do not count, as on text, which rests.
     """
@@ -134,14 +135,14 @@ def motion(
         counted = cv2.erode(counted, np.ones((_RIM, _RIM), np.uint8))
     corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8, mask=counted)
     if corners is None or len(corners) < _FEWEST:
-        return float("inf")
+        return float("inf"), 0.0
     moved, tracked = _followed(before, after, corners)
     back, again = _followed(after, before, moved)
     kept = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
     if kept.sum() < _FEWEST:
-        return float("inf")
+        return float("inf"), float(kept.sum()) / _CORNERS
     lengths = np.linalg.norm(moved - corners, axis=2)[kept, 0]
-    return float(np.median(lengths)) / max(before.shape)
+    return float(np.median(lengths)) / max(before.shape), float(kept.sum()) / _CORNERS
 
 
 def _followed(

@@ -26,6 +26,21 @@ log = logging.getLogger(__name__)
 
 #: Share of the frames stated by a video's header below which it is said that the others are missing.
 _COMPLETE = 0.95
+#: Frames a second that no header states in earnest.
+_FASTEST = 1000.0
+
+
+@dataclass(frozen=True)
+class Span:
+    """Frames of a video, by their numbers in it."""
+
+    first: int = 0
+    last: int | None = None  # inclusive; None: to the end
+    seek: bool = True  # whether the first is sought, or all before it are decoded
+
+    def count(self, of: int) -> int:
+        """How many there are in a video of so many frames; at least 1, so that progress has an end."""
+        return max(1, (of if self.last is None else min(of, self.last + 1)) - self.first)
 
 
 class FrameSource(Protocol):
@@ -36,11 +51,19 @@ class FrameSource(Protocol):
         """The file or folder."""
 
     @property
+    def span(self) -> Span:
+        """Which of its frames."""
+
+    @property
     def expected(self) -> int:
         """Number of frames by what the file says, at least 1; for progress alone."""
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Names, which sort in frame order, and RGB images, all of one size."""
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second; None where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +71,20 @@ class ImageFolder:
     """Images of a folder, in the natural order of their names."""
 
     path: Path
+    span: Span = Span()
+    rate: float | None = None
 
     @property
     def expected(self) -> int:
         """Number of images."""
-        return len(list_images(self.path))
+        return self.span.count(len(list_images(self.path)))
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Stems of the file names, and images; see :class:`FrameSource`."""
         images = list_images(self.path)
         shape: tuple[int, ...] | None = None
-        for name, path in zip(file_names([path.stem for path in images], ""), images, strict=True):
+        named = list(zip(file_names([path.stem for path in images], ""), images, strict=True))
+        for name, path in named[self.span.first :][: self.span.count(len(named))]:
             image = read_image(path)
             shape = shape or image.shape
             if image.shape != shape:
@@ -75,57 +101,90 @@ class VideoFile:
     """Frames of a video file, decoded by OpenCV."""
 
     path: Path
+    span: Span = Span()
 
     @property
     def expected(self) -> int:
         """Number of frames by the file's header."""
+        return self.span.count(self._frame_count)
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second by the file's header; None where it does not say."""
         import cv2
 
+        rate = self._of_header(cv2.CAP_PROP_FPS)
+        return rate if 0.0 < rate < _FASTEST else None
+
+    @property
+    def _frame_count(self) -> int:
+        import cv2
+
+        return max(1, int(self._of_header(cv2.CAP_PROP_FRAME_COUNT)))
+
+    def _of_header(self, what: int) -> float:
         video = _opened(self.path)
         try:
-            return max(1, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
+            return video.get(what)
         finally:
             video.release()
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Names ``frame_000000``, ... by their number in the video, and images; see :class:`FrameSource`."""
-        expected = self.expected
+        expected, span = self.expected, self.span
         video = _opened(self.path)
-        count, shape = 0, None
+        number, shape = _go_to(video, span), None
         try:
-            while True:
+            while span.last is None or number <= span.last:
                 there, image = video.read()
                 if not there:
                     break
                 shape = shape or image.shape
                 if image.shape != shape:
                     raise InputError(
-                        f"{self.path}: the size changes at frame {count}", "frames of one size", _AS_IMAGES
+                        f"{self.path}: the size changes at frame {number}", "frames of one size", _AS_IMAGES
                     )
-                yield f"frame_{count:06d}", np.ascontiguousarray(image[..., ::-1])
-                count += 1
+                yield f"frame_{number:06d}", np.ascontiguousarray(image[..., ::-1])
+                number += 1
         finally:
             video.release()
+        count = number - span.first
+        if count <= 0 and span.first > 0:
+            raise InputError(f"{self.path} has no frame {span.first}", f"one of about {self._frame_count} frames")
         if count == 0:
             raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec OpenCV has", _AS_IMAGES)
         if count < _COMPLETE * expected:
             log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, expected)
 
 
+def _go_to(video: cv2.VideoCapture, span: Span) -> int:
+    """Have the first frame of a span come next; returns its number, or where the video ended before it."""
+    import cv2
+
+    if span.seek and span.first > 0 and video.set(cv2.CAP_PROP_POS_FRAMES, span.first):
+        if round(video.get(cv2.CAP_PROP_POS_FRAMES)) == span.first:
+            return span.first
+        video.set(cv2.CAP_PROP_POS_FRAMES, 0)
+    for number in range(span.first):
+        if not video.grab():
+            return number
+    return span.first
+
+
 _AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the folder"
 
 
-def frame_source(path: Path) -> FrameSource:
-    """The frames of a file or folder."""
+def frame_source(path: Path, span: Span = Span()) -> FrameSource:
+    """The frames of a file or folder, all or some."""
     if path.is_dir():
         list_images(path)
-        return ImageFolder(path)
+        return ImageFolder(path, span)
     if not path.exists():
         raise InputError(f"no {path}", "a video file, or a folder of images", "Check the path")
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image", "a video file, or a folder of images", "Give its folder")
     _opened(path).release()
-    return VideoFile(path)
+    return VideoFile(path, span)
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
@@ -146,6 +205,29 @@ def _opened(path: Path) -> cv2.VideoCapture:
             f"Fetch it again if it is incomplete. {_AS_IMAGES}",
         )
     return video
+
+
+def frame_at(source: FrameSource, time: str) -> int:
+    """Number of the frame at a time such as ``200``, ``3:20`` or ``1:02:03.5`` (seconds, minutes, hours).
+
+    Raises:
+        InputError: This is no time, or the source does not tell how many frames a second has.
+    """
+    try:
+        parts = [float(part) for part in time.split(":")]
+        if len(parts) > 3 or min(parts) < 0.0:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"the time '{time}'", "seconds, or hours, minutes and seconds such as 3:20 or 1:02:03.5"
+        ) from None
+    if source.rate is None:
+        raise InputError(
+            f"the time {time}, and {source.path} does not tell how many frames a second it has",
+            "a video whose header does",
+            "Give numbers of frames: --set frames.first=100 --set frames.last=400",
+        )
+    return round(sum(part * 60.0**power for power, part in enumerate(reversed(parts))) * source.rate)
 
 
 @contextmanager

@@ -21,7 +21,6 @@ from coliags_plugin.pipeline.frame_selection import (
     THINNED,
     blurred_frames,
     combing,
-    interval,
     lens_mask,
     motion,
     overlays,
@@ -100,15 +99,20 @@ def write_frames(
             {
                 "source": source.path.name,
                 "frames": total,
-                "every": interval(total, settings),
+                "every": settings.every,
                 "size": [size[1], size[0]],
                 "masked": None if used is None else round(float(1.0 - used.mean()), 4),
                 "kept": [
-                    {"frame": index, "name": name, "sharpness": sharpnesses[index], "blurred": index in blurred}
+                    {
+                        "frame": source.span.first + index,
+                        "name": name,
+                        "sharpness": sharpnesses[index],
+                        "blurred": index in blurred,
+                    }
                     for index, name in kept
                 ],
                 "dropped": [
-                    {"frame": index, "why": why, "sharpness": sharpnesses[index]}
+                    {"frame": source.span.first + index, "why": why, "sharpness": sharpnesses[index]}
                     for index, why in sorted(dropped.items())
                     if why != THINNED
                 ],

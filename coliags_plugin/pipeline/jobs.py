@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from coliags_plugin.execution.choice import ExecutionOptions
@@ -34,6 +34,7 @@ class PartJobs:
         options: How.
         overwrite: Whether stages that were made with other options are removed.
         size: Of all jobs together, in the queue's unit.
+        then: Gives other jobs that are to be done once the stages that all sub-maps need have ended.
 
     Raises:
         InputError: A stage was made with other options, and ``overwrite`` is not given; or a worker of an earlier call
@@ -41,7 +42,13 @@ class PartJobs:
     """
 
     def __init__(
-        self, context: StageContext, executor: Executor, options: ExecutionOptions, overwrite: bool, size: int
+        self,
+        context: StageContext,
+        executor: Executor,
+        options: ExecutionOptions,
+        overwrite: bool,
+        size: int,
+        then: Callable[[PartJobs], list[Job]] | None = None,
     ) -> None:
         self.context, self.executor, self.options, self._overwrite = context, executor, options, overwrite
         self.record = Record.of(context.out)
@@ -49,7 +56,7 @@ class PartJobs:
         self.record.write()
         self.record.take_over_all()
         self.failures: dict[Part, str] = {}
-        self._left, self._size = set[Part](), size
+        self._left, self._size, self._then = set[Part](), size, then
         check_options(stages_of(context), self.record, overwrite)
 
     def jobs(self) -> list[Job]:
@@ -64,13 +71,20 @@ class PartJobs:
         if None in waiting:
             waiting = [None]
         self._left = set(waiting)
+        others = [] if None in waiting else self._others()
         if not waiting:
             self.write_page()
-            return []
+            return others
         frames = {context.submap.number: context.submap.frames or 1 for context in self.context.submaps()}
         shares = {part: 1.0 if part is None else frames[part] / sum(frames.values()) for part in waiting}
         whole = self._size * (_PLAN_SHARE if None in waiting else 1.0)
-        return [PartJob(self, part, parts[part], round(shares[part] * whole)) for part in waiting]
+        own = [PartJob(self, part, parts[part], round(shares[part] * whole)) for part in waiting]
+        return [*own, *others]
+
+    def _others(self) -> list[Job]:
+        """Those that are to be done after the stages that all need, once."""
+        then, self._then = self._then, None
+        return [] if then is None else then(self)
 
     def is_done(self, stage: Stage) -> bool:
         """Whether a stage is."""
@@ -95,7 +109,7 @@ class PartJobs:
             return self.jobs()
         if not self._left:
             self.write_page()
-        return []
+        return self._others() if job.part is None else []
 
     def write_page(self) -> None:
         """Write the page of the reconstruction, and the record in the order of its stages."""

@@ -15,8 +15,10 @@ from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.execution.queue import JobQueue
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.jobs import PartJobs
 from coliags_plugin.pipeline.page import write_index
+from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
 from coliags_plugin.pipeline.recordings import opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
@@ -36,7 +38,7 @@ def reconstruct(
     progress: Progress | None = None,
     anonymous: bool = False,
     execution: ExecutionOptions | None = None,
-) -> Record:
+) -> Record | FinishedProcedure:
     """Reconstruct a video, or go on with what was begun; arguments as in :func:`coliags_plugin.reconstruct`.
 
     Raises:
@@ -48,13 +50,19 @@ def reconstruct(
     if mask is not None and not mask.is_file():
         raise InputError(f"no file {mask}", "an image, black where pixels are ignored", "Check --mask")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
+    frames, is_long = settings.frames, False
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
+        video = frame_source(source, Span(frames.first, frames.last))
+        is_long = is_procedure(video, frames.every, frames.segment)
     else:
         _refuse_unused(source, settings, mask)
-    Record.of(out)  # refuses another folder before anything is written
     context = StageContext(out, source, settings, mask, data_format, device, progress, anonymous)
+    if is_long:
+        with locked(out / LOCK_FILE, out):
+            return reconstruct_procedure(context, execution or ExecutionOptions(jobs=1, device=str(device)), overwrite)
+    Record.of(out)  # refuses another folder before anything is written
     stages = stages_of(context)
     with locked(out / LOCK_FILE, out):
         if execution is not None:

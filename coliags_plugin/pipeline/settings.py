@@ -20,15 +20,18 @@ Pixels = Annotated[int, Field(gt=0)]
 class FrameSettings(Settings):
     """Which frames of a video are used."""
 
-    every: int | None = Field(
-        default=None,
-        ge=1,
-        description="Use the sharpest of every n frames. None: such that at most 'at_most' are left.",
+    first: int = Field(default=0, ge=0, description="Number of the first frame in the video, counted from 0.")
+    last: int | None = Field(default=None, ge=0, description="Number of the last frame; None: of the video.")
+    seek: bool = Field(
+        default=True,
+        description="Whether the first frame is sought in the video's file. false: all before it are decoded, for "
+        "files in which frames are not found by their number.",
     )
-    at_most: int = Field(
+    every: int = Field(default=1, ge=1, description="Use the sharpest of every n frames.")
+    segment: int = Field(
         default=1500,
-        ge=2,
-        description="Largest number of frames where 'every' is not given, spread over the whole video.",
+        ge=50,
+        description="Largest number of frames of use that are posed together; a longer video is cut into segments.",
     )
     least_sharpness: float = Field(
         default=0.5,

@@ -10,7 +10,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline.frame_sources import ImageFolder, VideoFile, frame_source
+from coliags_plugin.pipeline.frame_sources import ImageFolder, Span, VideoFile, frame_at, frame_source
 from tests.pipeline.films import film, write_images
 
 
@@ -73,3 +73,39 @@ def test_images_of_two_sizes_are_refused(tmp_path):
     write_images(tmp_path, [frames[0], frames[1][:100]])
     with pytest.raises(InputError, match=r"1.png is 160 x 100, 0.png 160 x 120. Expected frames of one size"):
         list(frame_source(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "images"])
+@pytest.mark.parametrize("seek", [True, False])
+def test_some_frames_are_those_of_the_whole(tmp_path, name, seek):
+    frames = film(range(0, 120, 3))
+    if name == "images":
+        write_images(tmp_path / name, frames)
+    else:
+        write_video(frames, tmp_path / name, 15.0)
+    whole = list(frame_source(tmp_path / name))
+    for first, last in ((0, 5), (1, 1), (17, 30), (38, 99), (5, None)):
+        source = frame_source(tmp_path / name, Span(first, last, seek))
+        some, stop = list(source), len(whole) if last is None else last + 1
+        assert [name for name, _ in some] == [name for name, _ in whole[first:stop]]
+        assert all(np.array_equal(one, other) for (_, one), (_, other) in zip(some, whole[first:stop], strict=True))
+        assert source.expected == len(some)
+
+
+def test_a_frame_that_a_video_does_not_have(tmp_path):
+    write_video(film(range(0, 30, 3)), tmp_path / "film.mp4", 15.0)
+    with pytest.raises(InputError, match=r"film.mp4 has no frame 50. Expected one of about 10 frames"):
+        list(frame_source(tmp_path / "film.mp4", Span(50)))
+
+
+def test_times_are_frames(tmp_path):
+    write_video(film(range(0, 30, 3)), tmp_path / "film.mp4", 15.0)
+    source = frame_source(tmp_path / "film.mp4")
+    assert source.rate == pytest.approx(15.0)
+    for text, frame in (("0", 0), ("3:20", 3000), ("1:00:00.2", 54003), ("0.4", 6)):
+        assert frame_at(source, text) == frame
+    for text in ("", "3:x", "-1", "1:2:3:4"):
+        with pytest.raises(InputError, match="seconds, or hours, minutes and seconds"):
+            frame_at(source, text)
+    with pytest.raises(InputError, match=r"does not tell how many frames a second.*frames.first"):
+        frame_at(frame_source(write_images(tmp_path / "images", film([0, 5]))), "3:20")

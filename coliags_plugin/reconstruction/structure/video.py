@@ -99,18 +99,25 @@ class MatchedVideo:
 
     def windows(self, longest: int) -> list[range]:
         """Stretches of frames, each mapped by itself: cut where few points are followed, if longer than ``longest``."""
-        followed = np.array([frame.followed for frame in self.tracks])
-        done, left = [], [range(len(self.images))]
-        while left:
-            window = left.pop()
-            if len(window) <= longest:
-                done.append(window)
-                continue
-            # In the middle half, so that windows are not shorter than a quarter of the longest.
-            start, stop = window.start + len(window) // 4, window.start + 3 * len(window) // 4
-            cut = start + int(np.argmin(followed[start:stop]))
-            left += [range(window.start, cut), range(cut, window.stop)]
-        return sorted(done, key=lambda window: window.start)
+        return cut_where_lost([frame.followed for frame in self.tracks], longest)
+
+
+def cut_where_lost(followed: Sequence[float], longest: int) -> list[range]:
+    """Stretches of frames, no longer than ``longest``, cut before frames that show little of the frame before.
+
+    ``followed`` says of each frame how much of that it shows.
+    """
+    counts, done, left = np.asarray(followed), list[range](), [range(len(followed))]
+    while left:
+        window = left.pop()
+        if len(window) <= longest:
+            done.append(window)
+            continue
+        # In the middle half, so that stretches are not shorter than a quarter of the longest.
+        start, stop = window.start + len(window) // 4, window.start + 3 * len(window) // 4
+        cut = start + int(np.argmin(counts[start:stop]))
+        left += [range(window.start, cut), range(cut, window.stop)]
+    return sorted(done, key=lambda window: window.start)
 
 
 def read_video(

@@ -1,0 +1,99 @@
+"""Joins of segments: the similarity between models of two segments that have posed the same frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.datamanagers.colmap.files import find_models
+from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
+
+#: Fewest frames that both models have to have posed.
+_FEWEST = 6
+#: Largest residuals of a join: rotation in degrees, and position as a share of the median depth; and the largest ratio
+#: of the depths of a point-wise scale to its median, as a share.
+_ROTATION, _POSITION, _SCALE = 3.0, 0.1, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrames:
+    """Frames of a model: rotations and centres of the cameras, and median depths of the points that they see."""
+
+    model: str  # folder, relative to the scene
+    rotations: dict[str, Float[np.ndarray, "3 3"]]  # camera to world, by the stem of the frame's name
+    centers: dict[str, Float[np.ndarray, "3"]]
+    depths: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """Whether two models of neighbouring segments are in one place, and how."""
+
+    models: tuple[str, str]
+    frames: int  # that both have posed
+    reason: str = ""  # why they are not joined; empty where they are
+    transform: Float[np.ndarray, "4 4"] | None = None  # from the second model's world to the first's
+    rotation: float = 0.0  # residual, degrees, root mean square
+    position: float = 0.0  # residual, share of the median depth, root mean square
+
+
+def read_posed(scene: Path) -> list[PosedFrames]:
+    """The models of a scene, the largest first."""
+    found = []
+    for folder in find_models(scene):
+        suffix = model_suffix(folder, ("images", "points3D"))
+        positions = {point.number: point.position for point in read_points(folder / f"points3D{suffix}")}
+        frames = PosedFrames(folder.relative_to(scene).as_posix(), {}, {}, {})
+        for image in read_images(folder / f"images{suffix}"):
+            turn = Rotation.from_quat(image.quat_wxyz, scalar_first=True).as_matrix()
+            name, shift = Path(image.name).stem, np.array(image.translation)
+            seen = np.array([positions[number] for number in image.points.tolist() if number in positions])
+            if len(seen):
+                frames.rotations[name], frames.centers[name] = turn.T, -turn.T @ shift
+                frames.depths[name] = float(np.median(seen @ turn[2] + shift[2]))
+        found.append(frames)
+    return found
+
+
+def join(first: list[PosedFrames], second: list[PosedFrames]) -> Join:
+    """The best join of any model of one segment with any of the next."""
+    tried = [_join_models(*pair) for pair in product(first, second)]
+    none = Join(("", ""), 0, "no frame has a pose on one side")
+    return min(tried, key=lambda one: (bool(one.reason), -one.frames), default=none)
+
+
+def _join_models(first: PosedFrames, second: PosedFrames) -> Join:
+    """The similarity by which the shared cameras agree.
+
+    The scale is that of the depths that the shared frames see, which are far less uncertain than the short way of the
+    cameras between them.
+    """
+    names = sorted(first.rotations.keys() & second.rotations.keys())
+    models = (first.model, second.model)
+    if len(names) < _FEWEST:
+        return Join(models, len(names), f"{len(names)} frames have a pose on both sides, fewer than {_FEWEST}")
+    ratios = np.array([first.depths[name] / second.depths[name] for name in names])
+    scale = float(np.median(ratios))
+    spread = float(np.median(np.abs(ratios / scale - 1.0)))
+    turns = Rotation.from_matrix([first.rotations[name] @ second.rotations[name].T for name in names])
+    turn = turns.mean()
+    rotation = float(np.degrees(np.sqrt(np.mean((turns * turn.inv()).magnitude() ** 2))))
+    mine, other = (np.array([frames.centers[name] for name in names]) for frames in (first, second))
+    moved = scale * turn.apply(other)
+    shift = (mine - moved).mean(0)
+    depth = float(np.median([first.depths[name] for name in names]))
+    position = float(np.sqrt(np.mean(np.square(mine - moved - shift).sum(1)))) / depth
+    reason = ""
+    if rotation > _ROTATION or position > _POSITION or spread > _SCALE:
+        reason = (
+            f"the {len(names)} shared frames do not agree: cameras turned by {rotation:.1f} degrees, "
+            f"{100.0 * position:.0f} % of the depth apart, scales differ by {100.0 * spread:.0f} %"
+        )
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = scale * turn.as_matrix(), shift
+    return Join(models, len(names), reason, transform, rotation, position)

@@ -1,0 +1,235 @@
+"""Reconstructs a long video: survey, segments as jobs of worker processes, joins."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.images import write_mask
+from coliags_plugin.execution.choice import ExecutionOptions, make_executor
+from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.queue import Job, JobQueue
+from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
+from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source
+from coliags_plugin.pipeline.frames import MASK
+from coliags_plugin.pipeline.jobs import PartJobs
+from coliags_plugin.pipeline.procedure.joins import Join, join, read_posed
+from coliags_plugin.pipeline.procedure.record import Procedure
+from coliags_plugin.pipeline.procedure.segments import cut
+from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, survey_video
+from coliags_plugin.pipeline.stages import Record
+from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FinishedProcedure:
+    """What a procedure came to."""
+
+    folder: Path
+    procedure: Procedure
+    segments: dict[str, Record]  # by name
+
+
+def is_procedure(source: FrameSource, every: int, segment: int) -> bool:
+    """Whether a video is too long for one segment, by what its header says."""
+    return source.expected > segment * every
+
+
+def reconstruct_procedure(
+    context: StageContext, execution: ExecutionOptions, overwrite: bool = False
+) -> FinishedProcedure:
+    """Reconstruct a long video, or go on with what was begun. The caller holds the folder's lock.
+
+    Raises:
+        InputError: The video cannot be read; the folder was made with other options; or nothing could be posed.
+        InterruptedRunError: Ctrl-C; all that is done is kept.
+    """
+    executor = make_executor(execution)
+    procedure, survey = _prepare(context, overwrite)
+    executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
+    segments = _Segments(context, procedure, survey, executor, execution, overwrite)
+    total = sum(segment.count for segment in procedure.segments)
+    queue = JobQueue(executor, execution.retries, segments.jobs(), total)
+    try:
+        queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
+    except KeyboardInterrupt as error:
+        raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
+    names = [procedure.name(number) for number in range(len(procedure.segments))]
+    procedure = replace(procedure, joins=_joins(context.out, procedure, names))
+    procedure.write(context.out)
+    records = {name: Record.of(context.out / name) for name in names}
+    posed = [name for name, record in records.items() if _state(record, "poses") == "done"]
+    if not posed:
+        reasons = next((record.stages["poses"].summary for record in records.values() if "poses" in record.stages), "")
+        raise InputError(f"none of {len(names)} segments has poses: {reasons}", "a video in which the camera moves")
+    return FinishedProcedure(context.out, procedure, records)
+
+
+def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]:
+    """Survey the video and cut it, or read what was found before."""
+    out, chosen = context.out, context.settings.frames
+    least = context.settings.least_submap
+    options = {"every": chosen.every, "segment": chosen.segment, "last": chosen.last, "least": least}
+    known = Procedure.read(out)
+    size = _size(context.source)
+    if known is not None and (out / SURVEY_FILE).is_file():
+        same = (known.source, known.bytes, known.first) == (context.source.name, size, chosen.first)
+        if not same or known.options != options:
+            raise InputError(
+                f"{out} was made from {known.source}, {known.bytes} bytes, cut by {known.options}",
+                f"{context.source.name}, {size} bytes, cut by {options}",
+                "Choose another --output",
+            )
+        return known, Survey.read(out)
+    if known is None and out.is_dir() and any(not path.name.startswith(".") for path in out.iterdir()):
+        raise InputError(
+            f"{out} already exists and is no procedure", "a new or empty folder", "Choose another --output"
+        )
+    source = frame_source(context.source, Span(chosen.first, chosen.last, chosen.seek))
+    survey = survey_video(source, context.progress)
+    segments, skipped = cut(survey, chosen, least)
+    if not segments:
+        raise InputError(
+            f"no stretch of {context.source} of {least} frames in which points can be followed",
+            "a video of a camera that moves along tissue it sees",
+        )
+    survey.write(out)
+    shifted = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in segments]
+    left_out = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in skipped]
+    seek = chosen.seek and _are_found(context.source, survey, [each.first for each in shifted], chosen.first)
+    procedure = Procedure(
+        context.source.name, size, source.rate, len(survey), survey.size, chosen.first, options, seek, shifted, left_out
+    )  # fmt: skip
+    procedure.write(out)
+    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(shifted), len(left_out))
+    return procedure, survey
+
+
+def _size(source: Path) -> int:
+    files = source.iterdir() if source.is_dir() else [source]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _are_found(path: Path, survey: Survey, numbers: Sequence[int], first: int) -> bool:
+    """Whether frames that are sought by their number are those that came in order."""
+    from zlib import crc32
+
+    from coliags_plugin.pipeline.frame_selection import reduced
+
+    for number in numbers:
+        image = next((image for _, image in frame_source(path, Span(number, number))), None)
+        if image is None or crc32(reduced(image).tobytes()) != survey.checksums[number - first]:
+            log.warning("%s: frames are not found by their number, and decoded in order for every segment", path)
+            return False
+    return True
+
+
+class _Segments:
+    """The segments as reconstructions of their own, whose camera is that of the one that is posed first."""
+
+    def __init__(
+        self,
+        context: StageContext,
+        procedure: Procedure,
+        survey: Survey,
+        executor: Executor,
+        execution: ExecutionOptions,
+        overwrite: bool,
+    ) -> None:
+        self._context, self._procedure, self._overwrite = context, procedure, overwrite
+        self._executor, self._execution = executor, execution
+        self._mask = context.mask
+        if self._mask is None and survey.mask is not None:
+            self._mask = context.out / MASK
+            write_mask(self._mask, survey.mask)
+        followed = [
+            float(survey.followed[each.first - procedure.first : each.last + 1 - procedure.first].sum())
+            for each in procedure.segments
+        ]
+        #: Segments of which one is to tell the camera, the most promising first.
+        self._promising = sorted(range(len(followed)), key=lambda number: -followed[number])
+        self._begun: set[int] = set()
+
+    def jobs(self) -> list[Job]:
+        """Those of the first segment to be posed, or of all where the camera is known."""
+        if has_known_camera(self._context.settings.sfm.camera):
+            return self._all(self._context.settings.sfm.camera)
+        return self._first()
+
+    def _first(self) -> list[Job]:
+        """Pose the most promising segment that is not begun, for the others to have its camera."""
+        number = next((number for number in self._promising if number not in self._begun), None)
+        if number is None:
+            return []
+        self._begun.add(number)
+
+        def others(jobs: PartJobs) -> list[Job]:
+            camera = _camera_of(jobs.context.posed)
+            return self._first() if camera is None else self._all(camera)
+
+        return self._part_jobs(number, self._context.settings.sfm.camera, others)
+
+    def _all(self, camera: CameraSettings) -> list[Job]:
+        """Every segment that is not begun, with a camera."""
+        left = [number for number in range(len(self._procedure.segments)) if number not in self._begun]
+        self._begun.update(left)
+        return [job for number in left for job in self._part_jobs(number, camera, None)]
+
+    def _part_jobs(self, number: int, camera: CameraSettings, then: Any) -> list[Job]:
+        segment, settings = self._procedure.segments[number], self._context.settings
+        frames = settings.frames.model_copy(
+            update={"first": segment.first, "last": segment.last, "seek": self._procedure.seek}
+        )
+        sfm = settings.sfm.model_copy(update={"camera": camera})
+        own = settings.model_copy(update={"frames": frames, "sfm": sfm})
+        out = self._context.out / self._procedure.name(number)
+        context = replace(self._context, out=out, settings=own, mask=self._mask)
+        return PartJobs(context, self._executor, self._execution, self._overwrite, segment.count, then).jobs()
+
+
+def _camera_of(scene: Path) -> CameraSettings | None:
+    """The camera of the largest model of a scene; None where there is none."""
+    folder = scene / "sparse" / "0"
+    suffix = model_suffix(folder, ("images", "cameras"))
+    if suffix is None:
+        return None
+    number = read_images(folder / f"images{suffix}", observations=False)[0].camera
+    camera = read_cameras(folder / f"cameras{suffix}")[number]
+    return CameraSettings(model=camera.model, params=tuple(map(float, camera.params)), refine=False)
+
+
+def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Joins of every two neighbouring segments."""
+    found = []
+    posed = [read_posed(out / name / "poses") if (out / name / "poses").is_dir() else [] for name in names]
+    for number in range(len(names) - 1):
+        gap = procedure.segments[number + 1].first - procedure.segments[number].last - 1
+        if gap >= 0:
+            one = Join(("", ""), 0, f"{gap} frames between them show nothing that can be followed")
+        else:
+            one = join(posed[number], posed[number + 1])
+        found.append(
+            {
+                "segments": list(names[number : number + 2]),
+                "models": list(one.models),
+                "frames": one.frames,
+                "joined": not one.reason,
+                "reason": one.reason,
+                "transform": None if one.transform is None or one.reason else one.transform.tolist(),
+                "rotation_deg": round(one.rotation, 3),
+                "position": round(one.position, 4),
+            }
+        )
+    return found
+
+
+def _state(record: Record, stage: str) -> str:
+    return record.stages[stage].state if stage in record.stages else "not begun"

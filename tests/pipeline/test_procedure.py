@@ -1,0 +1,203 @@
+"""Long videos: survey, segments, joins, and their reconstruction by worker processes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import coliags_plugin as cp
+from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.execution.tasks import TaskOutcome
+from coliags_plugin.outputs.video import write_video
+from coliags_plugin.pipeline import capture_stages
+from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.procedure import run
+from coliags_plugin.pipeline.procedure.joins import PosedFrames, join
+from coliags_plugin.pipeline.procedure.record import Procedure
+from coliags_plugin.pipeline.procedure.segments import OVERLAP, Stretch, cut
+from coliags_plugin.pipeline.procedure.survey import Survey, survey_video
+from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.stages import Record, StageOutcome
+from tests import commands
+from tests.pipeline.conftest import TRAINING, write_atlas
+from tests.pipeline.films import film
+from tests.pipeline.test_jobs import Workers
+
+SUBMAP = ("check_data", "estimate_depth", *TRAINING)
+
+
+def surveyed(followed, sharpness=1.0):
+    followed = np.array(followed, np.float32)
+    count = len(followed)
+    sharp = np.full(count, sharpness, np.float32)
+    return Survey(sharp, followed, np.zeros(count, np.float32), np.arange(count, dtype=np.uint32), (40, 50), None)
+
+
+def test_a_survey_sees_every_frame_once_and_is_read_back(tmp_path):
+    write_video(film([*range(0, 60, 2), *range(0, 60, 2)]), tmp_path / "film.mp4", 15.0)
+    survey = survey_video(frame_source(tmp_path / "film.mp4"))
+    assert len(survey) == 60 and survey.size == (120, 160)
+    assert survey.followed[0] == 0.0
+    assert survey.followed[30] < 0.5 * np.median(survey.followed), "the film begins again there"
+    assert np.isfinite(survey.motion[1:30]).all() and (survey.sharpness > 0).all()
+    survey.write(tmp_path)
+    again = Survey.read(tmp_path)
+    for name in ("sharpness", "followed", "motion", "checksums"):
+        np.testing.assert_array_equal(getattr(survey, name), getattr(again, name))
+    assert again.size == survey.size and (again.mask is None) == (survey.mask is None)
+
+
+def test_a_video_is_cut_where_nothing_is_seen_for_long_and_where_least_is_followed():
+    followed = np.full(1000, 0.8)
+    followed[300:350] = 0.0  # contact
+    followed[500] = 0.0  # one lost frame is no break
+    followed[620] = 0.2
+    segments, skipped = cut(surveyed(followed), FrameSettings(segment=500), 12)
+    assert [(each.first, each.last) for each in skipped] == [(300, 349)]
+    half = OVERLAP // 2
+    # The middle half of 350 to 999 has frame 500 in it, where least is followed.
+    assert segments == [Stretch(0, 299), Stretch(350, 499 + half), Stretch(500 - half, 999)] or segments[0].last == 299
+    assert segments[1].last - segments[2].first + 1 == OVERLAP
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(20, 3000), longest=st.integers(60, 700), every=st.integers(1, 4))
+def test_every_frame_is_in_a_segment_or_left_out_and_none_is_too_long(seed, count, longest, every):
+    generator = np.random.default_rng(seed)
+    followed = generator.uniform(0.3, 1.0, count)
+    for _ in range(generator.integers(0, 6)):
+        start = generator.integers(0, count)
+        followed[start : start + generator.integers(1, 200)] = 0.0
+    segments, skipped = cut(surveyed(followed), FrameSettings(segment=longest, every=every), 12)
+    covered = np.zeros(count, int)
+    for each in segments:
+        covered[each.first : each.last + 1] += 1
+        assert each.count <= max(longest, 2 * OVERLAP + OVERLAP) * every
+    for each in skipped:
+        assert not covered[each.first : each.last + 1].any()
+        covered[each.first : each.last + 1] = 1
+    assert (covered > 0).all() and covered.max(initial=0) <= 2
+    assert all(one.first < other.first and one.last < other.last for one, other in pairwise(segments))
+
+
+def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
+    """Cameras on a bent path that look at points 30 away; in a world of its own."""
+    generator = np.random.default_rng(7)
+    scale, turn, shift = (1.0, Rotation.identity(), np.zeros(3)) if transform is None else transform
+    frames = PosedFrames(model, {}, {}, {})
+    for index in range(first, first + count):
+        name, center = f"frame_{index:06d}", np.array([0.1 * index, 0.02 * index**2 / 10, 0.3 * index])
+        rotation = Rotation.from_rotvec([0.02 * index, 0.1, 0.0])
+        frames.rotations[name] = (turn * rotation).as_matrix()
+        frames.centers[name] = scale * turn.apply(center + noise * generator.normal(size=3)) + shift
+        frames.depths[name] = scale * 30.0
+    return frames
+
+
+def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
+    other = (0.4, Rotation.from_rotvec([0.3, -1.0, 2.0]), np.array([5.0, -7.0, 1.0]))
+    first, second = posed(20), posed(30, other, first=12)
+    found = join([posed(4, model="sparse/1", first=90), first], [second])
+    assert (found.reason, found.frames, found.models) == ("", 8, ("sparse/0", "sparse/0"))
+    for name in ("frame_000012", "frame_000019"):
+        place = found.transform @ [*second.centers[name], 1.0]
+        np.testing.assert_allclose(place[:3], first.centers[name], atol=1e-9)
+    assert found.rotation == pytest.approx(0.0, abs=1e-5) and found.position == pytest.approx(0.0, abs=1e-9)
+    assert "3 frames have a pose on both sides" in join([posed(15)], [posed(9, other, first=12)]).reason
+    assert "do not agree" in join([first], [posed(30, other, 20.0, first=12)]).reason
+    assert join([], [second]).reason == "no frame has a pose on one side"
+
+
+@pytest.fixture
+def workers(monkeypatch):
+    def use(*endings):
+        executor = Workers(*endings)
+        monkeypatch.setattr(run, "make_executor", lambda options: executor)
+        return executor
+
+    return use
+
+
+@pytest.fixture
+def long_video(done, tmp_path, monkeypatch):
+    """Of 150 frames, cut into segments of at most 60, each posed in three models, with a contact of 40 frames."""
+    still = np.zeros((120, 160, 3), np.uint8)
+    images = film(range(0, 110))
+    write_video([*images[:70], *[still] * 40, *images[70:]], tmp_path / "long.mp4", 15.0)
+
+    def poses(context):
+        done.append(f"{context.out.name}/make_poses")
+        write_atlas(context.posed)
+        return StageOutcome("31 of 50 images posed")
+
+    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    return tmp_path / "long.mp4"
+
+
+OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
+
+
+def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers, done, monkeypatch):
+    executor = workers()
+    made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    names = list(made.segments)
+    plans = [task for task in executor.tasks if task.part is None]
+    assert len(plans) == len(names) >= 3 and executor.tasks[0].part is None
+    cameras = [json.loads(task.settings)["sfm"]["camera"] for task in plans]
+    assert cameras[0]["params"] is None and all(camera["params"] is not None for camera in cameras[1:])
+    (skipped,) = made.procedure.skipped
+    assert 70 <= skipped.first <= 72 and 105 <= skipped.last <= 110
+    for name, segment in zip(names, made.procedure.segments, strict=True):
+        kept = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
+        assert [frame["frame"] for frame in kept] == list(range(segment.first, segment.last + 1))
+        assert made.segments[name].stages["submap-1/report"].state == "done"
+    assert len(made.procedure.joins) == len(names) - 1
+    assert any("show nothing that can be followed" in each["reason"] for each in made.procedure.joins)
+    assert replace(Procedure.read(tmp_path / "out")) == replace(made.procedure, segments=list(made.procedure.segments))
+    before = list(done)
+    executor = workers()
+    cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    assert executor.tasks == [] and done == before, "what is done is not done again"
+    with pytest.raises(InputError, match="Choose another --output"):
+        cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
+
+
+def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
+    long_video, tmp_path, workers, done, monkeypatch
+):
+    workers(None, KeyboardInterrupt())
+    with pytest.raises(InterruptedRunError):
+        cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    make_poses, failing = capture_stages.make_poses, ["segment-001"]
+
+    def poses(context):
+        if context.out.name in failing:
+            raise InputError("2 of 50 frames have poses")
+        return make_poses(context)
+
+    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    workers(TaskOutcome("died", "the node died"))
+    given = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
+    assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *given) == 0
+    records = {path.parent.name: Record.of(path.parent) for path in (tmp_path / "out").glob("*/reconstruction.json")}
+    done_poses = {name: record.stages["poses"].state for name, record in records.items()}
+    assert sorted(done_poses.values())[0] == "done" and len(records) >= 3
+    failing[:] = [f"segment-{number:03d}" for number in range(9)]
+    with pytest.raises(InputError, match=r"none of \d segments has poses: 2 of 50 frames"):
+        workers()
+        cp.reconstruct(long_video, tmp_path / "none", settings=OPTIONS)
+
+
+def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):
+    survey = survey_video(frame_source(long_video))
+    assert run._are_found(long_video, survey, [0, 55, 120], 0)
+    other = replace(survey, checksums=survey.checksums + 1)
+    assert not run._are_found(long_video, other, [55], 0) and "decoded in order" in caplog.text
+    assert len(list(frame_source(long_video, Span(140, None, seek=False)))) == 10
