@@ -31,6 +31,7 @@ from tests.datamanagers.spoiling import (
     cut,
     double_colmap,
     drop_last_line,
+    edit,
     files,
     grey,
     half_size,
@@ -55,7 +56,9 @@ from tests.datamanagers.spoiling import (
 MATRICES = ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam")
 #: Kinds whose poses are frames of a JSON file.
 FRAMES_OF_JSON = ("rotatecolon", "nerfstudio", "reim-nerf")
-TUM = ("rgbd", "rgbd-by-order")
+TUM = ("rgbd", "rgbd-by-order", "endomapper")
+#: Of them, those with a camera.json, and those whose line n of the trajectory belongs to image n.
+TUM_JSON, BY_ORDER = ("rgbd", "rgbd-by-order"), ("rgbd-by-order", "endomapper")
 COLMAP = ("colmap", "colmap-text")
 #: Kinds with EndoGSLAM's result.
 PARAMS = tuple(name for name, kind in KINDS.items() if kind.params)
@@ -71,6 +74,7 @@ SIZES = {
     "rgbd": "camera.json",
     "rgbd-by-order": "camera.json",
     "reim-nerf": "transforms_train.json",
+    "endomapper": "calibration.xml",
 }
 
 Rows = dict[str, list[tuple[Spoil, str]]]
@@ -166,7 +170,7 @@ ERRORS: dict[str, list[Row]] = {
     ],
     "depth that is missing for a frame": same(
         lambda kind: remove(kind.depths, 3),
-        ((*PAIRED, "rgbd-by-order"), "11 images and 10 depth files; frame 3 has only one of the two.*for every image"),
+        ((*PAIRED, *BY_ORDER), "11 images and 10 depth files; frame 3 has only one of the two.*for every image"),
         ("rotatecolon", "depth_train has 10 depth files for 11 frames; frame 3 has none.*for every image"),
         ("nerfstudio", r"transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png"),
         ("reim-nerf", r"names \S*distmaps/0003_color\.png, which does not exist"),
@@ -174,7 +178,7 @@ ERRORS: dict[str, list[Row]] = {
     "no depth and no points": same(
         lambda kind: remove(kind.depths),
         (
-            ("c3vd", "c3vd-raw", "c3vd-v2", "rgbd"),
+            ("c3vd", "c3vd-raw", "c3vd-v2", "rgbd", "endomapper"),
             r"neither depth files nor points3D\.ply.*points3D\.ply \(world of the poses\)",
         ),
     ),
@@ -191,14 +195,14 @@ ERRORS: dict[str, list[Row]] = {
         ("rotatecolon", r"transforms\.json: frame 3 has no image \S*0003\.png"),
         (COLMAP, r"1 of the 11 images of \S*sparse/0 are not in \S*images: 0003\.png"),
         ("nerfstudio", r"transforms\.json: 1 of 11 frames have no image in .*images/frame_00004\.png"),
-        ("rgbd-by-order", r"groundtruth\.txt has 11 poses for 10 images"),
+        (BY_ORDER, r"<poses> has 11 poses for 10 images"),
         ("reim-nerf", r"names \S*images/0003_color\.png, which does not exist"),
     ),
     "two images of one number": same(
         lambda kind: (
             lambda folder: shutil.copy(image := files(folder, kind.images)[4], image.with_name(f"00{image.name}"))
         ),
-        (("c3vd", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "rgbd-by-order"), "have the same number"),
+        (("c3vd", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", *BY_ORDER), "have the same number"),
     ),
     "numbers from one on": same(
         lambda kind: rename([kind.images, kind.depths], lambda number: number + 1),
@@ -213,7 +217,7 @@ ERRORS: dict[str, list[Row]] = {
     ),
     "fewer poses than images": [
         (
-            (*MATRICES, "rgbd-by-order"),
+            (*MATRICES, *BY_ORDER),
             lambda kind: drop_last_line(kind.poses),
             "<poses> has 10 poses for 11 images.*a pose for every image",
         ),
@@ -225,7 +229,7 @@ ERRORS: dict[str, list[Row]] = {
     ],
     "more poses than images": [
         (
-            (*MATRICES, "rgbd-by-order"),
+            (*MATRICES, *BY_ORDER),
             lambda kind: repeat_last_line(kind.poses),
             "<poses> has 12 poses for 11 images.*a pose for every image",
         ),
@@ -366,7 +370,7 @@ ERRORS: dict[str, list[Row]] = {
     ],
     "intrinsics of another resolution": [
         (
-            ("c3vd", *TUM),
+            ("c3vd", *TUM_JSON),
             lambda _: change_json("camera.json", _doubled(*_TWICE_K, "w", "h")),
             r"\.png is 64 x 51, but \S*camera\.json says 128 x 102",
         ),
@@ -406,10 +410,18 @@ ERRORS: dict[str, list[Row]] = {
     ],
     "no camera file": [
         ("c3vd", lambda _: remove("camera.json"), r"has images but no camera\.json"),
-        (TUM, lambda _: remove("camera.json"), r"has images but no camera\.json, intrinsics\.txt, cameras\.txt"),
+        *(
+            (
+                kinds,
+                lambda _, file=file: remove(file),
+                r"but no camera\.json, intrinsics\.txt, cameras\.txt or calibration",
+            )
+            for kinds, file in ((TUM_JSON, "camera.json"), ("endomapper", "calibration.xml"))
+        ),
     ],
     "a camera file cut short": [
-        (("c3vd", *TUM), lambda _: cut("camera.json"), r"camera\.json is not JSON: .* line.*JSON object"),
+        ("endomapper", lambda _: cut("calibration.xml"), r"calibration\.xml is not XML: .*line \d+.*Restore"),
+        (("c3vd", *TUM_JSON), lambda _: cut("camera.json"), r"camera\.json is not JSON: .* line.*JSON object"),
         (
             "c3vd-v2",
             lambda _: cut("camera_intrinsics.txt"),
@@ -419,18 +431,18 @@ ERRORS: dict[str, list[Row]] = {
         ("colmap-text", lambda _: cut("sparse/0/cameras.txt", 0, 0.9), r"cameras\.txt, line 4: '1 PINHOLE 64 51"),
     ],
     "camera.json without numbers": [
-        (("c3vd", *TUM), lambda _: write_text("camera.json", "[]"), r"camera\.json has no fx, fy")
+        (("c3vd", *TUM_JSON), lambda _: write_text("camera.json", "[]"), r"camera\.json has no fx, fy")
     ],
     "camera.json without keys": [
-        (("c3vd", *TUM), lambda _: change_camera(fx=None, cy=None), r"camera\.json has no fx, cy")
+        (("c3vd", *TUM_JSON), lambda _: change_camera(fx=None, cy=None), r"camera\.json has no fx, cy")
     ],
-    "a word for a focal length": [(("c3vd", *TUM), lambda _: change_camera(fx="wide"), r"camera\.json: .*'wide'")],
+    "a word for a focal length": [(("c3vd", *TUM_JSON), lambda _: change_camera(fx="wide"), r"camera\.json: .*'wide'")],
     "no focal length": [
-        (("c3vd", *TUM), lambda _: change_camera(fy=0), r"camera\.json: .*above 0"),
+        (("c3vd", *TUM_JSON), lambda _: change_camera(fy=0), r"camera\.json: .*above 0"),
         ("reim-nerf", lambda _: change_camera("transforms_*.json", fy=0), r"transforms_train\.json: .*above 0"),
     ],
     "half pixels": [
-        (("c3vd", *TUM), lambda _: change_camera(w=64.5), "whole pixels"),
+        (("c3vd", *TUM_JSON), lambda _: change_camera(w=64.5), "whole pixels"),
         ("reim-nerf", lambda _: change_camera("transforms_*.json", h=51.5), "w = 64.0, h = 51.5"),
     ],
     "a crop": same(
@@ -476,7 +488,9 @@ ERRORS: dict[str, list[Row]] = {
         ),
     ),
     "a depth scale that nobody says": same(
-        lambda _: change_camera(depth_scale=None),
+        lambda kind: (
+            change_camera(depth_scale=None) if kind.format == "rgbd" else edit("calibration.xml", r"<depth_.*", "")
+        ),
         (TUM, "their number of steps per unit.*5000 steps per metre.*depth_scale=5000"),
     ),
 }
@@ -532,6 +546,17 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             r"rgb/0\.png is not named by a timestamp",
         ),
         *((change_camera(depth_scale=scale), "depth_scale") for scale in (0, -5.0, "5000", True)),
+    ],
+    "endomapper": [
+        (edit("calibration.xml", "_kb4", "_fov"), r"calibration\.xml: the camera model 'calibu_fu_fv_u0_v0_fov'"),
+        (edit("calibration.xml", "> 64 <", "> 128 <"), r"0000\.png is 64 x 51, but \S*calibration\.xml says 128 x 51"),
+        (
+            lambda folder: edit("other.xml", "> 64 <", "> 65 <")(
+                shutil.copy(folder / "calibration.xml", folder / "other.xml").parent
+            ),
+            r"calibration\.xml and other\.xml have different cameras",
+        ),
+        (remove("mask/*.png", 3), r"mask has no mask for 0003\.png"),
     ],
     "reim-nerf": [
         (remove("transforms_true_test.json"), r"has no transforms_true_test\.json.*choose another split"),

@@ -91,6 +91,7 @@ KINDS = {
     "rotatecolon": Kind("rotatecolon", "rotatecolon", "train_views/*.png", "depth_train/*.exr", "transforms.json"),
     "colmap": Kind("colmap", "colmap", "images/*.png", "", ""),
     "colmap-text": Kind("colmap", "colmap", "images/*.png", "", "sparse/0/images.txt", prepare=_text_model),
+    "endomapper": Kind("endomapper", "endomapper", "rgb/*.png", "depth/*.png", "trajectory.txt"),
     "nerfstudio": Kind("nerfstudio", "nerfstudio", "images/*.png", "depth/*.png", "transforms.json"),
     "rgbd": Kind("rgbd", "rgbd", "rgb/*.png", "depth/*.png", "groundtruth.txt"),
     "rgbd-by-order": Kind("rgbd", "rgbd", "rgb/*.png", "depth/*.png", "groundtruth.txt", prepare=_in_order),
@@ -197,6 +198,17 @@ def cut(pattern: str, place: int = 0, share: float = 0.6, lines: int | None = No
 def write_text(name: str, content: str | bytes) -> Spoil:
     """Replace the content of a file."""
     return lambda folder: (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def edit(name: str, old: str, new: str) -> Spoil:
+    """Replace what matches a pattern in a text file."""
+
+    def spoil(folder: Path) -> None:
+        text, count = re.subn(old, new, (folder / name).read_text())
+        assert count > 0
+        (folder / name).write_text(text)
+
+    return spoil
 
 
 def rename(patterns: list[str], change: Callable[[int], object]) -> Spoil:

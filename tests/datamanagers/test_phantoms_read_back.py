@@ -28,8 +28,10 @@ OFF_WALL = {
     "rgbd": (1.0, 0.002),
     "rgbd-by-order": (1.0, 0.002),
     "reim-nerf": (0.5, 0.3),
+    # Pixels of a wider lens.
+    "endomapper": (0.5, 0.35),
 }
-UNDISTORTED = ("c3vd-raw", "c3vd-raw-old", "c3vd-v2", "nerfstudio", "reim-nerf")
+UNDISTORTED = ("c3vd-raw", "c3vd-raw-old", "c3vd-v2", "nerfstudio", "reim-nerf", "endomapper")
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -137,6 +137,10 @@ def of_params(name: str) -> Callable[[Path], float]:
     return lambda folder: float(np.load(folder / name)["intrinsics"][0, 2])
 
 
+def of_calibration(folder: Path) -> float:
+    return float((folder / "calibration.xml").read_text().split("[")[1].split(";")[2])
+
+
 def of_model(name: str) -> Callable[[Path], float]:
     return lambda folder: pycolmap.Reconstruction(str(folder / name)).cameras[1].principal_point_x
 
@@ -151,6 +155,7 @@ def of_model(name: str) -> Callable[[Path], float]:
         ("nerfstudio", of_json("transforms.json"), 0.0),
         ("reim-nerf", of_json("transforms_train.json"), -0.5),
         ("rgbd", of_json("camera.json"), -0.5),
+        ("endomapper", of_calibration, -0.5),
     ],
 )
 def test_files_count_as_their_format_does(name, stored, shift, tmp_path):

@@ -22,7 +22,7 @@ SPLITS = {
     "rotatecolon": "all-train",
 }
 #: Layouts without.
-OTHERS = ("pr-endo", "colmap", "nerfstudio", "rgbd", "reim-nerf")
+OTHERS = ("pr-endo", "colmap", "nerfstudio", "rgbd", "endomapper", "reim-nerf")
 COARSE = {"mesh_spacing": 3.0, "texture_spacing": 1.0, "path_length": 20.0}
 
 

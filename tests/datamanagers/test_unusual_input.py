@@ -43,6 +43,7 @@ def _unpad_colmap(folder: Path) -> None:
 
 UNPADDED = {
     **{name: _unpad(KINDS[name].images, KINDS[name].depths) for name in (*MATRICES, "pr-endo", "rotatecolon")},
+    "endomapper": _unpad("rgb/*.png", "depth/*.png", "mask/*.png"),
     # In TUM's form by order, names of the fixture are unpadded as they are.
     "rgbd-by-order": _unpad(),
     "colmap-text": _unpad_colmap,

@@ -28,9 +28,12 @@ def manager(name: str, **options) -> RecordedDataManager:
 @pytest.mark.parametrize(
     ("name", "stored", "size"),
     [
-        *((name, RAW, PAPER) for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd")),
-        *((name, HD, HD_FITTED) for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd")),
-        *((name, SMALL, SMALL) for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd", "reim-nerf")),
+        *((name, RAW, PAPER) for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd", "endomapper")),
+        *((name, HD, HD_FITTED) for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd", "endomapper")),
+        *(
+            (name, SMALL, SMALL)
+            for name in ("c3vd", "c3vd-v2", "colmap", "nerfstudio", "rgbd", "endomapper", "reim-nerf")
+        ),
         *((name, size, size) for name in ("c3vd-endogslam", "rotatecolon") for size in (RAW, PREPARED, HD, SMALL)),
         *(("reim-nerf", size, FIFTH) for size in (RAW, PREPARED, PAPER, FIFTH)),
     ],

@@ -53,7 +53,7 @@ NODES = ("missing", "folder", "loop", "dangling", "empty", "unreadable")
 #: Words of a text that :func:`single` replaces.
 _WORDS = 40
 _TOKEN = re.compile(rb'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|"[^"\n]*"|[A-Za-z_][\w.-]*')
-_TEXT = frozenset({".txt", ".json", ".yaml", ".yml", ".obj", ".csv", ".jsonl", ".freiburg", ""})
+_TEXT = frozenset({".txt", ".xml", ".json", ".yaml", ".yml", ".obj", ".csv", ".jsonl", ".freiburg", ""})
 _IMAGE = frozenset({".png", ".tiff", ".tif", ".jpg"})
 _HEADERS = frozenset({".ply", ".safetensors", ".glb"})
 

@@ -198,7 +198,7 @@ def _video(folder: Path) -> None:
 
 #: Files of a scene besides its images.
 _FILES = (
-    *("*.json", "*.txt", "*.npz", "*.ply", "*.png", "sparse/0/*"),
+    *("*.json", "*.txt", "*.xml", "*.npz", "*.ply", "*.png", "sparse/0/*"),
     *("rotation/*.txt", "rotation/*.json", "*.yaml"),
 )
 

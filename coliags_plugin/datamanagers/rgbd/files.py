@@ -1,4 +1,4 @@
-"""Finding the files of a scene in TUM's RGB-D layout: images, depth, trajectory and intrinsics."""
+"""Finding the files of a scene in TUM's RGB-D layout: images, depth, trajectory and camera."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import torch
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text, text_lines
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.colmap import read_pinholes
 from coliags_plugin.geometry.poses.formats import shortened
@@ -32,7 +33,7 @@ TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*
 CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
 EXPECTED = (
     f"{', '.join(f'{name}/' for name in IMAGE_FOLDERS)} with images, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
-    f"and one of {', '.join(CAMERA_FILES)}"
+    f"and one of {', '.join(CAMERA_FILES)} or a calibration file (docs/layouts/endomapper.md)"
 )
 #: Where the principal point of an image may lie, as a share of its size, when nothing says which size it is for.
 _MIDDLE = (0.3, 0.7)
@@ -45,7 +46,7 @@ class CameraFile:
     """Contents of a camera file; ``depth_scale`` in depth steps per scene unit, None if not given."""
 
     path: Path
-    intrinsics: Intrinsics
+    lens: Lens  # of the stored images
     depth_scale: float | None = None
 
 
@@ -95,13 +96,18 @@ def files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path]
     return {image.stem: files[image.stem] for image in images}
 
 
+def is_calibrated(folder: Path) -> bool:
+    """Whether the camera of a folder is that of a calibration file."""
+    return not any((folder / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(folder))
+
+
 def lacks_trajectory(folder: Path) -> bool:
-    """Whether a folder holds images, depth and intrinsics in this layout, but no trajectory."""
+    """Whether a folder holds images, depth and a camera in this layout, but no trajectory."""
     return (
         folder.is_dir()
         and any((folder / name).is_dir() for name in IMAGE_FOLDERS)
         and any((folder / name).is_dir() for name in DEPTH_FOLDERS)
-        and any((folder / name).is_file() for name in CAMERA_FILES)
+        and (any((folder / name).is_file() for name in CAMERA_FILES) or is_calibrated(folder))
         and not any(tum.recognise(path) for path in _trajectories(folder))
     )
 
@@ -129,14 +135,18 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
 
 
 def find_camera(folder: Path, image: Path) -> CameraFile:
-    """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
+    """The camera: of ``camera.json``, ``intrinsics.txt``, COLMAP's ``cameras.txt`` or a calibration file, the first.
 
     ``image`` is one of the scene's, for the size if the file has none.
     """
     for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
         if (folder / name).is_file():
             return read(folder / name, image)
-    raise InputError(f"{folder} has images but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
+    calibration = find_calibration(folder)
+    if calibration is None:
+        seen = f"{folder} has images but no {', '.join(CAMERA_FILES)} or calibration file"
+        raise InputError(seen, EXPECTED, "Add the camera")
+    return CameraFile(calibration.path, calibration.lens, calibration.depth_scale)
 
 
 def find_mesh(folder: Path) -> Path | None:
@@ -180,12 +190,12 @@ def _trajectories(folder: Path) -> list[Path]:
 
 
 def _read_json(path: Path, image: Path) -> CameraFile:
-    intrinsics = read_intrinsics(path)
+    lens = PinholeLens.of(read_intrinsics(path))
     content = read_json(path, "a JSON object")
     if content.get("depth_scale") is None:
-        return CameraFile(path, intrinsics)
+        return CameraFile(path, lens)
     expected = "a number above 0: depth steps per scene unit"
-    return CameraFile(path, intrinsics, read_number(content, "depth_scale", path, expected, above=0.0))
+    return CameraFile(path, lens, read_number(content, "depth_scale", path, expected, above=0.0))
 
 
 def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
@@ -210,7 +220,7 @@ def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
             "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
         )
     # OpenCV's K: pixel centres at integers.
-    return CameraFile(path, Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height))
+    return CameraFile(path, PinholeLens(fx, fy, cx + 0.5, cy + 0.5, width, height))
 
 
 def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
@@ -220,7 +230,7 @@ def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
     camera = cameras[0]
     if isinstance(camera, str):
         raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
-    return CameraFile(path, camera)
+    return CameraFile(path, PinholeLens.of(camera))
 
 
 def is_time(name: str) -> bool:

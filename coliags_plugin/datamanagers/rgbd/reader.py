@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -18,11 +18,12 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
-from coliags_plugin.datamanagers.rectification import Rectification
+from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.rgbd import files
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.association import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -41,8 +42,8 @@ class RGBDSettings(SceneSettings):
     depth_scale: float | None = Field(
         None,
         gt=0.0,
-        description="Depth steps per scene unit, the unit of the trajectory. None: from camera.json. TUM's files have "
-        "5000 per metre.",
+        description="Depth steps per scene unit, the unit of the trajectory. None: from the camera's file. TUM's files "
+        "have 5000 per metre.",
     )
     association: Literal["auto", "time", "order"] = Field(
         "auto",
@@ -75,16 +76,18 @@ class RGBDDataManager(RecordedDataManager):
     settings: RGBDSettings
     name = "rgbd"
     unit = "unknown"
+    #: Whether this format's camera is that of a calibration file.
+    is_calibrated: ClassVar[bool] = False
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return files.recognise(path)
+        return files.recognise(path) if files.is_calibrated(path) == cls.is_calibrated else None
 
     @classmethod
     def recognise_unposed(cls, path: Path) -> bool:
         """See :class:`DataManager`."""
-        return files.lacks_trajectory(path)
+        return files.lacks_trajectory(path) and files.is_calibrated(path) == cls.is_calibrated
 
     def without_poses(self) -> DataManager:
         """See :class:`DataManager`."""
@@ -102,8 +105,9 @@ class RGBDDataManager(RecordedDataManager):
         camera = files.find_camera(path, frames.images[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
-        size = self.working_size(camera.intrinsics.width, camera.intrinsics.height)
-        rectification = Rectification.of_pinhole(camera.intrinsics, camera.path, size)
+        (rectification,) = rectifications(
+            {0: camera.lens}, camera.path, self.working_size, settings.focal_scale
+        ).values()
         complete = len(frames.images) == len(images) == len(trajectory)
         seen = find_seen_masks(path / "truth", len(images), complete)
         masks = files.files_of_images(path, files.MASK_FOLDERS, frames.images, "mask")
@@ -134,6 +138,8 @@ class RGBDDataManager(RecordedDataManager):
             "layout": "TUM RGB-D",
             "trajectory": None if file is None else file.name,
             "intrinsics_from": camera.path.name,
+            "lens": type(camera.lens).__name__,
+            "focal_scale": None if isinstance(camera.lens, PinholeLens) else settings.focal_scale,
             "depth_scale": scale,
             "association": frames.facts,
             "masks": len(masks),
@@ -284,7 +290,8 @@ class RGBDDataManager(RecordedDataManager):
         if scale is None:
             raise InputError(
                 f"{path} has depth files, but their number of steps per unit of the trajectory is not given",
-                '"depth_scale" in camera.json, or the option depth_scale; TUM\'s files have 5000 steps per metre',
+                '"depth_scale" in camera.json, <depth_scale> in a calibration file, or the option depth_scale; TUM\'s '
+                "files have 5000 steps per metre",
                 "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
             )
         return scale

@@ -16,7 +16,7 @@ SUFFIX = ".xml"
 #: Name of the camera model: focal lengths, principal point and four terms of Kannala-Brandt.
 TYPE = "calibu_fu_fv_u0_v0_kb4"
 _EXPECTED = f'a <camera_model type="{TYPE}"> with width, height and eight params'
-_CENTER = 0.5  # the files count pixel centres at integers (docs/poses.md 9.1)
+_CENTER = 0.5  # the files count pixel centres at integers (docs/layouts/endomapper.md 2)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Posed sequences of the EndoMapper dataset."""

@@ -1,0 +1,52 @@
+"""A simulated sequence of EndoMapper (docs/layouts/endomapper.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.datamanagers.rgbd.writer import TRAJECTORY, write_frame
+from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.vicalib import calibration_text
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
+from coliags_plugin.phantom.layouts.rgbd import DEPTH_SCALE
+
+CALIBRATION = "calibration.xml"
+#: Like a colonoscope's: 150 degrees of view across the frame.
+_LENS = FisheyeLens(width=1440, height=1080, fx=720.0, fy=720.0, cx=730.0, cy=550.0, k1=-0.14, k2=0.0, k3=0.0, k4=0.0)
+#: Largest angle from the optical axis that is lit, degrees.
+_LIT = 75.0
+
+
+class EndoMapperLayout(Layout):
+    """Fisheye images, depth and masks named by number, trajectory.txt and calibration.xml."""
+
+    default_size = (1440, 1080)
+
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+        """A wide Kannala-Brandt lens, and the circle of its image."""
+        lens = _LENS.resized(width, height)
+        column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
+        lit = np.linalg.norm(rays, axis=1) <= 1.0 / np.cos(np.radians(_LIT))
+        return lens, lit.reshape(height, width)
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`; normals are not part of this layout."""
+        height, width = frame.z_depth.shape
+        _, lit = self.lens(width, height)
+        write_frame(folder, f"{frame.index:04d}.png", frame.color, frame.z_depth, DEPTH_SCALE, lit)
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`."""
+        if not isinstance(lens, FisheyeLens):
+            raise TypeError("EndoMapper's lens is a fisheye")
+        tum.write(folder / TRAJECTORY, Trajectory(poses, timestamps=np.arange(len(poses), dtype=np.float64)))
+        atomic_write(folder / CALIBRATION, calibration_text(lens, DEPTH_SCALE))
+        write_unit(folder, "mm")
