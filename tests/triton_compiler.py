@@ -17,10 +17,12 @@ AMD = (("hip", "gfx942", 64),)
 TARGETS = [*NVIDIA, *(pytest.param(target, marks=pytest.mark.thorough) for target in AMD)]
 #: Bytes of shared memory for which every GPU has several programs at work on each multiprocessor.
 SHARED = 16 * 1024
+#: Bytes of registers that a thread may keep in memory, where the compiler so gets another program on a multiprocessor.
+SPILLED = 8
 
 
 def assert_compiles(path, target, folder, monkeypatch):
-    """All variants of a test module compile, for several programs on a multiprocessor and without spilling registers.
+    """All variants of a test module compile, for several programs on a multiprocessor and hardly spilling registers.
 
     Its ``variants()`` are names, kernels, types of arguments where these are not tables of float32, constants and
     options. They are compiled in an interpreter of their own, in which kernels are not those of triton's interpreter.
@@ -36,7 +38,7 @@ def assert_compiles(path, target, folder, monkeypatch):
     for name, usage in found.items():
         assert usage["shared"] <= SHARED, (name, usage)
         if target in NVIDIA:
-            assert usage["reg"] > 0 and not usage["stack"] and not usage["local"], f"{name} spills registers: {usage}"
+            assert usage["reg"] > 0 and usage["stack"] <= SPILLED and not usage["local"], f"{name} spills: {usage}"
 
 
 def _usages(path, target, folder):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+
+from coliags_plugin.core.triton_support import what_triton_lacks
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
@@ -17,9 +18,9 @@ def fit_kernels(*tensors: Tensor) -> bool:
 
 
 def fit_triton_kernels(*tensors: Tensor) -> bool:
-    """Whether kernels compiled by triton can compute with these tensors: float32 on CUDA, where triton is installed."""
+    """Whether kernels compiled by triton can compute with these tensors: float32 on CUDA, where it can launch them."""
     on_device = all(tensor.device.type == "cuda" and tensor.dtype == torch.float32 for tensor in tensors)
-    return on_device and find_spec("triton") is not None
+    return on_device and what_triton_lacks() is None
 
 
 def tables(*tensors: Tensor) -> list[npt.NDArray[Any]]:

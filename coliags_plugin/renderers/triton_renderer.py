@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import ClassVar
 
 import torch
@@ -12,6 +11,7 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.triton_support import what_triton_lacks
 from coliags_plugin.renderers.checks import check_device, check_float32
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.stages import Stages, draw_view
@@ -32,9 +32,9 @@ class TritonRenderer(SplattingRenderer[TritonRendererSettings]):
 
     @classmethod
     def availability(cls) -> Availability:
-        """Available where triton is installed and a CUDA device is there."""
-        if find_spec("triton") is None:
-            return Availability(False, "triton is not installed; PyTorch for CUDA on Linux brings it")
+        """Available where triton can launch kernels and a CUDA device is there."""
+        if (lack := what_triton_lacks()) is not None:
+            return Availability(False, lack)
         if not torch.cuda.is_available():
             return Availability(False, "no CUDA device is available")
         return Availability(True, f"triton kernels on {torch.cuda.get_device_name()}")

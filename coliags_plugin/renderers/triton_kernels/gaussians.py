@@ -89,17 +89,17 @@ def backward(
         wanted = here[:, None] & (channel < channels)[None, :]
         features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
         of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")
-        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, wanted)
+        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, wanted, sem="relaxed")
         gained = tl.dot(features, of_sums, input_precision="ieee") * weights
         of_logs = of_log_alphas(gained, hidden, alphas, weights, alpha_max)
         hidden -= tl.sum(gained, axis=0)
         of_along, of_across = -of_logs * along, -of_logs * across
         total_along, total_across = tl.sum(of_along, axis=1), tl.sum(of_across, axis=1)
-        tl.atomic_add(of_rows, -(total_along * u_xx + total_across * u_yx), here)
-        tl.atomic_add(of_rows + 1, -total_across * u_yy, here)
-        tl.atomic_add(of_rows + 2, tl.sum(of_along * dx, axis=1), here)
-        tl.atomic_add(of_rows + 3, tl.sum(of_across * dx, axis=1), here)
-        tl.atomic_add(of_rows + 4, tl.sum(of_across * dy, axis=1), here)
-        tl.atomic_add(of_rows + 5, tl.sum(of_logs, axis=1), here)
+        tl.atomic_add(of_rows, -(total_along * u_xx + total_across * u_yx), here, sem="relaxed")
+        tl.atomic_add(of_rows + 1, -total_across * u_yy, here, sem="relaxed")
+        tl.atomic_add(of_rows + 2, tl.sum(of_along * dx, axis=1), here, sem="relaxed")
+        tl.atomic_add(of_rows + 3, tl.sum(of_across * dx, axis=1), here, sem="relaxed")
+        tl.atomic_add(of_rows + 4, tl.sum(of_across * dy, axis=1), here, sem="relaxed")
+        tl.atomic_add(of_rows + 5, tl.sum(of_logs, axis=1), here, sem="relaxed")
         before = tl.min(behind, axis=0)
         first += RANKS

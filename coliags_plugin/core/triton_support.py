@@ -1,0 +1,27 @@
+"""What triton needs to launch kernels, beside a device."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sysconfig
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+
+@cache
+def what_triton_lacks() -> str | None:
+    """Why triton cannot launch kernels on this machine, and what to do; None where it can.
+
+    At first use it compiles the C code that calls the driver.
+    """
+    if find_spec("triton") is None:
+        return "triton is not installed; PyTorch for CUDA on Linux brings it"
+    if os.environ.get("CC") is None and shutil.which("gcc") is None and shutil.which("clang") is None:
+        return "triton finds no C compiler to call the driver by: install gcc, or name one in CC"
+    scheme = sysconfig.get_default_scheme()
+    header = Path(sysconfig.get_paths("posix_prefix" if scheme == "posix_local" else scheme)["include"], "Python.h")
+    if not header.is_file():
+        return f"triton needs {header}, the headers of Python: install python3-dev or the like"
+    return None

@@ -1,0 +1,47 @@
+"""What is said where triton cannot launch kernels."""
+
+import shutil
+import sysconfig
+from importlib.util import find_spec
+
+import pytest
+
+from coliags_plugin.core import triton_support
+
+
+@pytest.fixture
+def lacks(monkeypatch):
+    monkeypatch.setattr(triton_support, "find_spec", lambda name: object())
+    monkeypatch.delenv("CC", raising=False)
+    return triton_support.what_triton_lacks.__wrapped__
+
+
+def test_without_triton(lacks, monkeypatch):
+    monkeypatch.setattr(triton_support, "find_spec", lambda name: None)
+    assert "triton is not installed" in lacks()
+
+
+def test_without_a_compiler_or_the_headers_of_python(lacks, monkeypatch, tmp_path):
+    (tmp_path / "Python.h").touch()
+    monkeypatch.setattr(sysconfig, "get_paths", lambda scheme: {"include": str(tmp_path)})
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert "no C compiler" in lacks() and "gcc" in lacks()
+    monkeypatch.setenv("CC", "cc")
+    assert lacks() is None
+    (tmp_path / "Python.h").unlink()
+    assert "headers of Python" in lacks()
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
+def test_a_compiler_is_sought_where_triton_seeks_it(monkeypatch):
+    from triton.runtime import build
+
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(shutil, "which", {"clang": "clang"}.get)
+    build._find_compiler.cache_clear()
+    assert build._find_compiler("c") == "clang"
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    build._find_compiler.cache_clear()
+    with pytest.raises(RuntimeError, match="C compiler"):
+        build._find_compiler("c")
+    build._find_compiler.cache_clear()
