@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from pathlib import Path
 
 import torch
@@ -15,14 +17,17 @@ from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.execution.queue import JobQueue
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.forecast import forecast, within_budget
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.jobs import PartJobs
 from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
 from coliags_plugin.pipeline.recordings import opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
-from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
+from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+
+log = logging.getLogger(__name__)
 
 #: In which the progress of jobs is told: thousandths of a video.
 _UNITS = 1000
@@ -38,6 +43,7 @@ def reconstruct(
     progress: Progress | None = None,
     anonymous: bool = False,
     execution: ExecutionOptions | None = None,
+    budget: float | None = None,
 ) -> Record | FinishedProcedure:
     """Reconstruct a video, or go on with what was begun; arguments as in :func:`coliags_plugin.reconstruct`.
 
@@ -54,7 +60,15 @@ def reconstruct(
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
-        video = frame_source(source, Span(frames.first, frames.last))
+        video = frame_source(source, Span(frames.first, frames.last, frames.seek))
+        if budget is not None:
+            settings = within_budget(video, settings, budget, _cores(execution))
+            frames = settings.frames
+            log.info("within the budget: one of %d frames, %d steps of a hundred", frames.every, settings.steps)
+        expected = forecast(video, settings)
+        log.info("%s", expected)
+        if not (out / RECORD_FILE).is_file():
+            expected.check_disk(out)
         is_long = is_procedure(video, frames.every, frames.segment)
     else:
         _refuse_unused(source, settings, mask)
@@ -76,6 +90,14 @@ def reconstruct(
     if failure is not None:
         raise failure
     return record
+
+
+def _cores(execution: ExecutionOptions | None) -> float:
+    """CPU cores that work at a time."""
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if execution is None or execution.executor != "local" or execution.jobs is None:
+        return cpus
+    return min(cpus, execution.jobs * (execution.threads or max(1, cpus // execution.jobs)))
 
 
 def _by_workers(context: StageContext, execution: ExecutionOptions, overwrite: bool) -> Record:
