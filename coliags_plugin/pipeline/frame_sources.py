@@ -130,7 +130,10 @@ class VideoFile:
             video.release()
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names ``frame_000000``, ... by their number in the video, and images; see :class:`FrameSource`."""
+        """Names ``frame_000000``, ... by their number in the video, and images; see :class:`FrameSource`.
+
+        Where the file is damaged and goes on behind that, the frames between are black.
+        """
         expected, span = self.expected, self.span
         video = _opened(self.path)
         number, shape = _go_to(video, span), None
@@ -138,7 +141,15 @@ class VideoFile:
             while span.last is None or number <= span.last:
                 there, image = video.read()
                 if not there:
-                    break
+                    last = self._frame_count - 1 if span.last is None else span.last
+                    found = None if shape is None else _beyond_damage(video, number, last)
+                    if found is None:
+                        break
+                    behind, image = found
+                    log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, number, behind - 1)
+                    for lost in range(number, behind):
+                        yield f"frame_{lost:06d}", np.zeros(shape, np.uint8)
+                    number = behind
                 shape = shape or image.shape
                 if image.shape != shape:
                     raise InputError(
@@ -169,6 +180,20 @@ def _go_to(video: cv2.VideoCapture, span: Span) -> int:
         if not video.grab():
             return number
     return span.first
+
+
+def _beyond_damage(video: cv2.VideoCapture, number: int, last: int) -> tuple[int, np.ndarray] | None:
+    """The first frame after one that cannot be decoded, looked for farther and farther on, and its number."""
+    import cv2
+
+    ahead = 1
+    while number + ahead <= last:
+        if video.set(cv2.CAP_PROP_POS_FRAMES, number + ahead):
+            there, image = video.read()
+            if there and round(video.get(cv2.CAP_PROP_POS_FRAMES)) == number + ahead + 1:
+                return number + ahead, image
+        ahead = ahead + max(1, ahead // 4)
+    return None
 
 
 _AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the folder"

@@ -109,3 +109,20 @@ def test_times_are_frames(tmp_path):
             frame_at(source, text)
     with pytest.raises(InputError, match=r"does not tell how many frames a second.*frames.first"):
         frame_at(frame_source(write_images(tmp_path / "images", film([0, 5]))), "3:20")
+
+
+def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
+    generator = np.random.default_rng(0)
+    images = [
+        np.clip(image + generator.normal(0, 12, image.shape), 0, 255).astype(np.uint8) for image in film(range(150))
+    ]
+    write_video(images, tmp_path / "film.mp4", 15.0)
+    whole = list(frame_source(tmp_path / "film.mp4"))
+    data = bytearray((tmp_path / "film.mp4").read_bytes())
+    data[len(data) // 3 : len(data) // 2] = generator.bytes(len(data) // 2 - len(data) // 3)
+    (tmp_path / "damaged.mp4").write_bytes(data)
+    read = list(frame_source(tmp_path / "damaged.mp4"))
+    assert [name for name, _ in read] == [name for name, _ in whole]
+    black = [index for index, (_, image) in enumerate(read) if not image.any()]
+    assert 10 < len(black) < 100 and "cannot be decoded: black here" in caplog.text
+    assert all(np.array_equal(read[index][1], whole[index][1]) for index in (0, 20, 149))

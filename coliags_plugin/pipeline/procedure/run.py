@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source
 from coliags_plugin.pipeline.frames import MASK
 from coliags_plugin.pipeline.jobs import PartJobs
-from coliags_plugin.pipeline.procedure.joins import Join, join, read_posed
+from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, join, read_posed
 from coliags_plugin.pipeline.procedure.record import Procedure
 from coliags_plugin.pipeline.procedure.segments import cut
 from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, survey_video
@@ -208,27 +209,30 @@ def _camera_of(scene: Path) -> CameraSettings | None:
 
 def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[dict[str, Any]]:
     """Joins of every two neighbouring segments."""
-    found = []
-    posed = [read_posed(out / name / "poses") if (out / name / "poses").is_dir() else [] for name in names]
-    for number in range(len(names) - 1):
-        gap = procedure.segments[number + 1].first - procedure.segments[number].last - 1
-        if gap >= 0:
-            one = Join(("", ""), 0, f"{gap} frames between them show nothing that can be followed")
-        else:
-            one = join(posed[number], posed[number + 1])
+    found, before = [], _posed(out / names[0])
+    for (one, other), (first, second) in zip(pairwise(names), pairwise(procedure.segments), strict=True):
+        posed = _posed(out / other)
+        gap = second.first - first.last - 1
+        why = f"{gap} frames between them show nothing that can be followed"
+        made = join(before, posed) if gap < 0 else Join(("", ""), 0, why)
         found.append(
             {
-                "segments": list(names[number : number + 2]),
-                "models": list(one.models),
-                "frames": one.frames,
-                "joined": not one.reason,
-                "reason": one.reason,
-                "transform": None if one.transform is None or one.reason else one.transform.tolist(),
-                "rotation_deg": round(one.rotation, 3),
-                "position": round(one.position, 4),
+                "segments": [one, other],
+                "models": list(made.models),
+                "frames": made.frames,
+                "joined": not made.reason,
+                "reason": made.reason,
+                "transform": None if made.transform is None or made.reason else made.transform.tolist(),
+                "rotation_deg": round(made.rotation, 3),
+                "position": round(made.position, 4),
             }
         )
+        before = posed
     return found
+
+
+def _posed(segment: Path) -> list[PosedFrames]:
+    return read_posed(segment / "poses") if (segment / "poses").is_dir() else []
 
 
 def _state(record: Record, stage: str) -> str:
