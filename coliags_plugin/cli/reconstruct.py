@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import print_summary, view_command
+from coliags_plugin.cli.summaries import coliags, print_summary, view_command
 
 if TYPE_CHECKING:
     from coliags_plugin.pipeline.procedure.run import FinishedProcedure
@@ -133,7 +133,7 @@ class ReconstructCommand:
     def _tell(self, made: FinishedProcedure) -> None:
         """Print what became of the segments of a long video."""
         from coliags_plugin.pipeline.page import held_out_text, results_of
-        from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE
+        from coliags_plugin.pipeline.stages import PAGE_FILE
 
         lines = []
         for (name, record), segment in zip(made.segments.items(), made.procedure.segments, strict=True):
@@ -142,14 +142,15 @@ class ReconstructCommand:
             lines.append(f"{name}, frames {segment.first} to {segment.last}: {'; '.join(told)}")
         lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
         for each in made.procedure.joins:
-            what = "joined" if each["joined"] else f"not joined: {each['reason']}"
-            lines.append(f"{' and '.join(each['segments'])}: {what}")
+            what = "joined" if each.joined else f"not joined: {each.reason}"
+            lines.append(f"{' and '.join(each.segments)}: {what}")
         stages = {
             name: {stage: asdict(one) for stage, one in record.stages.items()} for name, record in made.segments.items()
         }
         print_summary(
             "\n".join(lines),
-            {"segments": stages, "joins": list(made.procedure.joins)},
-            written=[self.output / PROCEDURE_FILE],
+            {"segments": stages, "joins": [each.model_dump(mode="json") for each in made.procedure.joins]},
+            written=[self.output / PAGE_FILE],
+            then=[coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")],
             as_json=self.json,
         )

@@ -95,6 +95,15 @@ def atomic_copy(source: Path, target: Path) -> None:
         shutil.copyfileobj(original, file)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where that is not possible, as on another disk; for scratch folders."""
+    make_folder(target.parent)
+    try:
+        os.link(source.resolve(), target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
 @contextmanager
 def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
     durable, scratch = not is_in_scratch(target), None

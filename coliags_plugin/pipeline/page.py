@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+from markupsafe import escape
 
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
@@ -46,8 +49,10 @@ _KINDS = ("recorded.png", "depth.png", "flattened light.png")
 _LONG = 12
 #: Figures of a sub-map that have a mean over all, with their units.
 _MEASURED = {"psnr": "dB", "ssim": "1", "psnr_pose_refined": "dB", "psnr_training": "dB", "gap": "dB"}
+#: Figures that are words.
+_TEXTS = ("unit", "depth_scale")
 #: What to do where the poses of a sub-map are suspect.
-_SUSPECT = (
+SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
     "more frames (--every), a part of the video without cuts, a mask of what does not move with the wall (--mask), or "
     "the calibration of the camera (--camera, --params)."
@@ -63,8 +68,13 @@ class SubmapResults:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The numbers of all its stages."""
-        return {name: value for stage in self.stages.values() for name, value in stage.figures.items()}
+        """The numbers of all its stages; of a damaged record, those that are numbers."""
+        return {
+            name: value
+            for stage in self.stages.values()
+            for name, value in stage.figures.items()
+            if isinstance(value, str) == (name in _TEXTS) and isinstance(value, int | float | str)
+        }
 
     @property
     def failure(self) -> str:
@@ -83,8 +93,11 @@ def results_of(record: Record) -> list[SubmapResults]:
     return [SubmapResults(Submap(number), stages[number]) for number in sorted(stages)]
 
 
-def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | None = None) -> Table:
-    """Figures of the sub-maps and their means; ``spans`` tell where in the video each is."""
+def submap_table(
+    results: Sequence[SubmapResults], spans: Sequence[str | None] = (), names: Sequence[str] = ()
+) -> Table:
+    """Figures of the sub-maps and their means; ``spans`` tell where in the video each is, ``names`` their names."""
+    names = names or [f"{one.submap.number}{'' if one.submap.number else ', the largest'}" for one in results]
     refined = any("psnr_pose_refined" in one.figures for one in results)
     columns = [
         Column("submap", "Sub-map", words=True),
@@ -97,13 +110,13 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
         Column("psnr_training", "PSNR of training views", "dB"),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),
-        *([Column("seen", "Seen", words=True)] if any(_seen(one.figures) for one in results) else []),
+        *([Column("seen", "Seen", words=True)] if any(seen_of(one.figures) for one in results) else []),
         Column("steps", "Steps"),
         Column("time", "Time"),
     ]
     rows: list[dict[str, Value | TableCell]] = []
     measured: dict[str, list[float | None]] = {key: [] for key in _MEASURED}
-    for one in results:
+    for number, one in enumerate(results):
         figures = one.figures
         if "psnr" in figures and "psnr_training" in figures:
             figures["gap"] = figures["psnr_training"] - figures["psnr"]
@@ -111,12 +124,12 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
             values.append(figures.get(key))
         rows.append(
             {
-                "submap": f"{one.submap.number}{'' if one.submap.number else ', the largest'}",
+                "submap": names[number],
                 "frames": figures.get("frames"),
-                "span": (spans or {}).get(one.submap.number),
+                "span": spans[number] if spans else None,
                 "held_out": figures.get("held_out"),
-                "area": _area(figures),
-                "seen": _seen(figures),
+                "area": area_of(figures),
+                "seen": seen_of(figures),
                 "steps": figures.get("steps"),
                 "time": duration(sum(stage.seconds for stage in one.stages.values())),
             }
@@ -135,11 +148,12 @@ def submap_table(results: Sequence[SubmapResults], spans: Mapping[int, str] | No
     return Table("", columns, rows, name="submaps")
 
 
-def _area(figures: Mapping[str, Any]) -> str | None:
+def area_of(figures: Mapping[str, Any]) -> str | None:
+    """Area of the mesh; None where there is none."""
     return area_text(figures["area"], figures.get("unit") == "mm") if "area" in figures else None
 
 
-def _seen(figures: Mapping[str, Any]) -> str | None:
+def seen_of(figures: Mapping[str, Any]) -> str | None:
     """Share of the wall seen, in per cent, or the seen area where the whole wall is unknown."""
     if "seen" in figures:
         return f"{100.0 * figures['seen']:.0f} %"
@@ -168,7 +182,7 @@ def remarks(record: Record) -> list[str]:
     ]
     checks = {one.submap.title: one.stages["check"] for one in results_of(record) if "check" in one.stages}
     if suspect := [f"{title} ({check.summary})" for title, check in checks.items() if check.warnings]:
-        told.append(f"the poses of {', '.join(suspect)}: {_SUSPECT}")
+        told.append(f"the poses of {', '.join(suspect)}: {SUSPECT}")
     return told
 
 
@@ -188,9 +202,10 @@ def write_index(record: Record, posed: Path, title: str) -> None:
     """Write ``index.html`` for a reconstruction from the scene ``posed``: one file that opens offline."""
     results = results_of(record)
     atlas = read_atlas(posed)
-    spans = {} if atlas is None else _spans(atlas)
+    known = {} if atlas is None else _spans(atlas)
+    spans = [known.get(one.submap.number) for one in results] if known else []
     sections = [
-        Section("Scene", list(_scenes(record.folder, results))),
+        Section("Scene", list(scene_choice(record.folder, made_files(record.folder, results, SCENE)))),
         Section("Video", list(_video(record, atlas, posed))),
         Section("Depth and light", list(_pictures(record.folder, results))),
         *_views(record.folder, results),
@@ -263,20 +278,24 @@ def _stretches(atlas: AtlasRecord, reconstructed: set[int]) -> Iterator[Sequence
         yield [str(first) if first == last else f"{first} to {last}", len(frames), key[0], why]
 
 
-def _scenes(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
-    """The pages to fly through, within this one."""
-    found = [
-        (title, quote(path), (folder / path).read_text(encoding="utf-8"))
-        for title, path in _made(folder, results, SCENE)
-    ]
-    if found:
-        yield Template("scenes.html", {"scenes": found})
+def scene_choice(folder: Path, scenes: Sequence[tuple[str, str]], room: float = math.inf) -> Iterator[Block]:
+    """Pages to fly through, by titles and paths: within this page as far as there is room, bytes, else loaded by it."""
+    shown = []
+    for title, path in scenes:
+        page: str | None = None
+        if (folder / path).stat().st_size <= room:
+            page = (folder / path).read_text(encoding="utf-8")
+            size = len(escape(page).encode())
+            room, page = (room - size, page) if size <= room else (room, None)
+        shown.append((title, quote(path), page))
+    if shown:
+        yield Template("scenes.html", {"scenes": shown})
 
 
 def _pictures(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]:
     """Frames, their depth and the wall in flattened light, side by side."""
     scales = {one.submap.title: one.figures.get("depth_scale") for one in results}
-    for title, path in _made(folder, results, PICTURES):
+    for title, path in made_files(folder, results, PICTURES):
         rows: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if (scale := scales[title]) else []
         for frame in sorted((folder / path).iterdir()):
             files = [file for kind in _KINDS for file in frame.glob(kind)]
@@ -284,7 +303,7 @@ def _pictures(folder: Path, results: Sequence[SubmapResults]) -> Iterator[Block]
         yield Folded(title, rows, is_open=title == LARGEST.title)
 
 
-def _made(folder: Path, results: Sequence[SubmapResults], what: str) -> list[tuple[str, str]]:
+def made_files(folder: Path, results: Sequence[SubmapResults], what: str) -> list[tuple[str, str]]:
     """Titles of sub-maps, and paths of their files of one kind."""
     return [
         (one.submap.title, path)

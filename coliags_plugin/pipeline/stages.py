@@ -9,7 +9,9 @@ import time
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from coliags_plugin._version import __version__
 from coliags_plugin.core.anonymity import without_places
@@ -23,6 +25,7 @@ from coliags_plugin.core.errors import (
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
+from coliags_plugin.core.settings import first_error
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
@@ -57,6 +60,10 @@ class StageRecord:
     files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to the folder, and what each is
     warnings: Sequence[str] = ()  # what limits the result, and what to do
     figures: Mapping[str, Any] = field(default_factory=dict)  # numbers of the summary, by name
+
+
+_StageName = Annotated[str, Field(pattern=r"^(submap-[0-9]{1,6}/)?[a-z]+$")]
+_RECORDED = TypeAdapter(dict[_StageName, StageRecord])
 
 
 class Record:
@@ -144,10 +151,11 @@ def _worker_file(name: str) -> str:
 
 def _read(file: Path) -> dict[str, StageRecord]:
     try:
-        return {name: StageRecord(**stage) for name, stage in parse_json(json_text(file))["stages"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return _RECORDED.validate_python(parse_json(json_text(file))["stages"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
         raise InputError(
-            f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --output"
+            f"cannot read {file}: {told}", "what `coliags reconstruct` wrote", "Choose another --output"
         ) from error
 
 

@@ -23,6 +23,7 @@ from coliags_plugin.outputs.video import write_video
 from tests.comparison.small import TINY
 from tests.datamanagers.spoiling import KINDS, write_all
 from tests.export.splats.clouds import random_cloud
+from tests.pipeline.procedures import write_procedure
 
 FRAMES = 9
 METHOD = "coliags"
@@ -51,6 +52,7 @@ def make_seeds(folder: Path) -> None:
     (folder / "video").mkdir()
     frames = [cv2.imread(str(path))[..., ::-1] for path in sorted((made["c3vd"] / "images").iterdir())]
     write_video(np.stack(frames), folder / "video/film.mp4", 10.0)
+    write_procedure(folder / "procedure")
     shutil.rmtree(work)
 
 

@@ -196,6 +196,16 @@ def _video(folder: Path) -> None:
             break
 
 
+def _procedure_page(folder: Path) -> None:
+    from coliags_plugin.pipeline.procedure.page import write_procedure_page
+
+    write_procedure_page(folder)
+
+
+def _procedure_export(folder: Path) -> None:
+    _command("poses", "export", folder, "--output", folder.with_name("exported"), "--overwrite")
+
+
 #: Files of a scene besides its images.
 _FILES = (
     *("*.json", "*.txt", "*.xml", "*.npz", "*.ply", "*.png", "sparse/0/*"),
@@ -245,6 +255,12 @@ TARGETS: dict[str, Target] = {
     "depth-check-tiff": Target("depth-maps", ("tiff/*",), _depth_maps("tiff")),
     "prior": Target("depth-maps", ("npy/*", "png/*"), _prior),
     "video": Target("video", ("*",), _video),
+    "procedure-page": Target(
+        "procedure", ("*.*", "*/*.json", "*/*/*.json", "*/*/images/*", "*/run/eval/*/*.json"), _procedure_page, True
+    ),
+    "procedure-export": Target(
+        "procedure", ("*.json", "*/*/*.json", "*/poses/sparse/0/*"), _procedure_export, True, 0.3
+    ),
 }
 
 

@@ -108,6 +108,7 @@ WRITERS: dict[str, Writer] = {
             *_settings("tracking.method=hybrid", "tracking.pose_graph=false"),
         )
     ),
+    "poses export": Writer(lambda i, o: ("poses", "export", i / "procedure", "--output", o / "exported")),
     "poses sfm": Writer(
         lambda i, o: (
             *("poses", "sfm", i / "unposed/rgb", "--output", o / "found"),
@@ -139,6 +140,7 @@ def make_inputs(folder: Path) -> None:
     from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
     from coliags_plugin.export.splats.files import write_splats
     from tests.export.splats.clouds import random_cloud
+    from tests.pipeline.procedures import write_procedure
     from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
     folder.mkdir(parents=True)
@@ -168,6 +170,7 @@ def make_inputs(folder: Path) -> None:
     poses = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
     write_rgbd_scene(folder / "unposed", frames, poses)
     (folder / "unposed/trajectory.txt").unlink()
+    write_procedure(folder / "procedure")
     (folder / "params.txt").write_text(",".join(map(str, INTRINSICS)))
 
 

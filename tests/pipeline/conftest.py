@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -83,3 +85,17 @@ def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), 
 @pytest.fixture
 def atlas(tmp_path):
     return write_atlas(tmp_path / "atlas")
+
+
+@pytest.fixture(scope="session")
+def whole_procedure(tmp_path_factory):
+    """The folder of :mod:`tests.pipeline.procedures`, not to be changed."""
+    from tests.pipeline.procedures import write_procedure  # which uses this module
+
+    return write_procedure(tmp_path_factory.mktemp("procedure") / "out")
+
+
+@pytest.fixture
+def out(whole_procedure, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(whole_procedure, tmp_path / "out")

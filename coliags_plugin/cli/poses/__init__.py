@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli import arguments
+from coliags_plugin.cli.poses.export import PosesExportCommand
 from coliags_plugin.cli.poses.structure import PosesSfmCommand, PosesTriangulateCommand
 from coliags_plugin.cli.poses.track import PosesTrackCommand
 from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand
@@ -18,12 +19,13 @@ Subcommand = (
     | Annotated[PosesTriangulateCommand, tyro.conf.subcommand("triangulate")]
     | Annotated[PosesSfmCommand, tyro.conf.subcommand("sfm")]
     | Annotated[PosesTrackCommand, tyro.conf.subcommand("track")]
+    | Annotated[PosesExportCommand, tyro.conf.subcommand("export")]
 )
 
 
 @dataclass(frozen=True)
 class PosesCommand(arguments.CommandGroup):
-    """Convert and compare camera poses, triangulate points, or estimate poses from images or depth."""
+    """Convert, compare and export camera poses, triangulate points, or estimate poses from images or depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""

@@ -3,58 +3,95 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import json_text, parse_json
-from coliags_plugin.pipeline.procedure.segments import Skipped, Stretch
+from coliags_plugin.core.json_files import json_text
+from coliags_plugin.core.settings import first_error
+from coliags_plugin.pipeline.procedure.segments import Segment, Skipped, Stretch
 
 #: Name of the file, and version of its schema.
 PROCEDURE_FILE, _FORMAT = "procedure.json", 1
+#: Most frames of a video: a day at 60 a second.
+_MOST_FRAMES = 6_000_000
+#: Error of a rotation matrix in double precision that is written as JSON.
+_SKEW = 1e-4
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+#: A model of a segment: the segment's name, and the model's folder relative to the segment's scene.
+ModelKey = tuple[str, str]
 
 
-@dataclass(frozen=True)
-class Procedure:
-    """A video and its segments; what the other numbers count is the video's frames."""
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
-    source: str  # name of the file or folder
-    bytes: int  # its size, to notice that it is another one
-    rate: float | None  # frames a second
-    frames: int
-    size: tuple[int, int]  # height and width, pixels
-    first: int  # frame at which the survey began
+
+class SegmentJoin(_Part):
+    """What came out where the models of two segments were compared."""
+
+    segments: tuple[str, str]
+    models: tuple[str, str]  # folders, relative to the segments' scenes; empty where a side has none
+    frames: int  # posed in both
+    joined: bool
+    reason: str = ""  # why not
+    #: similarity from the world of the second to that of the first; None where they are not joined. [4][4]
+    transform: Annotated[list[Row], Field(min_length=4, max_length=4)] | None = None
+    rotation_deg: float | None = None  # residual of the shared frames, degrees
+    position: float | None = None  # residual of their positions, relative to the median depth
+
+    @model_validator(mode="after")
+    def _transform_of_joined(self) -> Self:
+        if self.joined and (self.transform is None or not _is_similarity(np.array(self.transform))):
+            raise ValueError("'transform' is no similarity, though 'joined' is true")
+        return self
+
+    @property
+    def keys(self) -> tuple[ModelKey, ModelKey]:
+        """The two models."""
+        first, second = zip(self.segments, self.models, strict=True)
+        return first, second
+
+
+class Procedure(_Part):
+    """A video and its segments; numbers of frames are those of the video."""
+
+    source: Annotated[list[str], Field(min_length=1)]  # names of the video's files, or of the folder
+    bytes: int  # their size, to notice that it is another one
+    rate: Annotated[float, Field(gt=0.0, lt=1e4)] | None  # frames a second; None: unknown
+    frames: Annotated[int, Field(gt=0, lt=_MOST_FRAMES)]  # that were looked at
+    size: tuple[int, int]  # width and height, pixels
+    first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)]  # at which the survey began
     options: dict[str, Any]  # of cutting
     seek: bool  # whether frames are found by their number
-    segments: Sequence[Stretch]
+    segments: Sequence[Segment]
     skipped: Sequence[Skipped]
-    joins: Sequence[dict[str, Any]] = ()
+    joins: Sequence[SegmentJoin] = ()
 
-    @staticmethod
-    def name(number: int) -> str:
-        """Folder of a segment."""
-        return f"segment-{number:03d}"
+    @model_validator(mode="after")
+    def _within_the_video(self) -> Self:
+        stretches: list[Stretch] = [*self.segments, *self.skipped]
+        for one in stretches:
+            if not self.first <= one.first <= one.last < self.stop:
+                raise ValueError(f"frames {one.first} to {one.last}, not of {self.first} to {self.stop - 1}")
+        if len({segment.name for segment in self.segments}) < len(self.segments):
+            raise ValueError("two segments have the same name")
+        return self
+
+    @property
+    def stop(self) -> int:
+        """Number of the last frame that was looked at, plus one."""
+        return self.first + self.frames
 
     def write(self, folder: Path) -> None:
         """Write ``procedure.json``."""
-        segments = [{"name": self.name(number), **asdict(each)} for number, each in enumerate(self.segments)]
-        content = {
-            "format": _FORMAT,
-            "source": [self.source],
-            "bytes": self.bytes,
-            "frames": self.frames,
-            "rate": self.rate,
-            "size": [self.size[1], self.size[0]],
-            "first": self.first,
-            "options": self.options,
-            "seek": self.seek,
-            "segments": segments,
-            "skipped": [asdict(each) for each in self.skipped],
-            "joins": list(self.joins),
-        }
-        write_json(folder / PROCEDURE_FILE, content)
+        write_json(folder / PROCEDURE_FILE, {"format": _FORMAT, **self.model_dump(mode="json")})
 
     @classmethod
     def read(cls, folder: Path) -> Procedure | None:
@@ -63,15 +100,17 @@ class Procedure:
         if not file.is_file():
             return None
         try:
-            content = parse_json(json_text(file))
-            width, height = content["size"]
-            return cls(
-                content["source"][0], content["bytes"], content["rate"], content["frames"], (height, width),
-                content["first"], content["options"], content["seek"],
-                [Stretch(each["first"], each["last"]) for each in content["segments"]],
-                [Skipped(**each) for each in content["skipped"]], content["joins"],
-            )  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --output"
-            ) from error
+            return cls.model_validate_json(json_text(file), strict=True)
+        except (OSError, ValueError) as error:
+            told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
+            raise InputError(f"cannot read {file}: {told}", "what `coliags reconstruct` wrote") from error
+
+
+def _is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a matrix turns, scales and moves, and mirrors nothing."""
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not (1e-9 < scale < 1e9 and np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0))):
+        return False
+    turn = linear / scale
+    return bool(np.abs(turn @ turn.T - np.eye(3)).max() < _SKEW)

@@ -20,8 +20,9 @@ from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_sourc
 from coliags_plugin.pipeline.frames import MASK
 from coliags_plugin.pipeline.jobs import PartJobs
 from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, join, read_posed
-from coliags_plugin.pipeline.procedure.record import Procedure
-from coliags_plugin.pipeline.procedure.segments import cut
+from coliags_plugin.pipeline.procedure.page import write_procedure_page
+from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
+from coliags_plugin.pipeline.procedure.segments import Segment, cut
 from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, survey_video
 from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
@@ -63,9 +64,10 @@ def reconstruct_procedure(
         queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
     except KeyboardInterrupt as error:
         raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
-    names = [procedure.name(number) for number in range(len(procedure.segments))]
-    procedure = replace(procedure, joins=_joins(context.out, procedure, names))
+    names = [segment.name for segment in procedure.segments]
+    procedure = procedure.model_copy(update={"joins": _joins(context.out, procedure, names)})
     procedure.write(context.out)
+    write_procedure_page(context.out)
     records = {name: Record.of(context.out / name) for name in names}
     posed = [name for name, record in records.items() if _state(record, "poses") == "done"]
     if not posed:
@@ -82,10 +84,10 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     known = Procedure.read(out)
     size = _size(context.source)
     if known is not None and (out / SURVEY_FILE).is_file():
-        same = (known.source, known.bytes, known.first) == (context.source.name, size, chosen.first)
+        same = (known.source, known.bytes, known.first) == ([context.source.name], size, chosen.first)
         if not same or known.options != options:
             raise InputError(
-                f"{out} was made from {known.source}, {known.bytes} bytes, cut by {known.options}",
+                f"{out} was made from {', '.join(known.source)}, {known.bytes} bytes, cut by {known.options}",
                 f"{context.source.name}, {size} bytes, cut by {options}",
                 "Choose another --output",
             )
@@ -103,12 +105,25 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
             "a video of a camera that moves along tissue it sees",
         )
     survey.write(out)
-    shifted = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in segments]
+    shifted = [
+        Segment(each.first + chosen.first, each.last + chosen.first, f"segment-{number:03d}")
+        for number, each in enumerate(segments)
+    ]
     left_out = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in skipped]
     seek = chosen.seek and _are_found(context.source, survey, [each.first for each in shifted], chosen.first)
+    height, width = survey.size
     procedure = Procedure(
-        context.source.name, size, source.rate, len(survey), survey.size, chosen.first, options, seek, shifted, left_out
-    )  # fmt: skip
+        source=[context.source.name],
+        bytes=size,
+        rate=source.rate,
+        frames=len(survey),
+        size=(width, height),
+        first=chosen.first,
+        options=options,
+        seek=seek,
+        segments=shifted,
+        skipped=left_out,
+    )
     procedure.write(out)
     log.info("%d frames in %d segments, %d stretches left out", len(survey), len(shifted), len(left_out))
     return procedure, survey
@@ -191,7 +206,7 @@ class _Segments:
         )
         sfm = settings.sfm.model_copy(update={"camera": camera})
         own = settings.model_copy(update={"frames": frames, "sfm": sfm})
-        out = self._context.out / self._procedure.name(number)
+        out = self._context.out / segment.name
         context = replace(self._context, out=out, settings=own, mask=self._mask)
         return PartJobs(context, self._executor, self._execution, self._overwrite, segment.count, then).jobs()
 
@@ -207,7 +222,7 @@ def _camera_of(scene: Path) -> CameraSettings | None:
     return CameraSettings(model=camera.model, params=tuple(map(float, camera.params)), refine=False)
 
 
-def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[dict[str, Any]]:
+def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[SegmentJoin]:
     """Joins of every two neighbouring segments."""
     found, before = [], _posed(out / names[0])
     for (one, other), (first, second) in zip(pairwise(names), pairwise(procedure.segments), strict=True):
@@ -216,16 +231,16 @@ def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[dict[s
         why = f"{gap} frames between them show nothing that can be followed"
         made = join(before, posed) if gap < 0 else Join(("", ""), 0, why)
         found.append(
-            {
-                "segments": [one, other],
-                "models": list(made.models),
-                "frames": made.frames,
-                "joined": not made.reason,
-                "reason": made.reason,
-                "transform": None if made.transform is None or made.reason else made.transform.tolist(),
-                "rotation_deg": round(made.rotation, 3),
-                "position": round(made.position, 4),
-            }
+            SegmentJoin(
+                segments=(one, other),
+                models=made.models,
+                frames=made.frames,
+                joined=not made.reason,
+                reason=made.reason,
+                transform=None if made.transform is None or made.reason else made.transform.tolist(),
+                rotation_deg=round(made.rotation, 3),
+                position=round(made.position, 4),
+            )
         )
         before = posed
     return found

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from coliags_plugin.pipeline.procedure.survey import Survey
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -29,6 +31,13 @@ class Stretch:
     def count(self) -> int:
         """Number of frames."""
         return self.last - self.first + 1
+
+
+@dataclass(frozen=True)
+class Segment(Stretch):
+    """Frames that are reconstructed by themselves."""
+
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]  # of the folder
 
 
 @dataclass(frozen=True)

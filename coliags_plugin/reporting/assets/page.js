@@ -1,4 +1,4 @@
-// Choosing on a page: columns, order of rows and views, axis of the curves, and a slider between two methods.
+// Choosing on a page: columns, rows and their order, order of views, axis of the curves, and a slider between two methods.
 // The page is complete without it.
 "use strict";
 
@@ -48,6 +48,21 @@
         body.append(...known, ...written.filter((row) => keys.get(row) === null));
       });
     });
+  }
+
+  // ---- Rows of a long table that hold a text.
+
+  function filterable(table) {
+    const rows = [...table.tBodies[0].rows];
+    if (rows.length < 16) return;
+    const input = make("input", { type: "search" });
+    const count = make("span");
+    input.addEventListener("input", () => {
+      const wanted = input.value.trim().toLowerCase();
+      rows.forEach((row) => (row.hidden = !row.textContent.toLowerCase().includes(wanted)));
+      count.textContent = wanted ? ` ${rows.filter((row) => !row.hidden).length} of ${rows.length}` : "";
+    });
+    table.parentElement.before(make("p", { className: "filter" }, make("label", {}, "Rows with ", input), count));
   }
 
   // ---- Choosing of columns, for all tables of metrics at once.
@@ -203,14 +218,25 @@
     const select = box.querySelector("select"), frames = [...box.querySelectorAll("iframe")];
     function show(index) {
       frames.forEach((frame, own) => (frame.hidden = own !== index));
-      frames[index].srcdoc ||= frames[index].dataset.page;
+      const { page, file } = frames[index].dataset;
+      if (page === undefined) frames[index].src ||= file;
+      else frames[index].srcdoc ||= page;
     }
     if (select) select.addEventListener("change", () => show(select.selectedIndex));
     show(0);
   }
 
+  // ---- What is pointed at on a time line.
+
+  function readout(line) {
+    const told = line.querySelector(".readout");
+    const tell = (event) => (told.textContent = event.target.closest("[title]")?.title ?? told.textContent);
+    for (const kind of ["pointerover", "focusin"]) line.addEventListener(kind, tell);
+  }
+
   const tables = all("table.results");
   tables.forEach(sortable);
+  tables.forEach(filterable);
   for (const family of new Set(tables.map(familyOf))) {
     const own = tables.filter((table) => familyOf(table) === family);
     if (own.some((table) => table.querySelector("th[hidden]"))) chooser(own);
@@ -220,4 +246,5 @@
   all(".compare").forEach(comparator);
   all("details.scene").forEach(scene);
   all(".scenes").forEach(scenes);
+  all(".timeline").forEach(readout);
 })();

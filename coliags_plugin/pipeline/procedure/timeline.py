@@ -1,0 +1,295 @@
+"""The time line of a procedure: which frame has a pose in which sub-map, why others have none, what the survey saw."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+import numpy as np
+from jaxtyping import Int
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.charts import COLORS
+from coliags_plugin.outputs.image_files import encode_jpeg
+from coliags_plugin.pipeline.frame_selection import THINNED
+from coliags_plugin.pipeline.procedure.contents import ProcedureContents, ProcedureSubmap
+from coliags_plugin.pipeline.stages import PAGE_FILE
+from coliags_plugin.reporting.model import EncodedImage, Template
+from coliags_plugin.reporting.numbers import counted
+
+#: Columns of the ribbon and of the curves, and pictures above it.
+_COLUMNS, _BINS, _PICTURES = 2000, 600, 24
+#: Width of a picture, pixels.
+_WIDTH = 144
+#: Steps of the time axis, seconds, and most of its ticks.
+_STEPS, _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200), 9
+#: Percentile of a curve at which its axis ends.
+_TOP = 99.0
+#: Titles of the survey's arrays, with units.
+_CURVES = {
+    "sharpness": ("Sharpness", "RMS of the Laplacian over mean brightness", 1.0),
+    "followed": ("Corners followed from the frame before", "%", 100.0),
+    "motion": ("Motion since the frame before", "% of the larger side", 100.0),
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """What became of frames."""
+
+    what: str  # for people; of a sub-map its name
+    why: str = ""
+    style: int | None = None  # colour index of a sub-map; None: no pose
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames that follow each other and share a state."""
+
+    first: int
+    last: int  # inclusive
+    state: State
+
+
+def styles(procedure: ProcedureContents) -> dict[str, int]:
+    """Colour index of each sub-map, by name: neighbours differ."""
+    return {submap.name: index % COLORS for index, submap in enumerate(procedure.submaps)}
+
+
+def clock(procedure: ProcedureContents, frame: float) -> str:
+    """Time of a frame in minutes and seconds, ``3:05``, with hours from the first one on; empty for an unknown rate."""
+    if procedure.record.rate is None:
+        return ""
+    minutes, seconds = divmod(int(frame / procedure.record.rate + 1e-6), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+def span_text(procedure: ProcedureContents, first: int, last: int) -> str:
+    """Frames and times of a stretch: ``frames 30 to 60, 0:01 to 0:02``."""
+    frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+    times = [clock(procedure, first), clock(procedure, last)]
+    return frames if not times[0] else f"{frames}, {' to '.join(dict.fromkeys(times))}"
+
+
+def frame_states(procedure: ProcedureContents) -> tuple[list[State], Int[np.ndarray, "N"]]:
+    """States, and which of them each frame of the video has. [N]
+
+    Frames that were not used, since of every n only one is, have the state of the used one before them. A frame that
+    two sub-maps have posed belongs to the earlier one.
+    """
+    record, kinds = procedure.record, dict[State, int]()
+    codes = np.full(record.frames, -1)
+    posed = np.zeros(record.frames, bool)
+    colors = styles(procedure)
+
+    def code(state: State) -> int:
+        return kinds.setdefault(state, len(kinds))
+
+    def number(first: int, last: int) -> slice:
+        return slice(first - record.first, last + 1 - record.first)
+
+    for skipped in record.skipped:
+        codes[number(skipped.first, skipped.last)] = code(State("left out", skipped.why))
+    for segment in procedure.segments:
+        span = segment.span
+        why = segment.failure or "not among those that were posed"
+        own = dict.fromkeys(segment.kept, code(State("no pose", why)))
+        own |= {frame: code(State("no pose", why)) for frame, why in segment.why.items() if why != THINNED}
+        with_pose = set[int]()
+        for submap in segment.submaps:
+            own |= dict.fromkeys(submap.names, code(State(submap.name, "", colors[submap.name])))
+            with_pose |= set(submap.names)
+        known = sorted(frame for frame in own if span.first <= frame <= span.last)
+        if not known:
+            own, known = {span.first: code(State("no pose", why))}, [span.first]
+        # An earlier segment that shares frames with this one keeps those that it has posed.
+        for frame, stop in zip([span.first, *known[1:]], [*known[1:], span.last + 1], strict=True):
+            source = frame if frame in own else known[0]
+            place = number(frame, stop - 1)
+            free = ~posed[place] if source in with_pose else codes[place] < 0
+            codes[place][free] = own[source]
+            posed[place] |= source in with_pose
+    codes[codes < 0] = code(State("left out", "in no segment"))
+    return list(kinds), codes
+
+
+def stretches(procedure: ProcedureContents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Iterator[Stretch]:
+    """Runs of one state, along the video."""
+    edges = np.flatnonzero(np.diff(codes)) + 1
+    first = procedure.record.first
+    for start, stop in zip([0, *edges.tolist()], [*edges.tolist(), len(codes)], strict=True):
+        yield Stretch(first + start, first + stop - 1, states[int(codes[start])])
+
+
+def picture_near(procedure: ProcedureContents, first: int, last: int) -> EncodedImage | None:
+    """The frame of use nearest to the middle of a stretch, as a small JPEG; None without one that can be read."""
+    middle = (first + last) / 2
+    for segment in procedure.segments:
+        if segment.span.last < first or segment.span.first > last:
+            continue
+        near = min(segment.kept, key=lambda frame: abs(frame - middle), default=None)
+        if near is not None and first <= near <= last:
+            return small_picture([segment.image(procedure.folder, near)], _WIDTH)
+    return None
+
+
+def small_picture(files: Sequence[Path], width: int) -> EncodedImage | None:
+    """Images of one size above each other, reduced to a width in pixels, as JPEG; None if one cannot be read."""
+    try:
+        image = np.concatenate([read_rgb(file) for file in files])
+    except (InputError, OSError, ValueError):
+        return None
+    if image.shape[1] > width:
+        size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    return EncodedImage(encode_jpeg(image, 80), "image/jpeg", image.shape[1], image.shape[0])
+
+
+def timeline(procedure: ProcedureContents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Template:
+    """The time line: pictures, ribbon of sub-maps, segments and curves over one axis of time and frames."""
+    record = procedure.record
+
+    def percent(frame: float) -> float:
+        return round(100.0 * (frame - record.first) / record.frames, 3)
+
+    def bar(first: int, last: int) -> dict[str, Any]:
+        return {"left": percent(first), "width": round(percent(last + 1) - percent(first), 3)}
+
+    ribbon = [
+        bar(one.first, one.last)
+        | {
+            "style": one.state.style,
+            "title": f"{one.state.what}: {span_text(procedure, one.first, one.last)}"
+            + (f"; {one.state.why}" if one.state.why else ""),
+        }
+        for one in stretches(procedure, states, _thinned(codes))
+    ]
+    parts = [
+        bar(segment.span.first, segment.span.last)
+        | {
+            "name": segment.span.name.removeprefix("segment-"),
+            "href": quote(f"{segment.span.name}/{PAGE_FILE}")
+            if (procedure.folder / segment.span.name / PAGE_FILE).is_file()
+            else "",
+            "failed": bool(segment.failure),
+            "title": f"{segment.span.name}: {span_text(procedure, segment.span.first, segment.span.last)}"
+            + (f"; {segment.failure}" if segment.failure else ""),
+        }
+        for segment in procedure.segments
+    ]
+    edges = [record.first + round(index * record.frames / _PICTURES) for index in range(_PICTURES + 1)]
+    pictures = [
+        {"image": picture_near(procedure, first, stop - 1), "title": span_text(procedure, first, stop - 1)}
+        for first, stop in pairwise(edges)
+        if stop > first
+    ]
+    return Template(
+        "timeline.html",
+        {
+            "thumbs": pictures,
+            "ribbon": ribbon,
+            "rows": [parts[::2], parts[1::2]] if len(parts) > 1 else [parts],
+            "curves": list(_curves(procedure)),
+            "ticks": [{"left": percent(frame), "texts": texts} for frame, texts in _ticks(procedure)],
+            "axis": "frame number" if record.rate is None else "time, min:s; frame number",
+        },
+    )
+
+
+def _thinned(codes: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
+    """The states of a long video with the commonest one in each of 2,000 columns, for a page of bounded size."""
+    if len(codes) <= _COLUMNS:
+        return codes
+    shown = codes.copy()
+    for part in np.array_split(shown, _COLUMNS):  # views
+        part[:] = Counter(part.tolist()).most_common(1)[0][0]
+    return shown
+
+
+def _ticks(procedure: ProcedureContents) -> Iterator[tuple[float, list[str]]]:
+    record = procedure.record
+    if record.rate is None:
+        for tick in linear_ticks(record.first, record.stop):
+            yield tick, [tick_label(tick)]
+        return
+    seconds = record.frames / record.rate
+    step = next((step for step in _STEPS if seconds / step <= _TICKS), math.ceil(seconds / _TICKS))
+    for number in range(math.ceil(record.first / record.rate / step), int(record.stop / record.rate / step) + 1):
+        frame = number * step * record.rate
+        yield frame, [clock(procedure, frame), str(round(frame))]
+
+
+def _curves(procedure: ProcedureContents) -> Iterator[dict[str, Any]]:
+    """Means of the survey's numbers over columns, as SVG paths in a box of 1000 x 100."""
+    for name, (title, unit, factor) in _CURVES.items():
+        values = factor * procedure.survey.get(name, np.zeros(0)).astype(np.float64)
+        values[~np.isfinite(values)] = np.nan
+        if not np.isfinite(values).any():
+            continue
+        bins = np.array_split(values, min(_BINS, len(values)))
+        means = [float(np.nanmean(part)) if np.isfinite(part).any() else math.nan for part in bins]
+        top = 100.0 if name == "followed" else float(np.nanpercentile(values, _TOP)) or 1.0
+        runs = groupby(enumerate(means), lambda item: math.isfinite(item[1]))
+        path = "".join(
+            "M"
+            + "L".join(
+                f"{1000.0 * (index + 0.5) / len(means):.1f} {100.0 * (1.0 - min(mean / top, 1.0)):.1f}"
+                for index, mean in [*own, *own][: max(2, len(own))]
+            )
+            for is_known, run in runs
+            if is_known and (own := list(run))
+        )
+        yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
+
+
+def submap_between(procedure: ProcedureContents, one: ProcedureSubmap, other: ProcedureSubmap) -> tuple[bool, str]:
+    """Whether a sub-map and the one that follows it are joined, and how well, or why they are not."""
+    for join in procedure.record.joins:
+        if {one.key, other.key} == set(join.keys):
+            if not join.joined:
+                return False, join.reason
+            residuals = [f"{counted(join.frames, 'shared frame')}"]
+            residuals += [] if join.rotation_deg is None else [f"cameras turned by {join.rotation_deg:.2g} degrees"]
+            residuals += [] if join.position is None else [f"{100.0 * join.position:.2g} % of the depth apart"]
+            return True, ", ".join(residuals)
+    return False, _reason_apart(procedure, one, other)
+
+
+def _reason_apart(procedure: ProcedureContents, one: ProcedureSubmap, other: ProcedureSubmap) -> str:
+    """Why two sub-maps that no join of segments names are apart, as far as it was recorded."""
+    segments = {segment.span.name: segment for segment in procedure.segments}
+    if one.segment == other.segment and (atlas := segments[one.segment].atlas) is not None:
+        names = {name: number for number, name in one.names.items()} | {
+            name: number for number, name in other.names.items()
+        }
+        cuts = [join for join in atlas.joins if not join.joined and join.after < len(atlas.frames)]
+        if reason := next((c.reason for c in cuts if names.get(atlas.frames[c.after], -1) == one.last), ""):
+            return reason
+    if one.segment != other.segment:
+        pair = {one.segment, other.segment}
+        if reason := next((join.reason for join in procedure.record.joins if set(join.segments) == pair), ""):
+            return reason
+    return _lost_between(procedure, one.last, other.first)
+
+
+def _lost_between(procedure: ProcedureContents, last: int, first: int) -> str:
+    """The commonest reason why frames between two have no pose."""
+    reasons = Counter(
+        why for segment in procedure.segments for frame, why in segment.why.items() if last < frame < first
+    )
+    for skipped in procedure.record.skipped:
+        if last < skipped.first < first:
+            reasons[skipped.why] += skipped.last - skipped.first + 1
+    gap = max(0, first - last - 1)
+    why = f", most: {reasons.most_common(1)[0][0]}" if reasons else ""
+    return f"{counted(gap, 'frame')} without a pose in between{why}" if gap else "no points are seen from both"
