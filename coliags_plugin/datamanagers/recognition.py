@@ -9,8 +9,9 @@ from pathlib import Path
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import candidates
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, TIFF_SUFFIXES, first_few, inventory
+from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, TIFF_SUFFIXES, inventory
 from coliags_plugin.geometry.lenses.vicalib import calibration_files
+from coliags_plugin.geometry.poses.trajectory import natural_order
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +34,8 @@ def find_format(path: Path) -> str:
     if path.is_file():
         raise _no_folder(path)
     found = recognised(path)
-    if not found and (video := video_in(path)) is not None:
-        raise _no_scene(path, f"{path} holds the video {video.name}, and no scene")
+    if not found and (videos := videos_in(path)):
+        raise _no_scene(path, f"{path} holds the video {videos[0].name}, and no scene")
     if not found:
         raise InputError(
             f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
@@ -50,23 +51,13 @@ def find_format(path: Path) -> str:
     return name
 
 
-def video_in(folder: Path) -> Path | None:
-    """The video of a recording's folder; None where there is none, or images are there and no calibration file.
-
-    Raises:
-        InputError: There are several videos.
-    """
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+def videos_in(folder: Path) -> list[Path]:
+    """The videos of a recording's folder in natural order; none where images are there and no calibration file."""
+    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
-    if not videos or (any(path.suffix.lower() in _FRAME_SUFFIXES for path in files) and not calibration_files(folder)):
-        return None
-    if len(videos) > 1:
-        raise InputError(
-            f"{folder} holds the videos {first_few([path.name for path in videos])}",
-            "a recording's folder, with one video",
-            "Give the video, with its calibration file if there is one: --camera NAME.xml",
-        )
-    return videos[0]
+    if any(path.suffix.lower() in _FRAME_SUFFIXES for path in files) and not calibration_files(folder):
+        return []
+    return [videos[index] for index in natural_order([path.name for path in videos])]
 
 
 def _no_scene(path: Path, seen: str) -> InputError:

@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.datamanagers.recognition import videos_in
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES, file_names, list_images, read_image
 
 if TYPE_CHECKING:
@@ -168,6 +169,43 @@ class VideoFile:
             log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, expected)
 
 
+@dataclass(frozen=True)
+class VideoFiles:
+    """Frames of several video files of one procedure, numbered through by what their headers say."""
+
+    path: Path
+    files: tuple[Path, ...]
+    span: Span = Span()
+
+    @property
+    def expected(self) -> int:
+        """Number of frames by the files' headers."""
+        return self.span.count(sum(VideoFile(file).expected for file in self.files))
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second of the first file."""
+        return VideoFile(self.files[0]).rate
+
+    def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
+        """Names ``frame_000000``, ... and images; see :class:`FrameSource`. Where a file ends too early, black ones."""
+        start, image = 0, None
+        for file in self.files:
+            count, first = VideoFile(file).expected, max(0, self.span.first - start)
+            last = count - 1 if self.span.last is None else min(count - 1, self.span.last - start)
+            number, shape = first, None if image is None else image.shape
+            if first <= last:
+                for _, image in VideoFile(file, Span(first, last, self.span.seek)):
+                    if shape is not None and image.shape != shape:
+                        raise InputError(f"{file} is {image.shape[1]} x {image.shape[0]}, the file before {shape[1]} x "
+                            f"{shape[0]}", "videos of one size", _AS_IMAGES)  # fmt: skip
+                    yield f"frame_{start + number:06d}", image
+                    number += 1
+                for missing in range(number, last + 1 if image is not None else 0):
+                    yield f"frame_{start + missing:06d}", np.zeros_like(image)
+            start += count
+
+
 def _go_to(video: cv2.VideoCapture, span: Span) -> int:
     """Have the first frame of a span come next; returns its number, or where the video ended before it."""
     import cv2
@@ -202,6 +240,8 @@ _AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the fold
 def frame_source(path: Path, span: Span = Span()) -> FrameSource:
     """The frames of a file or folder, all or some."""
     if path.is_dir():
+        if videos := videos_in(path):
+            return VideoFiles(path, tuple(videos), span)
         list_images(path)
         return ImageFolder(path, span)
     if not path.exists():

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.recognition import video_in
+from coliags_plugin.datamanagers.recognition import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.reconstruction.structure.sfm_cameras import camera_of_lens
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettings]:
-    """The video of a recording's folder, or else the video or folder of images itself; and its camera in the settings.
+    """The one video of a recording's folder, or else what was given itself; and its camera in the settings.
 
     The camera is that of the calibration file that the settings name as its model, or, where they name none, of the
     one in the folder; it is scaled to the frames. Without either, the settings are unchanged.
@@ -24,11 +24,12 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
     Raises:
         InputError: As :func:`frame_source`; or a calibration is missing, damaged or of another frame.
     """
-    source = (video_in(path) if path.is_dir() else None) or path
+    videos = videos_in(path) if path.is_dir() else []
+    source = videos[0] if len(videos) == 1 else path
     frames, camera = frame_source(source), settings.camera
     if camera.model is None:
         calibration = find_calibration(path)
-        if calibration is None and source != path:
+        if calibration is None and videos:
             log.warning("%s has no calibration file: its camera is estimated. --camera NAME.xml gives one", path)
     elif camera.model.lower().endswith(SUFFIX):
         if camera.params is not None:

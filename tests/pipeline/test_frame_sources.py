@@ -10,7 +10,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline.frame_sources import ImageFolder, Span, VideoFile, frame_at, frame_source
+from coliags_plugin.pipeline.frame_sources import ImageFolder, Span, VideoFile, VideoFiles, frame_at, frame_source
 from tests.pipeline.films import film, write_images
 
 
@@ -126,3 +126,22 @@ def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
     black = [index for index, (_, image) in enumerate(read) if not image.any()]
     assert 10 < len(black) < 100 and "cannot be decoded: black here" in caplog.text
     assert all(np.array_equal(read[index][1], whole[index][1]) for index in (0, 20, 149))
+
+
+def test_the_videos_of_a_folder_are_one(tmp_path):
+    for name, places in (("part 2.mp4", range(30, 60)), ("part 10.mp4", range(60, 80)), ("part 1.mp4", range(30))):
+        write_video(film(places), tmp_path / "parts" / name, 15.0)
+    parts = [image for n in (1, 2, 10) for _, image in frame_source(tmp_path / "parts" / f"part {n}.mp4")]
+    source = frame_source(tmp_path / "parts")
+    assert isinstance(source, VideoFiles) and source.expected == 80 and source.rate == pytest.approx(15.0)
+    whole = list(source)
+    assert [name for name, _ in whole] == [f"frame_{number:06d}" for number in range(80)]
+    assert all(np.array_equal(image, part) for (_, image), part in zip(whole, parts, strict=True))
+    for first, last in ((0, 10), (25, 64), (31, 31), (70, None)):
+        some = list(frame_source(tmp_path / "parts", Span(first, last)))
+        expected = whole[first : None if last is None else last + 1]
+        assert [name for name, _ in some] == [name for name, _ in expected]
+        assert all(np.array_equal(one, other) for (_, one), (_, other) in zip(some, expected, strict=True))
+    write_video([image[:100] for image in film([0, 5])], tmp_path / "parts" / "part 11.mp4", 15.0)
+    with pytest.raises(InputError, match=r"part 11.mp4 is 160 x 100, the file before 160 x 120"):
+        list(frame_source(tmp_path / "parts"))
