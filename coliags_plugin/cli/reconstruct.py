@@ -143,7 +143,9 @@ class ReconstructCommand:
         lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
         for each in made.procedure.joins:
             what = "joined" if each.joined else f"not joined: {each.reason}"
-            lines.append(f"{' and '.join(each.segments)}: {what}")
+            pairs = zip(each.segments, each.models, strict=True)
+            named = [f"{name}/{Path(model).name}" if model else name for name, model in pairs]
+            lines.append(f"{' and '.join(named)}: {what}")
         stages = {
             name: {stage: asdict(one) for stage, one in record.stages.items()} for name, record in made.segments.items()
         }

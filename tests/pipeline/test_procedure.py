@@ -19,7 +19,7 @@ from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.procedure import run
-from coliags_plugin.pipeline.procedure.joins import PosedFrames, join
+from coliags_plugin.pipeline.procedure.joins import PosedFrames, joins
 from coliags_plugin.pipeline.procedure.record import Procedure
 from coliags_plugin.pipeline.procedure.segments import OVERLAP, Stretch, cut
 from coliags_plugin.pipeline.procedure.survey import Survey, survey_video
@@ -104,15 +104,19 @@ def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
 def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
     other = (0.4, Rotation.from_rotvec([0.3, -1.0, 2.0]), np.array([5.0, -7.0, 1.0]))
     first, second = posed(20), posed(30, other, first=12)
-    found = join([posed(4, model="sparse/1", first=90), first], [second])
+    (found,) = joins([posed(4, model="sparse/1", first=90), first], [second])
     assert (found.reason, found.frames, found.models) == ("", 8, ("sparse/0", "sparse/0"))
     for name in ("frame_000012", "frame_000019"):
         place = found.transform @ [*second.centers[name], 1.0]
         np.testing.assert_allclose(place[:3], first.centers[name], atol=1e-9)
     assert found.rotation == pytest.approx(0.0, abs=1e-5) and found.position == pytest.approx(0.0, abs=1e-9)
-    assert "3 frames have a pose on both sides" in join([posed(15)], [posed(9, other, first=12)]).reason
-    assert "do not agree" in join([first], [posed(30, other, 20.0, first=12)]).reason
-    assert join([], [second]).reason == "no frame has a pose on one side"
+    assert "3 frames have a pose on both sides" in joins([posed(15)], [posed(9, other, first=12)])[0].reason
+    assert "do not agree" in joins([first], [posed(30, other, 20.0, first=12)])[0].reason
+    both = joins([first, posed(9, model="sparse/1", first=31)], [second])
+    assert [(one.models, one.frames, one.reason) for one in both] == [
+        (("sparse/1", "sparse/0"), 9, ""), (("sparse/0", "sparse/0"), 8, "")
+    ]  # fmt: skip
+    assert joins([], [second])[0].reason == "no frame has a pose on one side"
 
 
 @pytest.fixture
@@ -158,7 +162,7 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
         kept = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
         assert [frame["frame"] for frame in kept] == list(range(segment.first, segment.last + 1))
         assert made.segments[name].stages["submap-1/report"].state == "done"
-    assert len(made.procedure.joins) == len(names) - 1
+    assert {each.segments for each in made.procedure.joins} == set(pairwise(names))
     assert any("show nothing that can be followed" in each.reason for each in made.procedure.joins)
     assert Procedure.read(tmp_path / "out") == made.procedure
     assert "segment-000" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")

@@ -60,11 +60,11 @@ def read_posed(scene: Path) -> list[PosedFrames]:
     return found
 
 
-def join(first: list[PosedFrames], second: list[PosedFrames]) -> Join:
-    """The best join of any model of one segment with any of the next."""
-    tried = [_join_models(*pair) for pair in product(first, second)]
-    none = Join(("", ""), 0, "no frame has a pose on one side")
-    return min(tried, key=lambda one: (bool(one.reason), -one.frames), default=none)
+def joins(first: list[PosedFrames], second: list[PosedFrames]) -> list[Join]:
+    """Joins of models of one segment with those of the next: of all that share frames, or why there is none."""
+    tried = sorted((_join_models(*pair) for pair in product(first, second)), key=lambda one: -one.frames)
+    sharing = [one for one in tried if one.frames >= _FEWEST]
+    return sharing or tried[:1] or [Join(("", ""), 0, "no frame has a pose on one side")]
 
 
 def _join_models(first: PosedFrames, second: PosedFrames) -> Join:

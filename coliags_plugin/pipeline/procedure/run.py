@@ -19,7 +19,7 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source
 from coliags_plugin.pipeline.frames import MASK
 from coliags_plugin.pipeline.jobs import PartJobs
-from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, join, read_posed
+from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, joins, read_posed
 from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
 from coliags_plugin.pipeline.procedure.segments import Segment, cut
@@ -224,13 +224,12 @@ def _camera_of(scene: Path) -> CameraSettings | None:
 
 def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[SegmentJoin]:
     """Joins of every two neighbouring segments."""
-    found, before = [], _posed(out / names[0])
+    found, before = list[SegmentJoin](), _posed(out / names[0])
     for (one, other), (first, second) in zip(pairwise(names), pairwise(procedure.segments), strict=True):
         posed = _posed(out / other)
         gap = second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"
-        made = join(before, posed) if gap < 0 else Join(("", ""), 0, why)
-        found.append(
+        found += [
             SegmentJoin(
                 segments=(one, other),
                 models=made.models,
@@ -241,7 +240,8 @@ def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[Segmen
                 rotation_deg=round(made.rotation, 3),
                 position=round(made.position, 4),
             )
-        )
+            for made in (joins(before, posed) if gap < 0 else [Join(("", ""), 0, why)])
+        ]
         before = posed
     return found
 
