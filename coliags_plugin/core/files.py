@@ -97,7 +97,6 @@ def atomic_copy(source: Path, target: Path) -> None:
 
 def link_or_copy(source: Path, target: Path) -> None:
     """Give a file a second name, or copy it where that is not possible, as on another disk; for scratch folders."""
-    make_folder(target.parent)
     try:
         os.link(source.resolve(), target)
     except OSError:

@@ -52,17 +52,18 @@ def test_timestamps_are_frame_numbers_where_the_rate_is_unknown(out, tmp_path):
     assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
 
 
-@pytest.mark.parametrize("other_disk", [False, True])
-def test_images_take_no_space_on_the_same_disk(out, tmp_path, monkeypatch, other_disk):
+@pytest.mark.parametrize(("link", "other_disk"), [(False, False), (True, False), (True, True)])
+def test_linked_images_take_no_space_on_the_same_disk(out, tmp_path, monkeypatch, link, other_disk):
     def refused(*_):
         raise OSError(18, "Invalid cross-device link")
 
     if other_disk:
         monkeypatch.setattr("os.link", refused)
-    export_atlas(out, tmp_path / "export")
-    one, other = out / "segment-000/poses/images/003.png", tmp_path / "export/segment-000-0/colmap/images/003.png"
-    assert one.read_bytes() == other.read_bytes()
-    assert one.samefile(other) is not other_disk
+    export_atlas(out, tmp_path / "export", link=link)
+    for file, is_linked in (("images/003.png", link and not other_disk), ("sparse/0/images.bin", False)):
+        one, other = out / "segment-000/poses" / file, tmp_path / "export/segment-000-0/colmap" / file
+        assert one.read_bytes() == other.read_bytes()
+        assert one.samefile(other) is is_linked
 
 
 def test_what_cannot_be_exported_is_refused(out, tmp_path):

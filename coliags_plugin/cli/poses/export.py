@@ -20,6 +20,9 @@ class PosesExportCommand:
     """Folder that `coliags reconstruct` made of a long video."""
     output: arguments.Output
     """Folder to create."""
+    link: bool = False
+    """Do not copy images and depth, but give the files in OUT a second name, on the same disk: they take no space, and
+    who changes one changes both."""
     overwrite: arguments.Overwrite = False
     json: arguments.AsJson = False
 
@@ -27,7 +30,7 @@ class PosesExportCommand:
         """Export, and print the sub-maps."""
         from coliags_plugin.pipeline.procedure.export import MANIFEST, export_atlas
 
-        manifest = export_atlas(self.procedure, self.output, self.overwrite)
+        manifest = export_atlas(self.procedure, self.output, self.overwrite, self.link)
         lines = [
             f"{one['name']}: {len(one['frames'])} frames, unit {one['unit']}"
             + ("" if one["nerfstudio"] else ", no dense depth")
