@@ -95,6 +95,22 @@ def test_the_page_tells_what_came_out(out):
     assert str(out) not in text
 
 
+def test_two_segments_may_be_joined_at_several_models(out):
+    pair = ["segment-000", "segment-001"]
+    apart = join(pair, ["sparse/1", "sparse/0"], reason="scales differ by 30 %")
+    joins = procedure_content()["joins"]
+    write_json(out / "procedure.json", procedure_content(joins=[apart, *joins]))
+    text = page_of(out)
+    assert "1 of 2 places between segments" in text
+    assert "<span>joined: 5 shared frames" in text and "scales differ by 30 %" in text
+    write_json(
+        out / "procedure.json", procedure_content(joins=[join(pair, ["sparse/0", "sparse/1"], similarity(2)), apart])
+    )
+    assert "<span>no frame has a pose in both</span>" in page_of(out)
+    write_json(out / "procedure.json", procedure_content(joins=[apart]))
+    assert "<span>scales differ by 30 %</span>" in page_of(out)
+
+
 def test_the_page_is_one_file_without_anything_from_elsewhere(out):
     text = page_of(out)
     links = re.findall(r'(?:src|href|data-file)="([^"]*)"', text)

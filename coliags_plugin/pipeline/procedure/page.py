@@ -121,8 +121,8 @@ def _facts(procedure: ProcedureContents, known: Sequence[ProcedureSubmap]) -> It
     done = [submap for submap in known if submap.results and not submap.results.failure]
     yield Fact("Sub-maps", f"{len(done)} reconstructed of {len(procedure.submaps)}")
     if record.joins:
-        joined = sum(join.joined for join in record.joins)
-        yield Fact("Joined", f"{joined} of {counted(len(record.joins), 'place')} between segments")
+        joined, places = ({join.segments for join in record.joins if join.joined or not only} for only in (True, False))
+        yield Fact("Joined", f"{len(joined)} of {counted(len(places), 'place')} between segments")
     values = [psnr for submap in known if submap.results and (psnr := submap.results.figures.get("psnr")) is not None]
     if values:
         spread = f"{min(values):.2f} to {max(values):.2f} in {len(values)} sub-maps" if len(values) > 1 else ""

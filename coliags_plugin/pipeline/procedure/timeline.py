@@ -277,8 +277,9 @@ def _reason_apart(procedure: ProcedureContents, one: ProcedureSubmap, other: Pro
             return reason
     if one.segment != other.segment:
         pair = {one.segment, other.segment}
-        if reason := next((join.reason for join in procedure.record.joins if set(join.segments) == pair), ""):
-            return reason
+        between = [join for join in procedure.record.joins if set(join.segments) == pair]
+        if between and not any(join.joined for join in between):
+            return between[0].reason  # of the models that share most frames
     return _lost_between(procedure, one.last, other.first)
 
 
@@ -292,4 +293,4 @@ def _lost_between(procedure: ProcedureContents, last: int, first: int) -> str:
             reasons[skipped.why] += skipped.last - skipped.first + 1
     gap = max(0, first - last - 1)
     why = f", most: {reasons.most_common(1)[0][0]}" if reasons else ""
-    return f"{counted(gap, 'frame')} without a pose in between{why}" if gap else "no points are seen from both"
+    return f"{counted(gap, 'frame')} without a pose in between{why}" if gap else "no frame has a pose in both"
