@@ -25,9 +25,7 @@ def rotation_of_vector(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     x, y, z = vector.unbind()
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    if vector.device.type == "cpu":
-        return torch.linalg.matrix_exp(cross)
-    # On CUDA the host would wait for that. Rodrigues' formula: the sinc is smooth, and the norm has gradient 0 at zero.
+    # Rodrigues' formula, for which no device is waited for: the sinc is smooth, and the norm has gradient 0 at zero.
     turns = vector.double().norm() / math.tau
     once, half = torch.sinc(2.0 * turns).to(vector.dtype), torch.sinc(turns).to(vector.dtype)
     return torch.eye(3, dtype=vector.dtype, device=vector.device) + once * cross + 0.5 * half.square() * cross @ cross

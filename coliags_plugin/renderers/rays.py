@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from coliags_plugin.core.transfers import sent
+
 #: Added to every weight, so that no stretch of a ray is left out for good.
 WEIGHT_FLOOR = 1e-5
 
@@ -53,7 +55,7 @@ def _shares(rows: int, count: int, like: Tensor, generator: torch.Generator | No
     index = torch.arange(count, dtype=like.dtype, device=like.device)
     if generator is None:
         return ((index + 0.5) / count).expand(rows, -1).contiguous()
-    return (index + torch.rand(rows, count, generator=generator, dtype=like.dtype).to(like.device)) / count
+    return (index + sent(torch.rand(rows, count, generator=generator, dtype=like.dtype), like.device)) / count
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.transfers import constant
 from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.splatting import CutSettings, DrawnView, split_channels
 from coliags_plugin.renderers.tiles import TileGrid, TilePairs
@@ -128,7 +129,7 @@ def _draw_surfels(
 def _over_background(maps: dict[str, Tensor], placed: Placed, settings: CutSettings) -> DrawnView:
     rgb, alpha = maps["rgb"], maps["alpha"]
     if any(settings.background):
-        rgb = rgb + (1 - alpha)[..., None] * alpha.new_tensor(settings.background)
+        rgb = rgb + (1 - alpha)[..., None] * constant(settings.background, alpha)
     return DrawnView(rgb, alpha, maps, placed.means2d, placed.radii)
 
 

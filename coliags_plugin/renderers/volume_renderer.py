@@ -18,6 +18,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.transfers import constant
 from coliags_plugin.renderers.checks import check_outputs, check_primitive
 from coliags_plugin.renderers.rays import CompositedRays, even_places, refined_places, transmittances
 
@@ -158,7 +159,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         options = self.settings
         near, far = self._bounds(field, camera.near_plane)
         lines = _Lines.of(rays, options.spacing == "distance", far - near)
-        background = rays.new_tensor(options.background)
+        background = constant(options.background, rays)
         chance = generator if options.jitter else None
         early = [name for name in wants if name.endswith(_COARSE)]
         places = even_places(near, far, options.samples, rays, chance)

@@ -231,3 +231,8 @@ def test_triton_kernels_wait_for_the_number_of_pairs_besides(method, tmp_path):
     pytest.importorskip("triton")
     found = waits_of_a_step(tmp_path / "run", method, "renderer=triton")
     assert found <= WAITS + Counter({"local_scalar_dense renderers/triton_kernels/placing.py": 1})
+
+
+def test_the_volume_renderer_waits_for_nothing(tmp_path):
+    found = waits_of_a_step(tmp_path / "run", "reim-nerf-small", *STEPS["reim-nerf-small"])
+    assert found == Counter({"tolist engine/trainer.py": 1})
