@@ -172,6 +172,9 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
     assert executor.tasks == [] and done == before, "what is done is not done again"
     with pytest.raises(InputError, match="Choose another --output"):
         cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
+    workers()
+    again = cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 110}, overwrite=True)
+    assert {path.name for path in (tmp_path / "out").glob("segment-*")} == set(again.segments) < set(names)
 
 
 def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(

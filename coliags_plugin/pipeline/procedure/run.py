@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -85,13 +86,16 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     size = _size(context.source)
     if known is not None and (out / SURVEY_FILE).is_file():
         same = (known.source, known.bytes, known.first) == ([context.source.name], size, chosen.first)
-        if not same or known.options != options:
+        if same and known.options == options:
+            return known, Survey.read(out)
+        if not overwrite:
             raise InputError(
                 f"{out} was made from {', '.join(known.source)}, {known.bytes} bytes, cut by {known.options}",
                 f"{context.source.name}, {size} bytes, cut by {options}",
-                "Choose another --output",
+                "Choose another --output, or pass --overwrite to begin again",
             )
-        return known, Survey.read(out)
+        for segment in known.segments:
+            shutil.rmtree(out / segment.name, ignore_errors=True)
     if known is None and out.is_dir() and any(not path.name.startswith(".") for path in out.iterdir()):
         raise InputError(
             f"{out} already exists and is no procedure", "a new or empty folder", "Choose another --output"
