@@ -14,7 +14,8 @@ import pytest
 #: A100, H100, B200; MI300.
 NVIDIA = (("cuda", 80, 32), ("cuda", 90, 32), ("cuda", 100, 32))
 AMD = (("hip", "gfx942", 64),)
-TARGETS = [*NVIDIA, *(pytest.param(target, marks=pytest.mark.thorough) for target in AMD)]
+#: One in every test run, the others in thorough ones.
+TARGETS = [NVIDIA[1], *(pytest.param(target, marks=pytest.mark.thorough) for target in (NVIDIA[0], NVIDIA[2], *AMD))]
 #: Bytes of shared memory for which every GPU has several programs at work on each multiprocessor.
 SHARED = 16 * 1024
 #: Bytes of registers that a thread may keep in memory, where the compiler so gets another program on a multiprocessor.
