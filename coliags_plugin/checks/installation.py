@@ -80,7 +80,7 @@ def _cuda() -> list[CheckResult]:
 
 
 def _driver_version() -> str | None:
-    """The newest CUDA that the driver serves; None where it does not tell."""
+    """The newest CUDA version that the installed driver supports; None where it does not tell."""
     number = ctypes.c_int()
     try:
         status = ctypes.CDLL("libcuda.so.1").cuDriverGetVersion(ctypes.byref(number))

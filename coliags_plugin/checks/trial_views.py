@@ -102,7 +102,7 @@ def try_renderers(device: torch.device, trial: Trial) -> Iterator[CheckResult]:
 
 
 def _chosen(primitive: str, device: torch.device) -> Iterator[ChosenRenderer]:
-    """The renderer that ``auto`` takes, and gsplat where it is another that can serve; none where none can."""
+    """The renderer that ``auto`` takes, and gsplat where it is available and another one."""
     taken = set()
     for name in ("auto", "gsplat"):
         try:
@@ -221,7 +221,7 @@ def _values(
 
 
 def _unsettled(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Pixels where rounding decides whether a Gaussian is beyond a threshold: they change where it is moved. [H, W]"""
+    """Mask of the pixels that change where the alpha and transmittance thresholds are moved a little. [H, W]"""
     moved = {name: getattr(gaussians, name).double() for name in INPUTS}
     plain, alphas = TorchRendererSettings(), []
     for factor in (1.0 - _THRESHOLD_MARGIN, 1.0 + _THRESHOLD_MARGIN):

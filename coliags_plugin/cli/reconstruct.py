@@ -131,7 +131,7 @@ class ReconstructCommand:
         )
 
     def _tell(self, made: FinishedProcedure) -> None:
-        """Print what became of the segments of a long video."""
+        """Print a line for each segment of a long video and for each join."""
         from coliags_plugin.pipeline.page import held_out_text, results_of
         from coliags_plugin.pipeline.stages import PAGE_FILE
 

@@ -75,7 +75,7 @@ class CellRuns:
         self.tell(cell, phase, reason)
 
     def tell(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:
-        """Log what becomes of a cell."""
+        """Log a cell's phase."""
         ended = sum(self._ended.values())
         log.info("[%d/%d] %s: %s%s", ended, self._count, cell.title, phase, reason)
 

@@ -35,10 +35,15 @@ def make_executor(options: ExecutionOptions) -> Executor:
     check_name("executor", options.executor, get_args(ExecutorName))
     if options.executor == "ray":
         return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cpus = available_cpus()
     gpus = _gpus(options.device)
     jobs = options.jobs or len(gpus) or cpus
     return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
+
+
+def available_cpus() -> int:
+    """CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _gpus(device: str) -> list[str]:

@@ -17,16 +17,16 @@ from coliags_plugin.pipeline.stages import Stage, StageOutcome
 def stages_of(context: StageContext) -> list[Stage]:
     """The stages for a source, in order: of the sub-maps as far as they are known."""
     settings, stages = context.settings, list[Stage]()
-    source: dict[str, Any] = {"source": _identity(context.source)}
+    source: dict[str, Any] = {"source": identity_of(context.source)}
     if context.data_format is None:
-        mask = None if context.mask is None else _identity(context.mask)
+        mask = None if context.mask is None else identity_of(context.mask)
         options = {"frames": settings.frames.model_dump(), "mask": mask, **source}
         stages.append(Stage("frames", options, partial(capture_stages.make_frames, context), ["frames"]))
         options = {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
         stages.append(Stage("poses", options, partial(capture_stages.make_poses, context), ["poses"], is_plan=True))
         source = {}
     for submap in context.submaps():
-        own = {"model": _identity(context.posed / str(submap.submap.model))} if submap.submap.number else source
+        own = {"model": identity_of(context.posed / str(submap.submap.model))} if submap.submap.number else source
         stages += _submap_stages(submap, own)
     return stages
 
@@ -60,7 +60,7 @@ def _submap_stages(context: StageContext, source: Mapping[str, Any]) -> list[Sta
     return stages
 
 
-def _identity(path: Path) -> Mapping[str, Any]:
+def identity_of(path: Path) -> Mapping[str, Any]:
     """Name and size of a file or folder: enough to notice that it is another one."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}

@@ -6,13 +6,14 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from coliags_plugin.core.errors import InterruptedRunError
 from coliags_plugin.execution.choice import ExecutionOptions
 from coliags_plugin.execution.executors import Executor
-from coliags_plugin.execution.queue import Job
+from coliags_plugin.execution.queue import Job, JobQueue
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.page import write_index
-from coliags_plugin.pipeline.stages import Part, Record, Stage, StageRecord, check_options, part_name
+from coliags_plugin.pipeline.stages import Part, Record, Stage, check_options, part_name
 from coliags_plugin.pipeline.worker import PartTask
 from coliags_plugin.reporting.numbers import duration
 
@@ -22,7 +23,19 @@ log = logging.getLogger(__name__)
 LOGS = "logs"
 #: Share of the work that comes before the sub-maps.
 _PLAN_SHARE = 0.2
-_NOT_BEGUN = StageRecord({})
+
+
+def run_jobs(executor: Executor, options: ExecutionOptions, jobs: Sequence[Job], total: int) -> None:
+    """Do jobs, whose sizes are shares of ``total``, and tell which run.
+
+    Raises:
+        InterruptedRunError: Ctrl-C; what is done is kept.
+    """
+    queue = JobQueue(executor, options.retries, jobs, total)
+    try:
+        queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
+    except KeyboardInterrupt as error:
+        raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
 
 
 class PartJobs:
@@ -67,7 +80,9 @@ class PartJobs:
         parts: dict[Part, list[Stage]] = {}
         for stage in stages_of(self.context):
             parts.setdefault(stage.part, []).append(stage)
-        waiting = [part for part, stages in parts.items() if not all(self.is_done(stage) for stage in stages)]
+        waiting = [
+            part for part, stages in parts.items() if not all(self.record.is_done(stage.name) for stage in stages)
+        ]
         if None in waiting:
             waiting = [None]
         self._left = set(waiting)
@@ -85,10 +100,6 @@ class PartJobs:
         """Those that are to be done after the stages that all need, once."""
         then, self._then = self._then, None
         return [] if then is None else then(self)
-
-    def is_done(self, stage: Stage) -> bool:
-        """Whether a stage is."""
-        return self.record.stages.get(stage.name, _NOT_BEGUN).state == "done"
 
     def end(self, job: PartJob, reason: str = "") -> list[Job]:
         """Take what the worker of a part has written, or why it failed; returns what is to be done after it."""
@@ -154,7 +165,7 @@ class PartJob(Job):
     def progress(self) -> int:
         """Share of the stages that are done; the rest is over when the process has ended."""
         record = Record.of(self._jobs.context.out)
-        done = sum(record.stages.get(stage.name, _NOT_BEGUN).state == "done" for stage in self.stages)
+        done = sum(record.is_done(stage.name) for stage in self.stages)
         return self.size * done // (len(self.stages) + 1)
 
     def finish(self) -> Sequence[Job]:

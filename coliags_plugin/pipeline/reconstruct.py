@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 
 import torch
 
-from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_overlap
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
-from coliags_plugin.execution.choice import ExecutionOptions, make_executor
-from coliags_plugin.execution.queue import JobQueue
+from coliags_plugin.execution.choice import ExecutionOptions, available_cpus, make_executor
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.forecast import forecast, within_budget
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
-from coliags_plugin.pipeline.jobs import PartJobs
+from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
 from coliags_plugin.pipeline.recordings import opened_recording
@@ -94,7 +92,7 @@ def reconstruct(
 
 def _cores(execution: ExecutionOptions | None) -> float:
     """CPU cores that work at a time."""
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cpus = available_cpus()
     if execution is None or execution.executor != "local" or execution.jobs is None:
         return cpus
     return min(cpus, execution.jobs * (execution.threads or max(1, cpus // execution.jobs)))
@@ -105,11 +103,7 @@ def _by_workers(context: StageContext, execution: ExecutionOptions, overwrite: b
     executor = make_executor(execution)
     executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
     jobs = PartJobs(context, executor, execution, overwrite, _UNITS)
-    queue = JobQueue(executor, execution.retries, jobs.jobs(), _UNITS)
-    try:
-        queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
-    except KeyboardInterrupt as error:
-        raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
+    run_jobs(executor, execution, jobs.jobs(), _UNITS)
     for part in (None, 0):
         if part in jobs.failures:
             raise InputError(jobs.failures[part])

@@ -99,6 +99,10 @@ class Record:
             )
         return cls(folder, worker=worker)
 
+    def is_done(self, name: str) -> bool:
+        """Whether a stage is."""
+        return name in self.stages and self.stages[name].state == "done"
+
     def take_over_all(self) -> None:
         """Take what the workers of an earlier call have written; one that has not ended is waited for.
 

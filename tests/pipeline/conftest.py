@@ -13,10 +13,13 @@ from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
+from coliags_plugin.pipeline.procedure import run
 from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.pipeline.worker import PartTask, work
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from tests.pipeline.films import film
+from tests.task_list import TaskList
 from tests.textured_tube import tube_frames
 
 CAPTURE = ("make_poses", "check_data", "estimate_depth")
@@ -99,3 +102,29 @@ def whole_procedure(tmp_path_factory):
 def out(whole_procedure, tmp_path):
     """A copy of it."""
     return shutil.copytree(whole_procedure, tmp_path / "out")
+
+
+class Workers(TaskList):
+    """Work as the processes do, in this one; the first tasks end in some other way instead."""
+
+    def __init__(self, *endings):
+        super().__init__()
+        self.endings = list(endings)
+
+    def outcome(self, task):
+        assert PartTask.from_json(task.to_json()) == task
+        ending = self.endings.pop(0) if self.endings else None
+        if isinstance(ending, BaseException):
+            raise ending
+        return ending or work(task)
+
+
+@pytest.fixture
+def workers(monkeypatch):
+    def use(*endings):
+        executor = Workers(*endings)
+        for module in (reconstruct, run):
+            monkeypatch.setattr(module, "make_executor", lambda options: executor)
+        return executor
+
+    return use

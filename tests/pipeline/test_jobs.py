@@ -13,39 +13,12 @@ import pytest
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.execution.tasks import TaskOutcome
-from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
+from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome
-from coliags_plugin.pipeline.worker import PartTask, work
 from tests.comparison.small import until
 from tests.pipeline.conftest import TRAINING, write_atlas
-from tests.task_list import TaskList
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)
-
-
-class Workers(TaskList):
-    """Work as the processes do, in this one; the first tasks end in some other way instead."""
-
-    def __init__(self, *endings):
-        super().__init__()
-        self.endings = list(endings)
-
-    def outcome(self, task):
-        assert PartTask.from_json(task.to_json()) == task
-        ending = self.endings.pop(0) if self.endings else None
-        if isinstance(ending, BaseException):
-            raise ending
-        return ending or work(task)
-
-
-@pytest.fixture
-def workers(monkeypatch):
-    def use(*endings):
-        executor = Workers(*endings)
-        monkeypatch.setattr(reconstruct, "make_executor", lambda options: executor)
-        return executor
-
-    return use
 
 
 def told(folder):

@@ -28,7 +28,6 @@ from coliags_plugin.pipeline.stages import Record, StageOutcome
 from tests import commands
 from tests.pipeline.conftest import TRAINING, write_atlas
 from tests.pipeline.films import film
-from tests.pipeline.test_jobs import Workers
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)
 
@@ -117,16 +116,6 @@ def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
         (("sparse/1", "sparse/0"), 9, ""), (("sparse/0", "sparse/0"), 8, "")
     ]  # fmt: skip
     assert joins([], [second])[0].reason == "no frame has a pose on one side"
-
-
-@pytest.fixture
-def workers(monkeypatch):
-    def use(*endings):
-        executor = Workers(*endings)
-        monkeypatch.setattr(run, "make_executor", lambda options: executor)
-        return executor
-
-    return use
 
 
 @pytest.fixture

@@ -10,21 +10,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.execution.executors import Executor
-from coliags_plugin.execution.queue import Job, JobQueue
+from coliags_plugin.execution.queue import Job
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
+from coliags_plugin.pipeline.chain import identity_of
 from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.frame_selection import reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source
 from coliags_plugin.pipeline.frames import MASK
-from coliags_plugin.pipeline.jobs import PartJobs
+from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, joins, read_posed
 from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
 from coliags_plugin.pipeline.procedure.segments import Segment, cut
-from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, survey_video
+from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, checksum, survey_video
 from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
@@ -60,18 +62,13 @@ def reconstruct_procedure(
     executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
     segments = _Segments(context, procedure, survey, executor, execution, overwrite)
     total = sum(segment.count for segment in procedure.segments)
-    queue = JobQueue(executor, execution.retries, segments.jobs(), total)
-    try:
-        queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
-    except KeyboardInterrupt as error:
-        raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
+    run_jobs(executor, execution, segments.jobs(), total)
     names = [segment.name for segment in procedure.segments]
     procedure = procedure.model_copy(update={"joins": _joins(context.out, procedure, names)})
     procedure.write(context.out)
     write_procedure_page(context.out)
     records = {name: Record.of(context.out / name) for name in names}
-    posed = [name for name, record in records.items() if _state(record, "poses") == "done"]
-    if not posed:
+    if not any(record.is_done("poses") for record in records.values()):
         reasons = next((record.stages["poses"].summary for record in records.values() if "poses" in record.stages), "")
         raise InputError(f"none of {len(names)} segments has poses: {reasons}", "a video in which the camera moves")
     return FinishedProcedure(context.out, procedure, records)
@@ -83,7 +80,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     least = context.settings.least_submap
     options = {"every": chosen.every, "segment": chosen.segment, "last": chosen.last, "least": least}
     known = Procedure.read(out)
-    size = _size(context.source)
+    size = identity_of(context.source)["bytes"]
     if known is not None and (out / SURVEY_FILE).is_file():
         same = (known.source, known.bytes, known.first) == ([context.source.name], size, chosen.first)
         if same and known.options == options:
@@ -133,20 +130,11 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     return procedure, survey
 
 
-def _size(source: Path) -> int:
-    files = source.iterdir() if source.is_dir() else [source]
-    return sum(file.stat().st_size for file in files if file.is_file())
-
-
 def _are_found(path: Path, survey: Survey, numbers: Sequence[int], first: int) -> bool:
     """Whether frames that are sought by their number are those that came in order."""
-    from zlib import crc32
-
-    from coliags_plugin.pipeline.frame_selection import reduced
-
     for number in numbers:
         image = next((image for _, image in frame_source(path, Span(number, number))), None)
-        if image is None or crc32(reduced(image).tobytes()) != survey.checksums[number - first]:
+        if image is None or checksum(reduced(image)) != survey.checksums[number - first]:
             log.warning("%s: frames are not found by their number, and decoded in order for every segment", path)
             return False
     return True
@@ -252,7 +240,3 @@ def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[Segmen
 
 def _posed(segment: Path) -> list[PosedFrames]:
     return read_posed(segment / "poses") if (segment / "poses").is_dir() else []
-
-
-def _state(record: Record, stage: str) -> str:
-    return record.stages[stage].state if stage in record.stages else "not begun"

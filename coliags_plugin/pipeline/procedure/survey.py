@@ -7,7 +7,7 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt32
+from jaxtyping import Bool, Float32, UInt8, UInt32
 
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.progress import Progress
@@ -57,6 +57,11 @@ class Survey:
             return cls(**own, size=(height, width), mask=arrays["mask"] if arrays["mask"].size else None)
 
 
+def checksum(gray: UInt8[np.ndarray, "h w"]) -> int:
+    """Checksum of a reduced frame."""
+    return crc32(gray.tobytes())
+
+
 def survey_video(source: FrameSource, progress: Progress | None = None) -> Survey:
     """Look at every frame of a video once, two of them at a time.
 
@@ -71,7 +76,7 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
         moved, share = (np.inf, 0.0) if last is None else motion_and_survival(last, gray)
         motions.append(moved)
         followed.append(share)
-        checksums.append(crc32(gray.tobytes()))
+        checksums.append(checksum(gray))
         last = gray
         if progress is not None:
             progress("look at frames", done, max(done, expected))
