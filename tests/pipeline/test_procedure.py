@@ -35,7 +35,7 @@ SUBMAP = ("check_data", "estimate_depth", *TRAINING)
 def surveyed(followed, sharpness=1.0):
     followed = np.array(followed, np.float32)
     count = len(followed)
-    sharp = np.full(count, sharpness, np.float32)
+    sharp = np.broadcast_to(np.float32(sharpness), count)
     return Survey(sharp, followed, np.zeros(count, np.float32), np.arange(count, dtype=np.uint32), (40, 50), None)
 
 
@@ -64,6 +64,14 @@ def test_a_video_is_cut_where_nothing_is_seen_for_long_and_where_least_is_follow
     # The middle half of 350 to 999 has frame 500 in it, where least is followed.
     assert segments == [Stretch(0, 299), Stretch(350, 499 + half), Stretch(500 - half, 999)] or segments[0].last == 299
     assert segments[1].last - segments[2].first + 1 == OVERLAP
+
+
+def test_the_noise_of_a_flat_wall_at_the_lens_may_be_followed_and_is_left_out():
+    sharpness = np.full(400, 0.02)
+    sharpness[200:260] = 0.002
+    segments, skipped = cut(surveyed(np.full(400, 0.5), sharpness), FrameSettings(), 12)
+    assert [(each.first, each.last) for each in skipped] == [(200, 259)]
+    assert segments == [Stretch(0, 199), Stretch(260, 399)]
 
 
 @settings(max_examples=60, deadline=None)
