@@ -57,7 +57,7 @@ def make_poses(context: StageContext) -> StageOutcome:
     ]
     atlas = replace(atlas, models=(*models, *atlas.models[len(used) :]))
     units: list[Unit] = ["unknown" if factor is None else "mm" for factor in factors]
-    write_sfm_scene(context.posed, atlas, mask, overwrite=True, units=units)
+    write_sfm_scene(context.posed, atlas, mask, overwrite=True, units=units, link=True)
     depth = atlas.largest.median_depth
     unit = (
         f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"

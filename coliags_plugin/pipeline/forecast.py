@@ -16,8 +16,8 @@ from coliags_plugin.reporting.numbers import duration, file_size
 _POSES, _FRAME, _STEP, _SUBMAP = 1.1, 1.7, 0.24, 104.0
 #: Share of the frames that get a pose, and frames of a sub-map, in that clip; training steps of a frame, of 2000.
 _POSED, _SUBMAP_FRAMES, _STEPS = 0.92, 45, 23
-#: Bytes: of a pixel of a frame, which is kept twice; of a frame's depth; and of a sub-map.
-_PIXEL, _DEPTH, _SUBMAP_BYTES = 2.0, 0.45e6, 75e6
+#: Bytes: of a pixel of a frame; of a frame's depth; and of a sub-map.
+_PIXEL, _DEPTH, _SUBMAP_BYTES = 1.0, 0.45e6, 75e6
 #: Least share of the training steps that a budget leaves, and most frames of which one is used.
 _SHARES, _MOST_EVERY = (1.0, 0.5, 0.25), 12
 

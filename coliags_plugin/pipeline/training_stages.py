@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from coliags_plugin.config.method_config import method_name
@@ -20,8 +21,9 @@ if TYPE_CHECKING:
 _SAVE_SECONDS, _KEPT = 60.0, 2
 #: What the results are that the page shows: of scenes, and of frames beside depth and flattened light.
 SCENE, PICTURES = "the scene to fly through: Gaussians, surface, coverage", "frames, depth, flattened light"
-#: Largest page of a scene, bytes, and time for fitting its Gaussians, seconds: of the largest sub-map and of others.
-_PAGES = {True: (10_000_000, 90.0), False: (4_000_000, 30.0)}
+#: Largest page of a scene, bytes: of the largest sub-map and of others. Its Gaussians are fitted for as many steps as
+#: were trained, but so many at most; not for a time, so that it is the same whatever machine made it.
+_PAGES, _MOST_FIT_STEPS = {True: 10_000_000, False: 4_000_000}, 2000
 #: Frames that are shown with their depth.
 _PICTURED = 4
 #: Training views that are evaluated, for comparison with those held out.
@@ -146,8 +148,8 @@ def show(context: StageContext) -> StageOutcome:
 
     trained = load_trained(context.run, context.device, context.scene)
     depth_scale = _write_pictures(trained, context.run / "pictures")
-    size, seconds = _PAGES[context.submap.number == 0]
-    page = save_page(trained, context.run / "scene.html", size, "recorded", seconds)
+    size, steps = _PAGES[context.submap.number == 0], min(trained.step, _MOST_FIT_STEPS)
+    page = save_page(trained, context.run / "scene.html", size, "recorded", math.inf, steps)
     files = {"run/scene.html": SCENE, "run/pictures": PICTURES}
     return StageOutcome(page.text, files, figures={"depth_scale": depth_scale})
 

@@ -19,7 +19,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
+from coliags_plugin.export.baking.distillation import STEPS, adjusted_camera, distil, needs_distillation
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import THICKNESS_SHARE
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
@@ -172,13 +172,14 @@ def bake(
     most: int | None = None,
     degree: int = MAX_DEGREE,
     kind: type[ExplicitGaussians] = ExplicitGaussians,
+    most_steps: int = STEPS,
 ) -> tuple[SplatCloud, dict[str, Any]]:
     """One cloud of Gaussians for all views, under a held light, if any, and facts for its record, if it is changed.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
     that are others in every view, or where only ``most`` of them may be kept, those with the largest blending weights
-    are fitted to what the run renders, for so many seconds at most
+    are fitted to what the run renders, for so many seconds and steps at most
     (:mod:`~coliags_plugin.export.baking.distillation`): 70 % of the weights, as fewer Gaussians allow more steps.
     Explicit Gaussians of which all may be kept are as they are, and surfels, made thin Gaussians that viewers draw with
     another filter, are fitted so, all of them.
@@ -189,7 +190,7 @@ def bake(
     if most is None and isinstance(explicit, ExplicitGaussians):
         made = field_of_cloud(cloud_of_field(explicit).with_thickness(THICKNESS_SHARE))
         needs = explicit.scale_count < 3 and needs_distillation(made, trained, light)
-        facts = {"steps": distil(made, trained, light, seconds), "seconds": seconds} if needs else {}
+        facts = {"steps": distil(made, trained, light, seconds, most_steps), "seconds": seconds} if needs else {}
         return cloud_of_field(made).scaled(1.0 / scale), facts
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     averages, seen = _averaged(trained, views, light)
@@ -205,7 +206,7 @@ def bake(
     if needs_distillation(made, trained, light):
         kept = averages.heaviest(len(kept), _FITTED_SHARE)
         made = field()
-        steps = distil(made, trained, light, seconds)
+        steps = distil(made, trained, light, seconds, most_steps)
     facts = {"steps": steps, "seconds": seconds, "views": len(views), "visible": visible}
     return cloud_of_field(made).scaled(1.0 / scale), facts
 

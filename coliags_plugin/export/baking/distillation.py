@@ -69,13 +69,15 @@ class _Target:
     error: Float[Tensor, ""]  # mean squared error of the run: 0 between training frames
 
 
-def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float) -> int:
+def distil(
+    field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float, steps: int = STEPS
+) -> int:
     """Fit explicit Gaussians, in place, to renderings of a run in a held light; returns the number of steps.
 
     Half of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
     the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
-    renders beside them: between neighbouring ones, moved and turned a little. It ends after so many seconds, or
-    :data:`STEPS`.
+    renders beside them: between neighbouring ones, moved and turned a little. It ends after so many seconds, or so many
+    steps: without an end in time (``seconds`` infinite), a run gives the same Gaussians again.
     """
     renderer = splatting_of(model_of_gaussians(field, trained))
     unit = trained.scene.pixel_footprint
@@ -90,8 +92,8 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
     targets: dict[int, _Target] = {}
     order: list[int] = []
     start, step = time.monotonic(), 0
-    with ProgressReport("fit to what the run renders", STEPS) as progress:
-        while (done := max(step / STEPS, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
+    with ProgressReport("fit to what the run renders", steps) as progress:
+        while (done := max(step / steps, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
             step += 1
             order = order or torch.randperm(len(views), generator=chance).tolist()
             index = order.pop()
@@ -110,7 +112,7 @@ def distil(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | Non
             for group in adam.param_groups:
                 group["lr"] = log_linear(rates[group["name"]], _LAST * rates[group["name"]], done)
             adam.step()
-            progress.update(max(step, int(done * STEPS)), f"loss {float(loss.detach()):.4f}")
+            progress.update(max(step, int(done * steps)), f"loss {float(loss.detach()):.4f}")
     return step
 
 

@@ -16,7 +16,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import SECONDS, bake
-from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
+from coliags_plugin.export.baking.distillation import STEPS, adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.viewer.content import NOTHING, ViewerContent, mesh_files
@@ -51,29 +51,35 @@ class ScenePage:
     facts: Mapping[str, Any]  # the figures
 
 
-def save_page(trained: TrainedRun, output: Path, largest: int, light: str, seconds: float) -> ScenePage:
+def save_page(
+    trained: TrainedRun, output: Path, largest: int, light: str, seconds: float, most_steps: int = STEPS
+) -> ScenePage:
     """Write :func:`scene_page` to a file; an existing one is replaced."""
     refuse_folder(output)
-    page = scene_page(trained, largest, light, seconds)
+    page = scene_page(trained, largest, light, seconds, most_steps)
     atomic_write(output, page.html)
     return page
 
 
 def scene_page(
-    trained: TrainedRun, largest: int = LARGEST_PAGE, light: str = "recorded", seconds: float = SECONDS
+    trained: TrainedRun,
+    largest: int = LARGEST_PAGE,
+    light: str = "recorded",
+    seconds: float = SECONDS,
+    most_steps: int = STEPS,
 ) -> ScenePage:
     """A run as an HTML page of at most so many bytes: its Gaussians, and the meshes in its folder.
 
     Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction,
     but, in the recorded light, on the distance to the lamp that moves with the camera: the most visible ones, as many
-    as the page holds, fitted to what the run renders for so many seconds, and compared with the run on its held-out
-    frames. The view starts at a training frame
+    as the page holds, fitted to what the run renders for so many seconds and steps at most, and compared with the run
+    on its held-out frames. The view starts at a training frame
     (:func:`~coliags_plugin.export.baking.distillation.best_frame`). Of a method without Gaussians, the page shows the
     meshes.
     """
     meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
     if isinstance(trained.model.field, GaussianField):
-        return _page_of_gaussians(trained, trained.model.field, meshes, largest, light, seconds)
+        return _page_of_gaussians(trained, trained.model.field, meshes, largest, light, seconds, most_steps)
     if not meshes:
         raise InputError(
             f"method '{trained.method}' has no Gaussians to draw in a browser, and its run no mesh",
@@ -97,14 +103,20 @@ def _mesh_layer(name: str, mesh: TriangleMesh) -> Layer:
 
 
 def _page_of_gaussians(
-    trained: TrainedRun, field: GaussianField, meshes: list[Layer], largest: int, light: str, seconds: float
+    trained: TrainedRun,
+    field: GaussianField,
+    meshes: list[Layer],
+    largest: int,
+    light: str,
+    seconds: float,
+    most_steps: int,
 ) -> ScenePage:
     page, held = _Page(trained), held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     empty = len(page.html(meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
     kind = AttenuatedGaussians if held is None and knows_lamp(field) else ExplicitGaussians
-    splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0, kind)
+    splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
     first = best_frame(field_of_cloud(splats), trained, held)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
     while empty + (size := len(json.dumps(layer.packed))) > largest:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
@@ -63,20 +63,26 @@ RIBBON_FILE = "atlas.png"
 
 
 def write_sfm_scene(
-    folder: Path, atlas: Atlas, masks: Masks = None, overwrite: bool = False, units: Sequence[Unit] = ()
+    folder: Path,
+    atlas: Atlas,
+    masks: Masks = None,
+    overwrite: bool = False,
+    units: Sequence[Unit] = (),
+    link: bool = False,
 ) -> None:
     """Write a scene in COLMAP's layout: copies of the posed images, masks, the unit, and the models, largest first.
 
     ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose;
     ``atlas.png`` shows it. ``units`` are those of the models, unknown where not given: each has then one of its own.
+    With ``link``, images are second names of the given files, where the disk allows it, and take no space.
     """
     unknown: list[Unit] = ["unknown"] * (len(atlas.models) - len(units))
-    units = [*units, *unknown]
+    units, copy = [*units, *unknown], link_or_copy if link else shutil.copyfile
     with atomic_folder(folder, overwrite) as scratch:
         (scratch / "images").mkdir()
         for number, reconstruction in enumerate(atlas.models):
             for index in reconstruction.registered:
-                shutil.copyfile(reconstruction.images[index], scratch / "images" / reconstruction.names[index])
+                copy(reconstruction.images[index], scratch / "images" / reconstruction.names[index])
                 mask = mask_of(reconstruction.images[index], masks)
                 if mask is not None:
                     write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
