@@ -1,0 +1,299 @@
+"""A synthetic procedure with exact truth: phantoms in a row, with contact, blur and wash between them.
+
+python benchmarks/procedure.py make FOLDER
+coliags reconstruct FOLDER/procedure-6000.mp4 --output OUT --jobs 2
+python benchmarks/procedure.py judge FOLDER OUT
+
+``make`` renders the phantoms, and writes a video for each of the lengths. ``judge`` compares poses, joins and coverage
+with the truth. Both keep what is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+import tyro
+from in_vivo import LOST_MM, aligned, judged, path_length
+from machine import markdown_table, show
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
+from coliags_plugin.core.json_files import read_json
+from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.outputs.video import write_video
+from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
+from coliags_plugin.pipeline.procedure.record import ModelKey, SegmentJoin
+from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
+from coliags_plugin.surface.coverage.views import CoverageView
+from coliags_plugin.surface.coverage.visibility import Level, see_faces
+
+#: Of each phantom: seeds count from here; lengths of the withdrawals, mm; frames, and frames between two phantoms.
+SEED, LENGTHS, FRAMES, BETWEEN = 4100, (60, 45, 55, 35, 60, 50, 40, 60), 700, 50
+SETTINGS: dict[str, Any] = {
+    "preset": "in-vivo", "frames": FRAMES, "width": 192, "height": 192, "rotation_views": 0, "polyps": 2,
+    "frame_rate": 30.0, "turns": 7, "contacts": 2, "washes": 1, "mesh_spacing": 1.0, "texture_spacing": 0.2,
+}  # fmt: skip
+RATE = 30.0
+
+
+@dataclass(frozen=True)
+class Make:
+    """Render the phantoms, and write the videos and where each phantom is in them."""
+
+    folder: tyro.conf.Positional[Path]
+    """Of all that is made; what it holds already is not made again."""
+    lengths: tuple[int, ...] = (1500, 3000, 6000)
+    """Frames of the videos: each is the beginning of the next."""
+
+    def run(self) -> None:
+        """Make what is missing."""
+        from coliags_plugin.api.scenes import make_phantom
+
+        for number, length in enumerate(LENGTHS[: -(-max(self.lengths) // (FRAMES + BETWEEN))]):
+            if not (self.folder / f"phantom-{number}").is_dir():
+                make_phantom(
+                    self.folder / f"phantom-{number}", **SETTINGS, seed=SEED + number, path_length=float(length)
+                )
+        for length in self.lengths:
+            video = self.folder / f"procedure-{length}.mp4"
+            if not video.is_file():
+                frames = (image for image, _ in zip(_frames(self.folder), range(length), strict=False))
+                write_video(frames, video, RATE)
+
+
+def _frames(folder: Path) -> Iterator[np.ndarray]:
+    """Frames of all phantoms, and between two of them by turns wall contact, fast motion and a wash."""
+    rng = np.random.default_rng(0)
+    for number in range(len(LENGTHS)):
+        files = sorted((folder / f"phantom-{number}" / "images").glob("*.png"))
+        for file in files:
+            yield _read(file)
+        following = folder / f"phantom-{number + 1}" / "images"
+        after = _read(min(following.glob("*.png"))) if following.is_dir() else _read(files[0])
+        disturbed = (_contact, _fast, _washed)[number % 3]
+        for place in np.linspace(0.0, 1.0, BETWEEN):
+            image = _read(files[-1]) if place < 0.5 else after
+            yield disturbed(image, float(1.0 - abs(2.0 * place - 1.0)), rng)
+
+
+def _read(file: Path) -> np.ndarray:
+    return np.ascontiguousarray(decode_image(file, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def _contact(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
+    """The wall at the lens: out of focus, red and overexposed."""
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.1 + 40.0 * min(1.0, 4.0 * strength)).astype(np.float32)
+    share = 0.8 * min(1.0, 2.0 * strength)
+    return _noisy((1.0 - share) * blurred + share * np.array([235.0, 120.0, 95.0]), rng)
+
+
+def _fast(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
+    """The camera turned fast: blur along a direction, from elsewhere in every frame."""
+    size, angle = image.shape[0], rng.uniform(0.0, np.pi)
+    length = max(3, round(0.5 * size * min(1.0, 3.0 * strength)))
+    kernel = np.zeros((length, length), np.float32)
+    reach = 0.5 * (length - 1) * np.array([np.cos(angle), np.sin(angle)])
+    ends = [tuple(np.rint(0.5 * (length - 1) + sign * reach).astype(int).tolist()) for sign in (-1, 1)]
+    cv2.line(kernel, ends[0], ends[1], 1.0)
+    moved = np.roll(image, rng.integers(-size // 2, size // 2, 2) if strength > 0.1 else (0, 0), (0, 1))
+    return _noisy(cv2.filter2D(moved.astype(np.float32), -1, kernel / kernel.sum()), rng)
+
+
+def _washed(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
+    """Water over the lens: a distortion that changes in every frame, and glare."""
+    height, width = image.shape[:2]
+    shifts = 300.0 * min(1.0, 3.0 * strength) * rng.standard_normal((2, height, width)).astype(np.float32)
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    moved = [grid + cv2.GaussianBlur(shift, (0, 0), 8.0) for grid, shift in zip((columns, rows), shifts, strict=True)]
+    seen = cv2.remap(image, moved[0], moved[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101).astype(np.float32)
+    glare = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), 6.0)
+    glare = strength * 160.0 * np.clip((glare - glare.mean()) / glare.std() - 0.8, 0.0, 1.0)
+    return _noisy(cv2.GaussianBlur(seen, (0, 0), 0.1 + 3.0 * strength) + glare[..., None], rng)
+
+
+def _noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.clip(np.rint(image + rng.normal(0.0, 1.5, image.shape)), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Compare what was made of a video with the truth."""
+
+    folder: tyro.conf.Positional[Path]
+    """Of the phantoms."""
+    out: tyro.conf.Positional[Path]
+    """Of the procedure."""
+    json: Path | None = None
+    """Also write the rows of the sub-maps here."""
+
+    def run(self) -> None:
+        """Print the tables."""
+        procedure, truth = read_procedure(self.out), Truth(self.folder)
+        models = {one.key: Model.of(self.out, one) for one in procedure.submaps}
+        rows = [truth.row(self.out, one, models[one.key]) for one in procedure.submaps]
+        numbers = np.arange(procedure.record.first, procedure.record.stop)
+        is_tissue, is_posed = truth.phantom(numbers) >= 0, np.isin(numbers, list(procedure.posed))
+        segments = [truth.is_wrong(join, models) for join in procedure.record.joins if join.joined]
+        within = [wrong for one in procedure.segments for wrong in truth.wrong_within(one, models)]
+        show(rows, self.json)
+        print()
+        counts = {
+            "frames": len(numbers),
+            "of tissue": is_tissue.sum(),
+            "of these posed, %": 100.0 * is_posed[is_tissue].mean(),
+            "others posed": is_posed[~is_tissue].sum(),
+            "sub-maps": len(rows),
+            "meshes": sum(row["wall seen, mm2"] is not None for row in rows),
+            "ATE, mm": _spread(rows, "ATE, mm"),
+            "poses far off": sum(row["far off"] for row in rows),
+            "joins of segments": _told(segments),
+            "refused": sum(not join.joined for join in procedure.record.joins),
+            "joins within models": _told(within),
+            "wall seen that is there, %": _spread(rows, "there, %"),
+            "measured - true unseen, %": _spread(rows, "measured - true unseen, %"),
+        }
+        print(markdown_table([{"of the procedure": what, "": value} for what, value in counts.items()]))
+
+
+@dataclass(frozen=True)
+class Model:
+    """Poses of a sub-map by numbers of frames in the video; see :class:`in_vivo.PosedModel`."""
+
+    registered: np.ndarray
+    camera_to_world: np.ndarray
+
+    @classmethod
+    def of(cls, out: Path, submap: ProcedureSubmap) -> Self:
+        """Those of COLMAP's files."""
+        poses = colmap.read(out / submap.segment / "poses" / submap.model)
+        by_name = dict(zip(poses.names_or_numbers(), poses.camera_to_world, strict=True))
+        numbers = [number for number, name in submap.names.items() if name in by_name]
+        return cls(np.array(numbers), np.stack([by_name[submap.names[number]] for number in numbers]))
+
+    def moved(self, transform: np.ndarray) -> Self:
+        """In another world, by a similarity."""
+        scale = np.cbrt(np.linalg.det(transform[:3, :3]))
+        poses = transform @ self.camera_to_world
+        poses[:, :3, :3] /= scale
+        return type(self)(self.registered, poses)
+
+    def beside(self, other: Self) -> Self:
+        """With those frames of another that this has not."""
+        new = ~np.isin(other.registered, self.registered)
+        numbers = np.concatenate([self.registered, other.registered[new]])
+        poses = np.concatenate([self.camera_to_world, other.camera_to_world[new]])
+        return type(self)(numbers[order := np.argsort(numbers)], poses[order])
+
+
+class Truth:
+    """Poses relative to the wall in view of all frames, each in the world of its phantom, and the walls at rest."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folders = sorted(folder.glob("phantom-*"))
+        between = np.full((BETWEEN, 4, 4), np.nan)
+        poses = [np.load(phantom / "truth" / "camera_to_wall.npy") for phantom in self._folders]
+        self._poses = np.concatenate([part for own in poses for part in (own, between)])
+
+    def phantom(self, numbers: np.ndarray) -> np.ndarray:
+        """Number of the phantom that each frame shows; -1 between two. [N]"""
+        return np.where(numbers % (FRAMES + BETWEEN) < FRAMES, numbers // (FRAMES + BETWEEN), -1)
+
+    def row(self, out: Path, submap: ProcedureSubmap, model: Model) -> dict[str, Any]:
+        """Poses, mesh and coverage of a sub-map."""
+        shown = self.phantom(model.registered)
+        most = int(np.bincount(shown[shown >= 0], minlength=1).argmax())
+        frames = model.registered[shown == most]
+        fit = aligned(model, self._poses, frames)
+        elsewhere = len(model.registered) - len(frames)
+        row = {
+            "sub-map": submap.name,
+            "phantom": most,
+            "frames": len(model.registered),
+            "path, mm": path_length(self._poses[frames]),
+            "ATE, mm": None if fit is None else fit.ate.rmse,
+            "far off": elsewhere + (0 if fit is None else int((fit.position_errors > LOST_MM).sum())),
+        } | dict.fromkeys(("wall seen, mm2", "there, %", "measured - true unseen, %"))
+        run = out / submap.segment / ("" if submap.number == 0 else f"submap-{submap.number}") / "run"
+        if fit is None or not (run / "coverage" / "coverage.json").is_file():
+            return row
+        lens = _lens(self._folders[most])
+        views = [CoverageView(str(number), self._poses[number], lens) for number in frames]
+        wall = read_mesh(self._folders[most] / "truth" / "mesh.ply")
+        seen = see_faces(wall, views).frames > 0
+        mesh = read_mesh(run / "mesh" / "mesh.ply")
+        mesh = replace(mesh, vertices=fit.transform.points(mesh.vertices))
+        try:
+            compared = compare_meshes(mesh, TrueSurface(run, wall, seen, "cast rays"), samples=20_000)
+        except InputError:  # elsewhere
+            return row | {"wall seen, mm2": wall.areas[seen].sum(), "there, %": 0.0}
+        row |= {"wall seen, mm2": compared.seen_area, "there, %": 100.0 * compared.scores[-1].recall}
+        measured = read_json(run / "coverage" / "coverage.json", "coverage")["seen"]
+        true = measure_coverage(wall, views)
+        if measured is None or isinstance(true, PartialCoverage):
+            return row
+        unseen = true.area(true.level == Level.UNSEEN) / true.area()
+        return row | {"measured - true unseen, %": 100.0 * (1.0 - measured - unseen)}
+
+    def is_wrong(self, join: SegmentJoin, models: Mapping[ModelKey, Model]) -> bool | None:
+        """Whether a join of segments puts the frames after it elsewhere; None where this cannot be told."""
+        first, second = (models[key] for key in join.keys)
+        together = first.beside(second.moved(np.array(join.transform)))
+        last = int(first.registered.max())
+        return self._wrong(together, last)
+
+    def wrong_within(self, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
+        """The same of the joins within the models of a segment."""
+        if segment.atlas is None:
+            return []
+        numbers = {Path(name).stem: number for number, name in segment.kept.items()}
+        after = [numbers[Path(segment.atlas.frames[join.after]).stem] for join in segment.atlas.joins if join.joined]
+        owners = [[one for one in segment.submaps if number in one.names] for number in after]
+        return [self._wrong(models[own[0].key], number) for own, number in zip(owners, after, strict=True) if own]
+
+    def _wrong(self, model: Model, after: int) -> bool | None:
+        shown = self.phantom(model.registered)
+        before, behind = shown[model.registered <= after], shown[model.registered > after]
+        if not (len(before) and len(behind)) or before[-1] < 0 or behind[0] < 0:
+            return None
+        if before[-1] != behind[0]:
+            return True
+        same = shown == before[-1]
+        return judged(Model(model.registered[same], model.camera_to_world[same]), self._poses, after)
+
+
+def _lens(phantom: Path) -> PinholeLens:
+    """The camera of a phantom."""
+    stored = read_json(phantom / "camera.json", "a phantom's camera")
+    return PinholeLens(stored["w"], stored["h"], *(stored[key] for key in ("fx", "fy", "cx", "cy")))
+
+
+def _told(wrong: Sequence[bool | None]) -> str:
+    counts = [sum(one is value for one in wrong) for value in (False, True, None)]
+    return "{} right, {} wrong, {} not judged".format(*counts)
+
+
+def _spread(rows: Sequence[Mapping[str, Any]], key: str) -> str:
+    values = [row[key] for row in rows if row[key] is not None]
+    if not values:
+        return ""
+    return f"{np.median(values):.2f} (median of {len(values)}), {min(values):.2f} to {max(values):.2f}"
+
+
+Options = Make | Judge
+
+
+def main(options: Options) -> None:
+    """Make, or judge."""
+    options.run()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
