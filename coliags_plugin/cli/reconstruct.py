@@ -10,6 +10,7 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary, view_command
+from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.pipeline.procedure.run import FinishedProcedure
@@ -40,6 +41,8 @@ class ReconstructCommand:
     """Time of the last frame; default: the end."""
     every: arguments.OptionalInt = None
     """Use the sharpest of every n frames; default: all."""
+    frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
+    """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate."""
     mask: arguments.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
     size: arguments.OptionalText = None
@@ -74,7 +77,6 @@ class ReconstructCommand:
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.pipeline.forecast import seconds_of
-        from coliags_plugin.pipeline.frame_sources import frame_at, frame_source
         from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
         from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE
@@ -86,9 +88,7 @@ class ReconstructCommand:
             if self.params is None
             else parse_assignments([f"params=[{self.params}]"])["params"],
             "diameter": self.diameter,
-            "frames.first": None if self.start is None else frame_at(frame_source(self.video), self.start),
-            "frames.last": None if self.end is None else frame_at(frame_source(self.video), self.end),
-            "frames.every": self.every,
+            **self._frames(),
             "size": None if self.size is None else arguments.parse_size(self.size),
             "method": self.method,
             "steps": self.steps,
@@ -129,6 +129,19 @@ class ReconstructCommand:
             then=[view_command(self.output / "run")],
             as_json=self.json,
         )
+
+    def _frames(self) -> dict[str, Any]:
+        """Settings of which frames are used, None where nothing is given; times by the video's rate."""
+        from coliags_plugin.pipeline.frame_sources import every_of, frame_at, frame_source
+
+        if self.every is not None and self.frames_per_second is not None:
+            raise InputError("--every and --frames-per-second", "one of them")
+        if self.start is None and self.end is None and self.frames_per_second is None:
+            return {"frames.every": self.every}
+        source = frame_source(self.video)
+        first, last = (None if time is None else frame_at(source, time) for time in (self.start, self.end))
+        every = self.every if self.frames_per_second is None else every_of(source, self.frames_per_second)
+        return {"frames.first": first, "frames.last": last, "frames.every": every}
 
     def _tell(self, made: FinishedProcedure) -> None:
         """Print a line for each segment of a long video and for each join."""

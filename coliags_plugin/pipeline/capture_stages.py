@@ -8,7 +8,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.datamanagers.units import Unit
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.frame_sources import chosen_frames
 from coliags_plugin.pipeline.frames import IMAGES, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST
 from coliags_plugin.pipeline.stages import StageOutcome
@@ -19,8 +19,7 @@ _MOST = 0.7
 
 def make_frames(context: StageContext) -> StageOutcome:
     """Write the frames of use, and their mask."""
-    chosen = context.settings.frames
-    source = frame_source(context.source, Span(chosen.first, chosen.last, chosen.seek))
+    source = chosen_frames(context.source, context.settings.frames)
     summary = write_frames(source, context.frames, context.settings.frames, context.mask, context.progress)
     return StageOutcome(
         summary, {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}

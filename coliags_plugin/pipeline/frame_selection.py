@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.reconstruction.structure.image_files import is_repeated
 
 #: Larger side of the images that are measured, pixels.
 _SIDE = 480
@@ -29,9 +31,12 @@ _BORDER = (0.002, 0.7)
 #: what moves leaves up to 6.
 _STILL, _OVERLAYS, _EDGE = 48, 0.3, 10.0
 
-#: Ratio of the differences of neighbouring rows and of rows two apart, median over the frames, above which a video is
-#: interlaced: 0.5 to 0.6 in images, 1 for noise alone, 1.6 to 9 where two fields show a moving scene.
-INTERLACED = 1.3
+#: Ratio of the differences of neighbouring rows and of rows two apart above which a frame is interlaced: 0.5 to 0.7 in
+#: images, 1 for noise alone, 1.1 where that is sharpened, 1.4 to 9 where two fields show a scene that moves fast. Slow
+#: motion combs little: hence the percentile, over frames that change, of a video's ratios.
+_INTERLACED, _PERCENTILE = 1.3, 90.0
+#: Frames that change which are looked at, from the first on, and frames among which they are sought.
+_CHANGING, _LOOKED_AT = 300, 3000
 
 #: Why frames are dropped, as the record says it.
 THINNED, EMPTY, RESTING = "thinned out", "black or without any texture", "the camera rests"
@@ -98,6 +103,30 @@ def combing(image: UInt8[np.ndarray, "H W 3"]) -> float:
     """Mean difference of green between neighbouring rows, relative to that between rows two apart."""
     green = image[..., 1].astype(np.int16)
     return float(np.abs(green[1:] - green[:-1]).mean() / max(np.abs(green[2:] - green[:-2]).mean(), 1e-6))
+
+
+def looks_interlaced(images: Iterable[UInt8[np.ndarray, "H W 3"]]) -> bool:
+    """Whether frames of a video show two moments each, by the first of them that differ from the one before."""
+    combs, last = list[float](), None
+    for image in islice(images, _LOOKED_AT):
+        if last is not None and not is_repeated(last, image):
+            combs.append(combing(image))
+        last = image
+        if len(combs) == _CHANGING:
+            break
+    return bool(combs) and bool(np.percentile(combs, _PERCENTILE) > _INTERLACED)
+
+
+def one_field(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A frame of one moment: the even rows, from the first, and means of those above and below in place of the odd.
+
+    The rows of an interlaced frame show two moments in turn, while a pose is that of one. Which is the earlier does not
+    matter: the even rows of all frames are equally far apart in time.
+    """
+    whole = image.copy()
+    whole[1::2] = image[:-1:2]  # the last row has none below
+    whole[1:-1:2] = (image[:-2:2].astype(np.uint16) + image[2::2] + 1) // 2
+    return whole
 
 
 def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -18,6 +20,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import videos_in
+from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field
+from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES, file_names, list_images, read_image
 
 if TYPE_CHECKING:
@@ -33,15 +37,20 @@ _FASTEST = 1000.0
 
 @dataclass(frozen=True)
 class Span:
-    """Frames of a video, by their numbers in it."""
+    """Frames of a video, by their numbers in it, and how they are read."""
 
     first: int = 0
     last: int | None = None  # inclusive; None: to the end
     seek: bool = True  # whether the first is sought, or all before it are decoded
+    deinterlace: bool = False  # whether of every frame one field is kept, and the rows of the other interpolated
 
     def count(self, of: int) -> int:
         """How many there are in a video of so many frames; at least 1, so that progress has an end."""
         return max(1, (of if self.last is None else min(of, self.last + 1)) - self.first)
+
+    def shown(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+        """A frame as it is read."""
+        return one_field(image) if self.deinterlace else image
 
 
 class FrameSource(Protocol):
@@ -94,7 +103,7 @@ class ImageFolder:
                     "frames of one size",
                     "Leave out images of other sizes",
                 )
-            yield name, image
+            yield name, self.span.shown(image)
 
 
 @dataclass(frozen=True)
@@ -112,21 +121,21 @@ class VideoFile:
     @property
     def rate(self) -> float | None:
         """Frames a second by the file's header; None where it does not say."""
-        import cv2
-
-        rate = self._of_header(cv2.CAP_PROP_FPS)
+        rate, _ = self._header
         return rate if 0.0 < rate < _FASTEST else None
 
     @property
     def _frame_count(self) -> int:
+        return max(1, int(self._header[1]))
+
+    @cached_property
+    def _header(self) -> tuple[float, float]:
+        """Frames a second, and frames."""
         import cv2
 
-        return max(1, int(self._of_header(cv2.CAP_PROP_FRAME_COUNT)))
-
-    def _of_header(self, what: int) -> float:
         video = _opened(self.path)
         try:
-            return video.get(what)
+            return video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
         finally:
             video.release()
 
@@ -135,38 +144,40 @@ class VideoFile:
 
         Where the file is damaged and goes on behind that, the frames between are black.
         """
-        expected, span = self.expected, self.span
+        span, shape, count = self.span, None, 0
+        last, stop = self._frame_count - 1, sys.maxsize if self.span.last is None else self.span.last + 1
         video = _opened(self.path)
-        number, shape = _go_to(video, span), None
+        number = _go_to(video, span)
         try:
-            while span.last is None or number <= span.last:
+            while number < stop:
                 there, image = video.read()
                 if not there:
-                    last = self._frame_count - 1 if span.last is None else span.last
-                    found = None if shape is None else _beyond_damage(video, number, last)
+                    found = _beyond_damage(video, number, last)
                     if found is None:
                         break
                     behind, image = found
                     log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, number, behind - 1)
-                    for lost in range(number, behind):
-                        yield f"frame_{lost:06d}", np.zeros(shape, np.uint8)
+                    for lost in range(max(number, span.first), min(behind, stop)):
+                        yield f"frame_{lost:06d}", np.zeros(image.shape, np.uint8)
+                        count += 1
                     number = behind
                 shape = shape or image.shape
                 if image.shape != shape:
                     raise InputError(
                         f"{self.path}: the size changes at frame {number}", "frames of one size", _AS_IMAGES
                     )
-                yield f"frame_{number:06d}", np.ascontiguousarray(image[..., ::-1])
+                if span.first <= number < stop:
+                    yield f"frame_{number:06d}", span.shown(np.ascontiguousarray(image[..., ::-1]))
+                    count += 1
                 number += 1
         finally:
             video.release()
-        count = number - span.first
-        if count <= 0 and span.first > 0:
+        if count == 0 and span.first > 0:
             raise InputError(f"{self.path} has no frame {span.first}", f"one of about {self._frame_count} frames")
         if count == 0:
             raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec OpenCV has", _AS_IMAGES)
-        if count < _COMPLETE * expected:
-            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, expected)
+        if count < _COMPLETE * self.expected:
+            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, self.expected)
 
 
 @dataclass(frozen=True)
@@ -195,7 +206,7 @@ class VideoFiles:
             last = count - 1 if self.span.last is None else min(count - 1, self.span.last - start)
             number, shape = first, None if image is None else image.shape
             if first <= last:
-                for _, image in VideoFile(file, Span(first, last, self.span.seek)):
+                for _, image in VideoFile(file, replace(self.span, first=first, last=last)):
                     if shape is not None and image.shape != shape:
                         raise InputError(f"{file} is {image.shape[1]} x {image.shape[0]}, the file before {shape[1]} x "
                             f"{shape[0]}", "videos of one size", _AS_IMAGES)  # fmt: skip
@@ -221,17 +232,29 @@ def _go_to(video: cv2.VideoCapture, span: Span) -> int:
 
 
 def _beyond_damage(video: cv2.VideoCapture, number: int, last: int) -> tuple[int, np.ndarray] | None:
-    """The first frame after one that cannot be decoded, looked for farther and farther on, and its number."""
+    """The first frame after one that cannot be decoded, looked for farther and farther on and then back; its number."""
+    if number >= last:
+        return None
+    lost, found = number, number + 1
+    while _sought(video, found) is None:
+        if found == last:
+            return None
+        lost, found = found, min(last, found + max(1, (found - number) // 4))
+    while found - lost > 1:
+        middle = (lost + found) // 2
+        lost, found = (middle, found) if _sought(video, middle) is None else (lost, middle)
+    image = _sought(video, found)
+    return None if image is None else (found, image)
+
+
+def _sought(video: cv2.VideoCapture, number: int) -> np.ndarray | None:
+    """A frame by its number; None where it cannot be decoded."""
     import cv2
 
-    ahead = 1
-    while number + ahead <= last:
-        if video.set(cv2.CAP_PROP_POS_FRAMES, number + ahead):
-            there, image = video.read()
-            if there and round(video.get(cv2.CAP_PROP_POS_FRAMES)) == number + ahead + 1:
-                return number + ahead, image
-        ahead = ahead + max(1, ahead // 4)
-    return None
+    if not video.set(cv2.CAP_PROP_POS_FRAMES, number):
+        return None
+    there, image = video.read()
+    return image if there and round(video.get(cv2.CAP_PROP_POS_FRAMES)) == number + 1 else None
 
 
 _AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the folder"
@@ -250,6 +273,19 @@ def frame_source(path: Path, span: Span = Span()) -> FrameSource:
         raise InputError(f"{path} is a single image", "a video file, or a folder of images", "Give its folder")
     _opened(path).release()
     return VideoFile(path, span)
+
+
+def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
+    """The frames of a file or folder that settings choose, deinterlaced if they say so, or leave it to how it looks."""
+    source = frame_source(path, Span(settings.first, settings.last, settings.seek, bool(settings.deinterlace)))
+    if settings.deinterlace is None and looks_interlaced(image for _, image in source):
+        log.info(
+            "%s looks interlaced: of every frame, which shows two moments in alternate rows, one field is kept and the "
+            "rows between are interpolated (frames.deinterlace)",
+            path,
+        )
+        return frame_source(path, replace(source.span, deinterlace=True))
+    return source
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
@@ -272,6 +308,32 @@ def _opened(path: Path) -> cv2.VideoCapture:
     return video
 
 
+def every_of(source: FrameSource, rate: float) -> int:
+    """Of how many frames one is used for about so many a second.
+
+    Raises:
+        InputError: ``rate`` is no positive number, or the source does not tell how many frames a second it has.
+    """
+    if not 0.0 < rate < _FASTEST:
+        raise InputError(f"--frames-per-second {rate:g}", f"a number between 0 and {_FASTEST:g}")
+    own = source.rate
+    if own is None:
+        raise InputError(
+            f"--frames-per-second {rate:g}, and {source.path} does not tell how many frames a second it has",
+            "a video whose header does",
+            "Use one of every n frames: --every N",
+        )
+    every = max(1, round(own / rate))
+    log.info(
+        "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second",
+        source.path,
+        own,
+        every,
+        own / every,
+    )
+    return every
+
+
 def frame_at(source: FrameSource, time: str) -> int:
     """Number of the frame at a time such as ``200``, ``3:20`` or ``1:02:03.5`` (seconds, minutes, hours).
 
@@ -286,13 +348,14 @@ def frame_at(source: FrameSource, time: str) -> int:
         raise InputError(
             f"the time '{time}'", "seconds, or hours, minutes and seconds such as 3:20 or 1:02:03.5"
         ) from None
-    if source.rate is None:
+    rate = source.rate
+    if rate is None:
         raise InputError(
             f"the time {time}, and {source.path} does not tell how many frames a second it has",
             "a video whose header does",
             "Give numbers of frames: --set frames.first=100 --set frames.last=400",
         )
-    return round(sum(part * 60.0**power for power, part in enumerate(reversed(parts))) * source.rate)
+    return round(sum(part * 60.0**power for power, part in enumerate(reversed(parts))) * rate)
 
 
 @contextmanager
@@ -303,15 +366,16 @@ def image_files(
 ) -> Iterator[list[Path]]:
     """Image files of a folder, or of a video's frames, which are written to a temporary folder without loss.
 
-    ``look`` is given every frame of a video.
+    ``look`` is given every frame of a video. A video that looks interlaced is deinterlaced; images of a folder are as
+    they are.
 
     Raises:
         InputError: As :func:`frame_source`, or a frame cannot be read.
     """
-    frames = frame_source(source)
-    if isinstance(frames, ImageFolder):
+    if isinstance(frame_source(source), ImageFolder):
         yield list_images(source)
         return
+    frames = chosen_frames(source, FrameSettings())
     with tempfile.TemporaryDirectory(prefix="coliags-frames-") as scratch:
         files = []
         expected = frames.expected

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,11 +15,9 @@ from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frame_selection import (
-    INTERLACED,
     RESTING,
     THINNED,
     blurred_frames,
-    combing,
     lens_mask,
     motion,
     overlays,
@@ -31,8 +28,6 @@ from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
-
-log = logging.getLogger(__name__)
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
@@ -100,6 +95,7 @@ def write_frames(
                 "source": source.path.name,
                 "frames": total,
                 "every": settings.every,
+                "deinterlaced": source.span.deinterlace,
                 "size": [size[1], size[0]],
                 "masked": None if used is None else round(float(1.0 - used.mean()), 4),
                 "kept": [
@@ -119,7 +115,8 @@ def write_frames(
             },
         )
     outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
-    return f"{len(kept)} of {total} frames, {size[1]} x {size[0]} px{f'; {why}' if why else ''}{outside}"
+    fields = ", deinterlaced" if source.span.deinterlace else ""
+    return f"{len(kept)} of {total} frames, {size[1]} x {size[0]} px{fields}{f'; {why}' if why else ''}{outside}"
 
 
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
@@ -134,12 +131,11 @@ def read_blurred(folder: Path) -> set[str]:
 
 
 class FrameSurvey:
-    """Sharpness of all frames of a video, and what they have in common: their mask, and whether they are interlaced."""
+    """Sharpness of all frames of a video, and the mask that they have in common."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.sharpnesses: list[float] = []
-        self._combs: list[float] = []
         self._extremes: list[UInt8[np.ndarray, "H W 3"]] = []
         self._sum: Float32[np.ndarray, "H W 3"] | None = None
         self._sizes: set[tuple[int, ...]] = set()
@@ -150,7 +146,6 @@ class FrameSurvey:
         if len(self._sizes) > 1:
             return
         self.sharpnesses.append(sharpness(reduced(image)))
-        self._combs.append(combing(image))
         extremes = self._extremes
         self._extremes = (
             [np.minimum(extremes[0], image), np.maximum(extremes[1], image)] if extremes else [image, image]
@@ -163,18 +158,9 @@ class FrameSurvey:
         return self._extremes[0].shape[0], self._extremes[0].shape[1]
 
     def mask(self) -> Bool[np.ndarray, "H W"] | None:
-        """False outside of the lens's image and on overlays; None without any. Says if the frames are interlaced.
-
-        Frames of several sizes have none in common.
-        """
+        """False outside of the lens's image and on overlays; None without any, as of frames of several sizes."""
         if self._sum is None:
             raise InputError(f"no frames in {self.path}", "a video")
-        if np.median(self._combs) > INTERLACED:
-            log.warning(
-                "%s looks interlaced: every frame shows two moments in alternate rows, which spoils poses and surface. "
-                "Make whole frames with ffmpeg -i VIDEO -vf yadif NEW.mp4 and give these",
-                self.path,
-            )
         darkest, brightest = self._extremes
         inside, count = lens_mask(brightest.max(axis=2)), len(self.sharpnesses)
         mask = np.ones(self.size, bool) if inside is None else inside

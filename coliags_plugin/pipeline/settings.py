@@ -27,6 +27,11 @@ class FrameSettings(Settings):
         description="Whether the first frame is sought in the video's file. false: all before it are decoded, for "
         "files in which frames are not found by their number.",
     )
+    deinterlace: bool | None = Field(
+        default=None,
+        description="Whether of every frame one field is kept, and the rows of the other interpolated. None: where the "
+        "video looks interlaced.",
+    )
     every: int = Field(default=1, ge=1, description="Use the sharpest of every n frames.")
     segment: int = Field(
         default=1500,

@@ -10,7 +10,15 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline.frame_sources import ImageFolder, Span, VideoFile, VideoFiles, frame_at, frame_source
+from coliags_plugin.pipeline.frame_sources import (
+    ImageFolder,
+    Span,
+    VideoFile,
+    VideoFiles,
+    every_of,
+    frame_at,
+    frame_source,
+)
 from tests.pipeline.films import film, write_images
 
 
@@ -111,6 +119,16 @@ def test_times_are_frames(tmp_path):
         frame_at(frame_source(write_images(tmp_path / "images", film([0, 5]))), "3:20")
 
 
+@pytest.mark.parametrize(
+    ("rate", "wanted", "every"), [(50.0, 10.0, 5), (60.0, 24.0, 2), (59.94, 15.0, 4), (15.0, 30.0, 1), (15.0, 0.5, 30)]
+)
+def test_of_how_many_frames_one_is_used(tmp_path, rate, wanted, every, caplog):
+    write_video(film(range(3)), tmp_path / "film.mp4", rate)
+    with caplog.at_level(logging.INFO):
+        assert every_of(frame_source(tmp_path / "film.mp4"), wanted) == every
+    assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
+
+
 def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
     generator = np.random.default_rng(0)
     images = [
@@ -126,6 +144,13 @@ def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
     black = [index for index, (_, image) in enumerate(read) if not image.any()]
     assert 10 < len(black) < 100 and "cannot be decoded: black here" in caplog.text
     assert all(np.array_equal(read[index][1], whole[index][1]) for index in (0, 20, 149))
+    for first in (0, black[0] - 2, *black[:2], black[-1] - 1, black[-1], black[-1] + 1, 140):
+        for last in (first, first + 3, black[-1], black[-1] + 2):
+            for seek in (True, False):
+                if first <= last:
+                    some = list(frame_source(tmp_path / "damaged.mp4", Span(first, last, seek)))
+                    assert [name for name, _ in some] == [name for name, _ in read[first : last + 1]]
+                    assert all(np.array_equal(one, read[first + n][1]) for n, (_, one) in enumerate(some))
 
 
 def test_the_videos_of_a_folder_are_one(tmp_path):

@@ -85,7 +85,7 @@ def surveyed(frames):
     return survey
 
 
-def test_overlays_and_interlaced_frames_are_found(caplog):
+def test_overlays_are_found():
     labelled = [frame.copy() for frame in FILM]
     for frame in labelled:
         frame[80:100, 20:70] = (250, 250, 250)
@@ -94,12 +94,6 @@ def test_overlays_and_interlaced_frames_are_found(caplog):
     assert surveyed(labelled[:9]).mask() is None
     assert surveyed(FILM).mask() is None
     assert surveyed([*labelled, FILM[0][:50]]).mask() is None
-    assert "interlaced" not in caplog.text
-    woven = [one.copy() for one in FILM[:-1]]
-    for frame, following in zip(woven, FILM[1:], strict=True):
-        frame[1::2] = following[1::2]
-    surveyed(woven).mask()
-    assert "looks interlaced" in caplog.text
 
 
 def test_what_is_masked_does_not_rest():

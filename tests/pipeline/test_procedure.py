@@ -202,7 +202,7 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
 
 def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):
     survey = survey_video(frame_source(long_video))
-    assert run._are_found(long_video, survey, [0, 55, 120], 0)
+    assert run._are_found(frame_source(long_video), survey, [0, 55, 120])
     other = replace(survey, checksums=survey.checksums + 1)
-    assert not run._are_found(long_video, other, [55], 0) and "decoded in order" in caplog.text
+    assert not run._are_found(frame_source(long_video), other, [55]) and "decoded in order" in caplog.text
     assert len(list(frame_source(long_video, Span(140, None, seek=False)))) == 10

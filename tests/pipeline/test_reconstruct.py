@@ -51,6 +51,21 @@ def test_stages_of_a_video(done, video, tmp_path, capsys):
     assert done == [*TRAINING]
 
 
+def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
+    video = tmp_path / "film.mp4"
+    write_video(film(range(0, 120, 3)), video, 60.0)
+    argv = ("reconstruct", video, "--output", tmp_path / "out", "--frames-per-second")
+    assert commands.run(*argv, 30, "--to", 0.5) == 0
+    record = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]["frames"]
+    assert record["options"]["frames"]["every"] == 2 and record["options"]["frames"]["last"] == 30
+    assert record["summary"].startswith("16 of 31 frames")
+    images = write_images(tmp_path / "images", film(range(0, 60, 6)))
+    assert "Expected one of them" in commands.refused(capsys, *argv, 30, "--every", 2)
+    assert "a number between 0 and" in commands.refused(capsys, *argv, 0)
+    message = commands.refused(capsys, "reconstruct", images, "--output", tmp_path / "no", "--frames-per-second", 5)
+    assert "does not tell how many frames a second" in message and "--every N" in message
+
+
 def test_a_killed_reconstruction_goes_on(done, video, tmp_path, monkeypatch):
     def killed(context):
         raise Killed

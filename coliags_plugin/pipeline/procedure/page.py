@@ -112,7 +112,8 @@ def _facts(procedure: ProcedureContents, known: Sequence[ProcedureSubmap]) -> It
     record, used, posed = procedure.record, procedure.kept, procedure.posed
     length = "" if record.rate is None else duration(record.frames / record.rate)
     size = f"{record.size[0]} x {record.size[1]} px"
-    yield Fact("Video", f"{counted(record.frames, 'frame')}, {', '.join(filter(None, (length, size)))}")
+    parts = (counted(record.frames, "frame"), length, size, "deinterlaced" if record.deinterlace else "")
+    yield Fact("Video", ", ".join(filter(None, parts)))
     share = f" ({100.0 * len(posed) / len(used):.0f} %)" if used else ""
     yield Fact("Frames with a pose", f"{len(posed):,} of {len(used):,} used{share}")
     failed = sum(bool(segment.failure) for segment in procedure.segments)

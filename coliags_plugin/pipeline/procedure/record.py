@@ -70,6 +70,7 @@ class Procedure(_Part):
     first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)]  # at which the survey began
     options: dict[str, Any]  # of cutting
     seek: bool  # whether frames are found by their number
+    deinterlace: bool = False  # whether they were read so
     segments: Sequence[Segment]
     skipped: Sequence[Skipped]
     joins: Sequence[SegmentJoin] = ()

@@ -19,7 +19,7 @@ from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_camera
 from coliags_plugin.pipeline.chain import identity_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_selection import reduced
-from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source
+from coliags_plugin.pipeline.frame_sources import FrameSource, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import MASK
 from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, joins, read_posed
@@ -78,7 +78,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     """Survey the video and cut it, or read what was found before."""
     out, chosen = context.out, context.settings.frames
     least = context.settings.least_submap
-    options = {"every": chosen.every, "segment": chosen.segment, "last": chosen.last, "least": least}
+    options = {"least": least, **chosen.model_dump(include={"every", "segment", "last", "deinterlace"})}
     known = Procedure.read(out)
     size = identity_of(context.source)["bytes"]
     if known is not None and (out / SURVEY_FILE).is_file():
@@ -97,7 +97,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         raise InputError(
             f"{out} already exists and is no procedure", "a new or empty folder", "Choose another --output"
         )
-    source = frame_source(context.source, Span(chosen.first, chosen.last, chosen.seek))
+    source = chosen_frames(context.source, chosen)
     survey = survey_video(source, context.progress)
     segments, skipped = cut(survey, chosen, least)
     if not segments:
@@ -111,7 +111,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         for number, each in enumerate(segments)
     ]
     left_out = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in skipped]
-    seek = chosen.seek and _are_found(context.source, survey, [each.first for each in shifted], chosen.first)
+    seek = chosen.seek and _are_found(source, survey, [each.first for each in shifted])
     height, width = survey.size
     procedure = Procedure(
         source=[context.source.name],
@@ -122,6 +122,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         first=chosen.first,
         options=options,
         seek=seek,
+        deinterlace=source.span.deinterlace,
         segments=shifted,
         skipped=left_out,
     )
@@ -130,12 +131,13 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     return procedure, survey
 
 
-def _are_found(path: Path, survey: Survey, numbers: Sequence[int], first: int) -> bool:
+def _are_found(source: FrameSource, survey: Survey, numbers: Sequence[int]) -> bool:
     """Whether frames that are sought by their number are those that came in order."""
     for number in numbers:
-        image = next((image for _, image in frame_source(path, Span(number, number))), None)
-        if image is None or checksum(reduced(image)) != survey.checksums[number - first]:
-            log.warning("%s: frames are not found by their number, and decoded in order for every segment", path)
+        one = frame_source(source.path, replace(source.span, first=number, last=number))
+        image = next((image for _, image in one), None)
+        if image is None or checksum(reduced(image)) != survey.checksums[number - source.span.first]:
+            log.warning("%s: frames are not found by their number, and decoded in order for every segment", source.path)
             return False
     return True
 
@@ -194,7 +196,12 @@ class _Segments:
     def _part_jobs(self, number: int, camera: CameraSettings, then: Any) -> list[Job]:
         segment, settings = self._procedure.segments[number], self._context.settings
         frames = settings.frames.model_copy(
-            update={"first": segment.first, "last": segment.last, "seek": self._procedure.seek}
+            update={
+                "first": segment.first,
+                "last": segment.last,
+                "seek": self._procedure.seek,
+                "deinterlace": self._procedure.deinterlace,
+            }
         )
         sfm = settings.sfm.model_copy(update={"camera": camera})
         own = settings.model_copy(update={"frames": frames, "sfm": sfm})
