@@ -131,8 +131,9 @@ class CellJob(Job):
             self._runs.end(cell, "done")
         return ()
 
-    def fail(self, reason: str, attempts: int) -> None:
+    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
         """See :class:`Job`."""
         for cell in self._equal:
             self._runs.failures.append(self._runs.folder.fail(cell, reason, attempts))
             self._runs.end(cell, "failed", f": {reason}")
+        return ()

@@ -13,7 +13,7 @@ from typing import Literal
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.progress import ProgressReport, log_console
 from coliags_plugin.execution.executors import Executor
-from coliags_plugin.execution.tasks import Task, TaskOutcome
+from coliags_plugin.execution.tasks import Ending, Task, TaskOutcome
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +53,12 @@ class Job(ABC):
         """
 
     @abstractmethod
-    def fail(self, reason: str, attempts: int) -> None:
-        """Record that it cannot be done."""
+    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
+        """Record that it cannot be done; returns jobs that are now to be done."""
+
+    def unwritable(self, reason: str, attempts: int) -> Sequence[Job]:
+        """Take that its folder cannot be written, as where the disk is full: fail, or end the queue with an error."""
+        return self.fail(reason, attempts)
 
 
 class JobQueue:
@@ -130,17 +134,18 @@ class JobQueue:
                 self._over += job.size
             except InputError as error:
                 self._fail(job, str(error))
-        elif outcome.ending == "failed":
-            self._fail(job, outcome.reason)
+        elif outcome.ending in ("failed", "unwritable"):
+            self._fail(job, outcome.reason, outcome.ending)
         elif attempts > self._retries:
             self._fail(job, f"{reason}, {attempts} times")
         else:
             log.warning("%s: %s; trying again", job.title, reason)
             self._waiting.appendleft(job)
 
-    def _fail(self, job: Job, reason: str) -> None:
+    def _fail(self, job: Job, reason: str, ending: Ending = "failed") -> None:
         self._over += job.size
-        job.fail(reason, self._attempts[job.key])
+        take = job.unwritable if ending == "unwritable" else job.fail
+        self._waiting.extendleft(reversed(take(reason, self._attempts[job.key])))
 
 
 @contextmanager

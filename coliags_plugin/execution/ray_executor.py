@@ -74,6 +74,7 @@ class RayExecutor(Executor):
     def check(self, folder: Path, inputs: Sequence[Path]) -> None:
         """Have every node read and write in the folder, and see the inputs."""
         token = uuid.uuid4().hex
+        folder, inputs = folder.resolve(), [path.resolve() for path in inputs]
         file = folder / f".storage-{token}"
         atomic_write(file, token)
         try:
@@ -188,7 +189,7 @@ def _check_node(node: Mapping[str, Any], report: Mapping[str, Any], file: Path, 
         raise InputError(
             f"{name} does not see {', '.join(report['missing'])}",
             "inputs on storage that all machines share, under the same paths",
-            "Copy them there, or name their folder with --data",
+            "Copy them there, or give a path that all machines share",
         )
 
 

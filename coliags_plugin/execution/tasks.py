@@ -12,8 +12,9 @@ from typing import Any, ClassVar, Literal
 
 from typing_extensions import Self
 
-#: How a worker ended. ``died``: without a word, killed or crashed; ``stopped``: asked to, with its state saved.
-Ending = Literal["done", "failed", "stopped", "died"]
+#: How a worker ended. ``unwritable``: failed, as its folder cannot be written; ``died``: without a word, killed or
+#: crashed; ``stopped``: asked to, with its state saved.
+Ending = Literal["done", "failed", "unwritable", "stopped", "died"]
 
 #: Exit status of a worker that was asked to stop.
 STOPPED = 130

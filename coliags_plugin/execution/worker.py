@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from coliags_plugin.core.errors import InterruptedRunError, ReportedError
+from coliags_plugin.core.errors import InterruptedRunError, NotWritableError, ReportedError
 from coliags_plugin.execution.tasks import STOPPED, TaskOutcome, outcome_line
 
 log = logging.getLogger(__name__)
@@ -49,11 +49,12 @@ def attempt(title: str, folder: str, work: Callable[[], None]) -> TaskOutcome:
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return TaskOutcome("stopped", str(error))
     except ReportedError as error:
-        return TaskOutcome("failed", str(error))
+        return TaskOutcome("unwritable" if isinstance(error, NotWritableError) else "failed", str(error))
     except OSError as error:
         log.exception("%s", title)
-        full = f"no space left for {folder}"
-        return TaskOutcome("failed", full if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{error}")
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return TaskOutcome("unwritable", f"no space left for {folder}")
+        return TaskOutcome("failed", f"{error}")
     except Exception as error:
         log.exception("%s", title)
         first = str(error).strip().partition("\n")[0]

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from coliags_plugin.core.errors import InterruptedRunError
+from coliags_plugin.core.errors import InterruptedRunError, NotWritableError
 from coliags_plugin.execution.choice import ExecutionOptions
 from coliags_plugin.execution.executors import Executor
 from coliags_plugin.execution.queue import Job, JobQueue
@@ -30,6 +30,7 @@ def run_jobs(executor: Executor, options: ExecutionOptions, jobs: Sequence[Job],
 
     Raises:
         InterruptedRunError: Ctrl-C; what is done is kept.
+        NotWritableError: The disk is full, or cannot be written; likewise.
     """
     queue = JobQueue(executor, options.retries, jobs, total)
     try:
@@ -172,6 +173,10 @@ class PartJob(Job):
         """See :class:`Job`."""
         return self._jobs.end(self)
 
-    def fail(self, reason: str, attempts: int) -> None:
+    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
         """See :class:`Job`."""
-        self._jobs.end(self, reason or "it failed")
+        return self._jobs.end(self, reason or "it failed")
+
+    def unwritable(self, reason: str, attempts: int) -> Sequence[Job]:
+        """See :class:`Job`: the other parts are written to the same disk."""
+        raise NotWritableError(f"{self.title}: {reason}", do="What is done is kept")

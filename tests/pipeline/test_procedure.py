@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import resource
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +18,8 @@ from scipy.spatial.transform import Rotation
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.files import not_writable
+from coliags_plugin.execution.ray_executor import RayExecutor, _inspect_node
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages
@@ -195,9 +201,115 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     done_poses = {name: record.stages["poses"].state for name, record in records.items()}
     assert sorted(done_poses.values())[0] == "done" and len(records) >= 3
     failing[:] = [f"segment-{number:03d}" for number in range(9)]
-    with pytest.raises(InputError, match=r"none of \d segments has poses: 2 of 50 frames"):
-        workers()
+    workers()
+    with pytest.raises(
+        InputError, match=r"none of 3 segments of .* has poses: 2 of 50 frames.*none/index.html shows why"
+    ):
         cp.reconstruct(long_video, tmp_path / "none", settings=OPTIONS)
+    assert len(list((tmp_path / "none").glob("segment-*/frames/frames.json"))) == 3, "the next one is tried"
+    page = (tmp_path / "none" / "index.html").read_text(encoding="utf-8")
+    assert "No frame of this video has a pose: poses failed: 2 of 50 frames have poses" in page
+    assert Procedure.read(tmp_path / "none") and Survey.read(tmp_path / "none")
+
+
+def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path, workers, monkeypatch):
+    make_poses, tried = capture_stages.make_poses, []
+
+    def poses(context):
+        tried.append(context.out.name)
+        if len(tried) == 1:
+            raise InputError("2 of 50 frames have poses")
+        return make_poses(context)
+
+    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    executor = workers()
+    made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    states = {name: record.stages["poses"].state for name, record in made.segments.items()}
+    assert states == {name: "failed" if name == tried[0] else "done" for name in made.segments}
+    plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.part is None]
+    assert [params is None for params in plans] == [True, True, False]
+
+
+def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, workers, capsys):
+    write_video([np.zeros((48, 64, 3), np.uint8)] * 60, tmp_path / "dark.mp4", 10.0)
+    executor, out = workers(), tmp_path / "out"
+    argv = ("reconstruct", tmp_path / "dark.mp4", "--output", out, "--set", "frames.segment=50")
+    for _ in range(2):
+        message = commands.refused(capsys, *argv)
+        assert "no stretch of " in message and f"{out / 'index.html'} shows why" in message
+        page = (out / "index.html").read_text(encoding="utf-8")
+        assert "No frame of this video has a pose: nothing of the frame before is seen" in page
+        assert "No stretch of this video is long enough" in page and 'class="pictures"' not in page
+        assert Procedure.read(out).segments == [] and len(Survey.read(out)) == 60
+        (out / "index.html").unlink()
+    assert executor.tasks == []
+    assert "shows why" in commands.refused(capsys, *argv, "--set", "least_submap=20"), "nothing is made with others"
+    assert "has no sub-map with poses" in commands.refused(
+        capsys, "poses", "export", out, "--output", tmp_path / "atlas"
+    )
+
+
+@contextmanager
+def files_of_at_most(size):
+    """A disk with space for small files alone, for this process and those it starts."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, done, capsys):
+    argv = ["reconstruct", long_video, "--output", tmp_path / "out"]
+    argv += [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
+    executor = workers()
+    with files_of_at_most(20_000):
+        message = commands.refused(capsys, *argv)
+    assert "stage frames: cannot write to" in message and "Free some, or choose another output" in message
+    assert len(executor.tasks) == 1, "the other segments are not tried"
+    assert not list((tmp_path / "out").glob("segment-*/frames")) and not list((tmp_path / "out").rglob("*.png"))
+    assert commands.run(*argv) == 0
+    assert (tmp_path / "out" / "segment-002" / "frames" / "frames.json").is_file()
+
+
+def test_a_node_without_the_video_is_told_before_the_survey(long_video, tmp_path, workers, monkeypatch):
+    ray = pytest.importorskip("ray")
+    cluster, node = RayExecutor.__new__(RayExecutor), {"NodeID": "n1", "NodeManagerAddress": "10.0.0.2"}
+
+    def on_the_node(node, file, inputs):
+        with monkeypatch.context() as patched:
+            patched.chdir("/")
+            patched.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: node["NodeID"]))
+            return _inspect_node(str(file), [str(path) for path in (*inputs, *lacking)])
+
+    monkeypatch.setattr(cluster, "_nodes", lambda: [node], raising=False)
+    monkeypatch.setattr(cluster, "_ask", on_the_node, raising=False)
+    monkeypatch.chdir(tmp_path)
+    lacking = [tmp_path / "there" / "long.mp4"]
+    workers().check = cluster.check
+    with pytest.raises(
+        InputError, match=r"node 10.0.0.2 does not see .*there/long.mp4. .* under the same paths. Copy them"
+    ):
+        cp.reconstruct("long.mp4", "out", settings=OPTIONS, executor="ray")
+    assert not any((tmp_path / "out").glob("[!.]*")) and not any((tmp_path / "out").glob(".storage*"))
+    lacking.clear()
+    assert len(cp.reconstruct("long.mp4", "out", settings=OPTIONS, executor="ray").segments) == 3
+
+
+@pytest.mark.parametrize("file", ["procedure.json", "survey.npz"])
+def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, workers, monkeypatch, file):
+    workers()
+    full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
+
+    def fails(*_):
+        raise full
+
+    with monkeypatch.context() as patched, pytest.raises(InputError, match="No space left"):
+        patched.setattr(Procedure if file == "procedure.json" else Survey, "write", fails)
+        cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    assert not (tmp_path / "out" / file).exists()
+    assert len(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS).segments) == 3
 
 
 def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):

@@ -144,6 +144,7 @@ def _facts(procedure: ProcedureContents, known: Sequence[ProcedureSubmap]) -> It
 def _cautions(procedure: ProcedureContents) -> Iterator[str]:
     if not procedure.posed:
         reasons = Counter(segment.failure for segment in procedure.segments if segment.failure)
+        reasons = reasons or Counter(skipped.why for skipped in procedure.record.skipped)
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
         yield f"No frame of this video has a pose{why}"
     yield from procedure.problems
@@ -371,7 +372,7 @@ def _segments(procedure: ProcedureContents) -> Iterator[Block]:
         ]
         there = (procedure.folder / page).is_file()
         items.append(Bullet("; ".join(filter(None, texts)), span.name, quote(page) if there else ""))
-    yield Bullets(items)
+    yield Bullets(items) if items else Paragraph("No stretch of this video is long enough for one.", hint=False)
     told = [Bullet(remark, segment.span.name) for segment in procedure.segments for remark in remarks(segment.record)]
     if told:
         yield Folded(f"What the segments warn of ({len(told)})", [Bullets(told)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +27,7 @@ from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
 from coliags_plugin.pipeline.procedure.segments import Segment, cut
 from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE, Survey, checksum, survey_video
-from coliags_plugin.pipeline.stages import Record
+from coliags_plugin.pipeline.stages import PAGE_FILE, Record
 from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
 
@@ -55,23 +55,38 @@ def reconstruct_procedure(
 
     Raises:
         InputError: The video cannot be read; the folder was made with other options; or nothing could be posed.
-        InterruptedRunError: Ctrl-C; all that is done is kept.
+        NotWritableError: The disk is full, or cannot be written; all that is done is kept.
+        InterruptedRunError: Ctrl-C; likewise.
     """
     executor = make_executor(execution)
-    procedure, survey = _prepare(context, overwrite)
     executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
+    procedure, survey = _prepare(context, overwrite)
     segments = _Segments(context, procedure, survey, executor, execution, overwrite)
     total = sum(segment.count for segment in procedure.segments)
-    run_jobs(executor, execution, segments.jobs(), total)
+    if procedure.segments:
+        run_jobs(executor, execution, segments.jobs(), total)
     names = [segment.name for segment in procedure.segments]
     procedure = procedure.model_copy(update={"joins": _joins(context.out, procedure, names)})
     procedure.write(context.out)
     write_procedure_page(context.out)
     records = {name: Record.of(context.out / name) for name in names}
     if not any(record.is_done("poses") for record in records.values()):
-        reasons = next((record.stages["poses"].summary for record in records.values() if "poses" in record.stages), "")
-        raise InputError(f"none of {len(names)} segments has poses: {reasons}", "a video in which the camera moves")
+        raise _without_poses(context, procedure, records)
     return FinishedProcedure(context.out, procedure, records)
+
+
+def _without_poses(context: StageContext, procedure: Procedure, records: Mapping[str, Record]) -> InputError:
+    """The error where no frame has a pose; its page is there."""
+    stages = [stage for record in records.values() for stage in record.stages.values()]
+    why = next((stage.summary for stage in stages if stage.state == "failed"), "no stage was begun")
+    seen = f"none of {len(records)} segments of {context.source} has poses: {why}"
+    if not records:
+        seen = (
+            f"no stretch of {context.source} of {context.settings.least_submap} frames in which points can be followed"
+        )
+    return InputError(
+        seen, "a video of a camera that moves along tissue it sees", f"{context.out / PAGE_FILE} shows why"
+    )
 
 
 def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]:
@@ -85,7 +100,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         same = (known.source, known.bytes, known.first) == ([context.source.name], size, chosen.first)
         if same and known.options == options:
             return known, Survey.read(out)
-        if not overwrite:
+        if not overwrite and known.segments:
             raise InputError(
                 f"{out} was made from {', '.join(known.source)}, {known.bytes} bytes, cut by {known.options}",
                 f"{context.source.name}, {size} bytes, cut by {options}",
@@ -100,12 +115,6 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     source = chosen_frames(context.source, chosen)
     survey = survey_video(source, context.progress)
     segments, skipped = cut(survey, chosen, least)
-    if not segments:
-        raise InputError(
-            f"no stretch of {context.source} of {least} frames in which points can be followed",
-            "a video of a camera that moves along tissue it sees",
-        )
-    survey.write(out)
     shifted = [
         Segment(each.first + chosen.first, each.last + chosen.first, f"segment-{number:03d}")
         for number, each in enumerate(segments)
@@ -127,6 +136,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         skipped=left_out,
     )
     procedure.write(out)
+    survey.write(out)  # last: the folder is known for a procedure's from the record on, and surveyed anew without this
     log.info("%d frames in %d segments, %d stretches left out", len(survey), len(shifted), len(left_out))
     return procedure, survey
 
@@ -223,7 +233,7 @@ def _camera_of(scene: Path) -> CameraSettings | None:
 
 def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[SegmentJoin]:
     """Joins of every two neighbouring segments."""
-    found, before = list[SegmentJoin](), _posed(out / names[0])
+    found, before = list[SegmentJoin](), _posed(out / names[0]) if names else []
     for (one, other), (first, second) in zip(pairwise(names), pairwise(procedure.segments), strict=True):
         posed = _posed(out / other)
         gap = second.first - first.last - 1

@@ -198,7 +198,7 @@ def timeline(procedure: ProcedureContents, states: Sequence[State], codes: Int[n
         {
             "thumbs": pictures,
             "ribbon": ribbon,
-            "rows": [parts[::2], parts[1::2]] if len(parts) > 1 else [parts],
+            "rows": [row for row in (parts[::2], parts[1::2]) if row],
             "curves": list(_curves(procedure)),
             "ticks": [{"left": percent(frame), "texts": texts} for frame, texts in _ticks(procedure)],
             "axis": "frame number" if record.rate is None else "time, min:s; frame number",
