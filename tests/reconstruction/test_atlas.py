@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -260,3 +261,13 @@ def test_places_next_to_each_other_are_one():
     assert [link.after for link in _apart(links, 3)] == [4, 9, 12]
     assert [link.after for link in _apart(links, 1)] == [2, 4, 6, 9, 12]
     assert _apart([], 3) == []
+
+
+def test_a_wall_that_moves_is_split_into_stretches_of_which_each_can_give_depth():
+    steps = np.concatenate([np.full(30, 1.0), np.full(20, 0.0), np.full(30, 1.0)])
+    centers = np.stack([np.cumsum(steps), np.zeros(80), np.zeros(80)], axis=1)
+    assert sfm._far_apart(centers, 4, 5.0) == [20, 40, 60]
+    assert sfm._far_apart(centers, 5, 18.0) == [19, 58]
+    assert sfm._far_apart(centers, 5, 50.0) == []
+    ends = [0, *sfm._far_apart(centers, 6, 12.0), 80]
+    assert all(np.ptp(centers[first:last, 0]) >= 12.0 for first, last in pairwise(ends))

@@ -71,8 +71,8 @@ class Reconstruction:
 
     @property
     def median_depth(self) -> float:
-        """Median z-depth of the points over all observations, in the model's unit."""
-        return float(np.median(np.concatenate([depths for _, depths in depths_of(self.model).values()])))
+        """See :func:`median_depth`."""
+        return median_depth(self.model)
 
     def summary(self) -> str:
         """One-line summary."""
@@ -84,6 +84,11 @@ class Reconstruction:
             f"{f' and {len(others)} further cameras' if others else ''}, "
             f"field of view {field_of_view(camera, self.lens_side):.0f} degrees"
         )
+
+
+def median_depth(model: pycolmap.Reconstruction) -> float:
+    """Median z-depth of a model's points over all observations, in the model's unit."""
+    return float(np.median(np.concatenate([depths for _, depths in depths_of(model).values()])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +210,9 @@ def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction
 #: none is split as what it shows moves; and the fineness of its images, in the median, below which none is believed:
 #: that of a blur by 3.5 px of 384.
 _SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
+#: Extent of the camera's path, as a share of the median depth, that a stretch of what moves has at least: depth is
+#: estimated from three others of a frame that are 0.05 away or more.
+_LEAST_EXTENT = 0.15
 
 
 def _atlas(
@@ -265,14 +273,32 @@ def _rigid_stretches(one: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothe
     count = 1 if longest is None else min(-(-one.images // longest), one.images // _SHORT)
     if longest is None or count < 2:
         return [one], []
-    frames = sorted(number - 1 for number in one.model.reg_image_ids())
-    stretches = [stretch.tolist() for stretch in np.array_split(frames, count)]
+    frames = np.array(sorted(number - 1 for number in one.model.reg_image_ids()))
+    centers = np.array([one.model.images[number + 1].projection_center() for number in frames.tolist()])
+    places = _far_apart(centers, count, _LEAST_EXTENT * median_depth(one.model))
+    if not places:
+        return [one], []
+    stretches = [stretch.tolist() for stretch in np.split(frames, places)]
     log.warning(
         "images %s to %s: what is seen moves, as rigid for %d frames: split in %d models",
         *(video.images[frames[0]].name, video.images[frames[-1]].name, longest, len(stretches)),
     )
     links = [replace(link_at(one.model, stretch[-1]), moves=True) for stretch in stretches[:-1]]
     return [adjusted(part_of(one.model, stretch), video) for stretch in stretches], links
+
+
+def _far_apart(centers: Float[np.ndarray, "N 3"], count: int, least: float) -> list[int]:
+    """Where to split a path into so many stretches, or fewer, as each has an extent of ``least`` or more."""
+    places, extent = [0], 0.0
+    for index, center in enumerate(centers):
+        start = places[-1]
+        if (index - start) * count >= len(centers) and extent >= least:
+            places.append(index)
+            extent = 0.0
+        else:
+            extent = max(extent, float(np.linalg.norm(centers[start : index + 1] - center, axis=1).max()))
+    is_short = extent < least or len(centers) - places[-1] < _SHORT  # the last one, which then belongs to that before
+    return places[1:-1] if is_short else places[1:]
 
 
 def _apart(links: Sequence[Link], least: int) -> list[Link]:
