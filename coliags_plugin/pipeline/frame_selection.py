@@ -93,7 +93,11 @@ def overlays(
     others = change[~dark & ~still]
     if not still.any() or still.sum() > _OVERLAYS * (~dark).sum() or np.median(others) < 2 * _STILL:
         return np.zeros(still.shape, bool)
-    slope = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))).max(axis=2)
+    slope = np.zeros(still.shape, np.float32)
+    for number in range(3):  # one channel after the other, for the memory of large frames
+        channel = np.ascontiguousarray(mean[..., number])
+        slopes = (cv2.Sobel(channel, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+        np.maximum(slope, np.hypot(*slopes), out=slope)
     _, labels = cv2.connectedComponents(dilated(still, 1).astype(np.uint8))
     marked = np.unique(labels[still & dilated(slope > _EDGE, 1)])
     return dilated(np.isin(labels, marked[marked > 0]), _MARGIN)

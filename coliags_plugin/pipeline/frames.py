@@ -146,11 +146,12 @@ class FrameSurvey:
         if len(self._sizes) > 1:
             return
         self.sharpnesses.append(sharpness(reduced(image)))
-        extremes = self._extremes
-        self._extremes = (
-            [np.minimum(extremes[0], image), np.maximum(extremes[1], image)] if extremes else [image, image]
-        )
-        self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
+        if self._sum is None:
+            self._extremes, self._sum = [image.copy(), image.copy()], image.astype(np.float32)
+            return
+        for extreme, of_both in zip(self._extremes, (np.minimum, np.maximum), strict=True):
+            of_both(extreme, image, out=extreme)
+        self._sum += image
 
     @property
     def size(self) -> tuple[int, int]:

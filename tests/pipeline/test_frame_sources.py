@@ -19,7 +19,7 @@ from coliags_plugin.pipeline.frame_sources import (
     frame_at,
     frame_source,
 )
-from tests.pipeline.films import film, write_images
+from tests.pipeline.films import film, write_avi, write_images
 
 
 def test_a_video_is_read_in_order(tmp_path):
@@ -151,6 +151,18 @@ def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
                     some = list(frame_source(tmp_path / "damaged.mp4", Span(first, last, seek)))
                     assert [name for name, _ in some] == [name for name, _ in read[first : last + 1]]
                     assert all(np.array_equal(one, read[first + n][1]) for n, (_, one) in enumerate(some))
+
+
+def test_sound_is_left_out(tmp_path):
+    frames = film(range(0, 60, 3))
+    silent, loud = (write_avi(frames, tmp_path / f"{sound}.avi", 20, sound) for sound in (False, True))
+    assert loud.stat().st_size > silent.stat().st_size + 20 * 400
+    source = frame_source(loud)
+    assert source.expected == 20 and source.rate == pytest.approx(20.0)
+    for span in (Span(), Span(7, 12), Span(7, 12, seek=False)):
+        pairs = list(zip(frame_source(silent, span), frame_source(loud, span), strict=True))
+        assert len(pairs) == (20 if span == Span() else 6)
+        assert all(one[0] == other[0] and np.array_equal(one[1], other[1]) for one, other in pairs)
 
 
 def test_the_videos_of_a_folder_are_one(tmp_path):

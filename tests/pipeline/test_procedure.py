@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.core.files import not_writable
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.execution.ray_executor import RayExecutor, _inspect_node
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.outputs.video import write_video
@@ -33,7 +34,7 @@ from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from tests import commands
 from tests.pipeline.conftest import TRAINING, write_atlas
-from tests.pipeline.films import film
+from tests.pipeline.films import film, write_avi
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)
 
@@ -148,6 +149,7 @@ def long_video(done, tmp_path, monkeypatch):
     return tmp_path / "long.mp4"
 
 
+KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0, 60.0)}
 OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
 
 
@@ -247,6 +249,40 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
     assert "has no sub-map with poses" in commands.refused(
         capsys, "poses", "export", out, "--output", tmp_path / "atlas"
     )
+
+
+def test_a_long_video_that_is_cut_off_is_reconstructed_as_far_as_it_goes(done, tmp_path, workers, caplog):
+    whole = write_avi(film(range(150)), tmp_path / "whole.avi", 25)
+    (tmp_path / "cut.avi").write_bytes(whole.read_bytes()[: whole.stat().st_size * 7 // 10])
+    workers()
+    made = cp.reconstruct(tmp_path / "cut.avi", tmp_path / "out", settings={**OPTIONS, **KNOWN})
+    assert "is it complete?" in caplog.text and 100 < made.procedure.frames < 110
+    assert made.procedure.segments[-1].last == made.procedure.frames - 1
+    assert all(record.stages["report"].state == "done" for record in made.segments.values())
+    write_video(film(range(60)), tmp_path / "film.mp4", 15.0)
+    (tmp_path / "cut.mp4").write_bytes((tmp_path / "film.mp4").read_bytes()[:-2000])
+    with pytest.raises(InputError, match=r"cut.mp4 .* cannot be opened as a video"):
+        cp.reconstruct(tmp_path / "cut.mp4", tmp_path / "none", settings=OPTIONS)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
+    noise = np.random.default_rng(0)
+    images = [np.clip(image + noise.normal(0, 12, image.shape), 0, 255).astype(np.uint8) for image in film(range(150))]
+    write_video(images, tmp_path / "film.mp4", 15.0)
+    data = bytearray((tmp_path / "film.mp4").read_bytes())
+    place = len(data) * 4 // 10
+    data[place : place + len(data) // 10] = noise.bytes(len(data) // 10)
+    (tmp_path / "damaged.mp4").write_bytes(data)
+    frames = dict(frame_source(tmp_path / "damaged.mp4"))
+    black = [number for number, image in enumerate(frames.values()) if not image.any()]
+    workers()
+    made = cp.reconstruct(tmp_path / "damaged.mp4", tmp_path / "out", settings={**OPTIONS, **KNOWN})
+    assert made.procedure.seek and made.procedure.frames == 150 and black
+    for name, segment in zip(made.segments, made.procedure.segments, strict=True):
+        written = {path.stem: read_rgb(path) for path in (tmp_path / "out" / name / "frames" / "images").iterdir()}
+        assert set(written) == {f"frame_{n:06d}" for n in range(segment.first, segment.last + 1) if n not in black}
+        assert all(np.array_equal(image, frames[frame]) for frame, image in written.items())
 
 
 @contextmanager

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -13,11 +15,13 @@ import pytest
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.morphology import eroded
 from coliags_plugin.datamanagers.recognition import find_format
-from coliags_plugin.geometry.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.geometry.lenses.vicalib import calibration_text
 from coliags_plugin.pipeline import capture_stages
 from coliags_plugin.pipeline.recordings import opened_recording
+from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
 from tests import commands
@@ -75,6 +79,35 @@ def test_images_beside_a_video_without_calibration_are_the_frames(recording):
     (recording / "endoscope.xml").unlink()
     write_images(recording, film(range(3)))
     assert opened_recording(recording, SfmSettings()) == (recording, SfmSettings())
+
+
+def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_by_its_folder(done, tmp_path, workers):
+    """Images and poses alone, distorted, black outside an octagon (docs/layouts/c3vd-v2.md)."""
+    shown = octagon_mask(270, 216)
+    frames = [np.where(shown[..., None], cv2.resize(one, (270, 216)), 0).astype(np.uint8) for one in film(range(70))]
+    for number, frame in enumerate(frames):
+        write_image(tmp_path / "screening" / "rgb" / f"{number:04d}.png", frame)
+    folder = tmp_path / "screening"
+    with pytest.raises(InputError, match=r"screening holds 0 images.*Give the folder of the frames"):
+        cp.reconstruct(folder, tmp_path / "no")
+    executor = workers()
+    options = {"frames.segment": 50, "frames.least_motion": 0.0, "sfm.camera.model": "c3vd"}
+    made = cp.reconstruct(folder / "rgb", tmp_path / "out", settings=options)
+    assert len(made.segments) == 2 and made.procedure.frames == 70 and made.procedure.size == (270, 216)
+    assert {json.loads(task.settings)["sfm"]["camera"]["model"] for task in executor.tasks} == {"c3vd"}
+    for name, segment in zip(made.segments, made.procedure.segments, strict=True):
+        mask = read_mask(tmp_path / "out" / name / "frames" / "mask.png")
+        assert not mask[~shown].any() and mask[eroded(shown, 5)].all()
+        images = sorted(path.stem for path in (tmp_path / "out" / name / "frames" / "images").iterdir())
+        assert images == [f"{number:04d}" for number in range(segment.first, segment.last + 1)]
+    poses = np.tile(np.eye(4), (70, 1, 1))
+    poses[:, 0, 3] = np.arange(70)
+    lines = [",".join(map(str, pose.T.ravel())) for pose in poses]
+    (folder / "pose.txt").write_text("\n".join(lines) + "\n")
+    done.clear()
+    workers()
+    cp.reconstruct(folder, tmp_path / "posed")
+    assert done == [*CAPTURE[1:], *TRAINING]
 
 
 def test_a_recording_without_calibration_is_warned_of(recording, caplog):
