@@ -211,8 +211,8 @@ def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction
 #: that of a blur by 3.5 px of 384.
 _SHORT, _WORSE, _LEAST_FINENESS = 12, 2.0, 1.6
 #: Extent of the camera's path, as a share of the median depth, that a stretch of what moves has at least: depth is
-#: estimated from three others of a frame that are 0.05 away or more.
-_LEAST_EXTENT = 0.15
+#: estimated from three others of a frame that are 0.05 away or more, and adjustment changes the extent.
+_LEAST_EXTENT = 0.25
 
 
 def _atlas(
