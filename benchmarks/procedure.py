@@ -1,16 +1,24 @@
 """A synthetic procedure with exact truth: phantoms in a row, with contact, blur and wash between them.
 
 python benchmarks/procedure.py make FOLDER
-coliags reconstruct FOLDER/procedure-6000.mp4 --output OUT --jobs 2
+python benchmarks/procedure.py run FOLDER/procedure-6000.mp4 OUT
 python benchmarks/procedure.py judge FOLDER OUT
+python benchmarks/procedure.py run FOLDER/procedure-1500.mp4 OUT2 --nodes
+python benchmarks/procedure.py same OUT1 OUT2
 
-``make`` renders the phantoms, and writes a video for each of the lengths. ``judge`` compares poses, joins and coverage
-with the truth. Both keep what is there.
+``make`` renders the phantoms, and writes a video for each of the lengths. ``run`` reconstructs one by two processes,
+here or on a cluster of two nodes of which one is killed on the way. ``judge`` compares poses, joins and coverage with
+the truth, ``same`` the files of two runs.
 """
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -30,7 +38,7 @@ from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
-from coliags_plugin.pipeline.procedure.record import ModelKey, SegmentJoin
+from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.views import CoverageView
 from coliags_plugin.surface.coverage.visibility import Level, see_faces
@@ -121,6 +129,93 @@ def _washed(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.
 
 def _noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(np.rint(image + rng.normal(0.0, 1.5, image.shape)), 0, 255).astype(np.uint8)
+
+
+#: Options of ``coliags reconstruct``: little training, and no surface of what is posed for less than a second.
+OPTIONS = ("--set", "frames.segment=400", "--set", "least_submap=30", "--diameter", "40", "--steps", "100")
+#: Names of files that hold times, or what ended a worker.
+_TIMED = ("reconstruction.json", "metrics.jsonl", "provenance.json", "result.json", "*.log", "*.html", ".*", "costs*")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Reconstruct a video by two processes of one thread, and tell what it took."""
+
+    video: tyro.conf.Positional[Path]
+    """The video."""
+    out: tyro.conf.Positional[Path]
+    """New folder of the procedure."""
+    nodes: bool = False
+    """On a Ray cluster of two nodes of this machine, of which one is killed when a third of the segments have poses."""
+
+    def run(self) -> None:
+        """Reconstruct."""
+        command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", "reconstruct", str(self.video)]
+        command += ["--output", str(self.out), *OPTIONS, "--jobs", "2", "--threads", "1"]
+        start = time.monotonic()
+        with _cluster() if self.nodes else nullcontext() as cluster:
+            if cluster is not None:
+                command += ["--executor", "ray", "--ray-address", cluster.address]
+            child = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
+            if cluster is not None:
+                self._disturb(cluster, child)
+            _, status, used = os.wait4(child.pid, 0)
+        row = {"wall, s": time.monotonic() - start, "CPU, s": used.ru_utime + used.ru_stime}
+        if self.nodes:  # whose workers are not children
+            row = {"wall, s": row["wall, s"]}
+        print(markdown_table([row | {"largest process, MB": used.ru_maxrss / 1024, "status": status}]))
+
+    def _disturb(self, cluster: Any, child: subprocess.Popen[bytes]) -> None:
+        """Kill a node while it works, and add another one."""
+        while child.poll() is None:
+            procedure = Procedure.read(self.out)
+            posed = len(list(self.out.glob("segment-*/poses")))
+            if procedure is not None and 3 * posed >= len(procedure.segments):
+                print(f"a node is killed after {posed} of {len(procedure.segments)} segments", flush=True)
+                cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
+                cluster.add_node(num_cpus=1)
+                return
+            time.sleep(1.0)
+
+
+@contextmanager
+def _cluster() -> Iterator[Any]:
+    """Two nodes of one processor each, and a head that does no work."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        cluster.wait_for_nodes(timeout=120)
+        yield cluster
+    finally:
+        cluster.shutdown()
+
+
+@dataclass(frozen=True)
+class Same:
+    """Compare the files of two runs byte by byte, but those that hold times."""
+
+    first: tyro.conf.Positional[Path]
+    """One folder."""
+    second: tyro.conf.Positional[Path]
+    """The other."""
+
+    def run(self) -> None:
+        """Print how many are equal, and which are not."""
+        one, other = (
+            {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+            for folder in (self.first, self.second)
+        )
+        names = [name for name in sorted(one | other) if not any(name.match(pattern) for pattern in _TIMED)]
+        differ = [
+            name
+            for name in names
+            if name not in one or name not in other or one[name].read_bytes() != other[name].read_bytes()
+        ]
+        print(f"{len(names) - len(differ)} of {len(names)} files are equal")
+        print("\n".join(map(str, differ)))
 
 
 @dataclass(frozen=True)
@@ -287,11 +382,11 @@ def _spread(rows: Sequence[Mapping[str, Any]], key: str) -> str:
     return f"{np.median(values):.2f} (median of {len(values)}), {min(values):.2f} to {max(values):.2f}"
 
 
-Options = Make | Judge
+Options = Make | Run | Judge | Same
 
 
 def main(options: Options) -> None:
-    """Make, or judge."""
+    """Do what was asked for."""
     options.run()
 
 

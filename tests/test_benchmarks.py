@@ -9,11 +9,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import tyro
 
+from tests.pipeline.procedures import SUBMAPS, join, similarity, write_procedure
 from tests.scenes import write_wall
+from tests.textured_tube import tube_frames
 
 pytestmark = pytest.mark.thorough
 
@@ -36,6 +39,23 @@ def run(monkeypatch, capsys):
 
     yield of
     torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("is_right", [True, False])
+def test_joins_of_a_procedure_are_judged_by_its_truth(run, monkeypatch, tmp_path, is_right):
+    monkeypatch.setattr(import_module("procedure"), "FRAMES", 58)
+    tube_poses = [frame.camera.camera_to_world.numpy() for frame in tube_frames(14, 1.0, (40, 32))]
+    of_both = np.eye(4) if is_right else similarity(1)
+    joined = join(["segment-000", "segment-001"], ["sparse/2", "sparse/0"], of_both)
+    out = write_procedure(tmp_path / "out", joins=[joined])
+    poses = {number: pose for frames in SUBMAPS.values() for number, pose in zip(frames, tube_poses, strict=False)}
+    truth = tmp_path / "phantoms" / "phantom-0" / "truth"
+    truth.mkdir(parents=True)
+    np.save(truth / "camera_to_wall.npy", np.stack([poses.get(number, np.eye(4)) for number in range(58)]))
+    table = run("procedure", "judge", tmp_path / "phantoms", out)
+    assert "| frames | 100 |" in table and "| of these posed, % | 98.28 |" in table and "| others posed | 0 |" in table
+    assert "| ATE, mm | 0.00 (median of" in table and "| poses far off | 0 |" in table
+    assert f"| joins of segments | {'1 right, 0 wrong' if is_right else '0 right, 1 wrong'}, 0 not judged |" in table
 
 
 def test_the_training_step_by_stages(run):
