@@ -44,6 +44,11 @@ class Job(ABC):
     def progress(self) -> int:
         """How much of its size is over while it runs."""
 
+    @property
+    def doing(self) -> str:
+        """What messages say of it while it runs."""
+        return self.title
+
     @abstractmethod
     def finish(self) -> Sequence[Job]:
         """Take what the task has made; returns jobs that are now to be done.

@@ -34,7 +34,7 @@ def run_jobs(executor: Executor, options: ExecutionOptions, jobs: Sequence[Job],
     """
     queue = JobQueue(executor, options.retries, jobs, total)
     try:
-        queue.run("reconstruct", lambda: ", ".join(job.title for job in queue.running))
+        queue.run("reconstruct", lambda: ", ".join(job.doing for job in queue.running))
     except KeyboardInterrupt as error:
         raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
 
@@ -168,6 +168,13 @@ class PartJob(Job):
         record = Record.of(self._jobs.context.out)
         done = sum(record.is_done(stage.name) for stage in self.stages)
         return self.size * done // (len(self.stages) + 1)
+
+    @property
+    def doing(self) -> str:
+        """See :class:`Job`: with the stage that its worker is at."""
+        stages = Record.of(self._jobs.context.out).stages
+        begun = [stage.name for stage in self.stages if stage.name in stages and stages[stage.name].state == "begun"]
+        return " ".join([self.title, *(name.rpartition("/")[2] for name in begun)])
 
     def finish(self) -> Sequence[Job]:
         """See :class:`Job`."""

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,8 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.pipeline import capture_stages, training_stages
-from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome
+from coliags_plugin.pipeline.jobs import PartJob
+from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome, StageRecord
 from tests.comparison.small import until
 from tests.pipeline.conftest import TRAINING, write_atlas
 
@@ -73,6 +75,17 @@ def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, a
     with pytest.raises(InputError, match="SIGKILL, 3 times"):
         workers(died, died, died)
         cp.reconstruct(atlas, tmp_path / "third", jobs=1)
+
+
+def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
+    stages = [SimpleNamespace(name=f"submap-3/{name}") for name in ("depth", "train", "mesh")]
+    job = PartJob(SimpleNamespace(context=SimpleNamespace(out=tmp_path)), 3, stages, 10)
+    assert job.doing == f"{tmp_path.name}, sub-map 3"
+    record = Record(tmp_path)
+    record.put("submap-3/depth", StageRecord({}, "done"))
+    record.put("submap-3/train", StageRecord({}))
+    record.write()
+    assert job.doing == f"{tmp_path.name}, sub-map 3 train"
 
 
 def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, workers, monkeypatch):
