@@ -24,8 +24,13 @@ class ViserClient:
     """A connection to a server on this machine. Use it as a context manager."""
 
     def __init__(self, port: int) -> None:
+        # Without limits: behind a full queue, the server would wait ten seconds for an answer to its goodbye.
         self._socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            max_queue=None,
+            compression=None,
         )
         self.messages: list[dict[str, Any]] = []
 
