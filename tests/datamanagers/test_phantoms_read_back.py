@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.config.registry import phantom_layouts
 from tests.datamanagers.spoiling import FRAMES, KINDS
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses
 
@@ -34,6 +35,10 @@ OFF_WALL = {
 UNDISTORTED = ("c3vd-raw", "c3vd-raw-old", "c3vd-v2", "nerfstudio", "reim-nerf", "endomapper")
 
 
+def test_every_layout_is_read_back():
+    assert {kind.layout for kind in KINDS.values()} == set(phantom_layouts)
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_poses_depth_images_and_points(phantoms, name):
     folder, kind = phantoms[name], KINDS[name]
@@ -47,7 +52,7 @@ def test_poses_depth_images_and_points(phantoms, name):
     # EndoGSLAM's world is that of the first camera.
     world = true[0] if kind.params else np.eye(4)
     np.testing.assert_allclose(world @ poses, true, atol=1e-4)
-    json.dumps(scene.provenance, allow_nan=False)
+    assert json.loads(json.dumps(scene.provenance, allow_nan=False))["dataset"] == kind.format
     # Nothing is written into the data.
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 

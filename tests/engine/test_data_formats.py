@@ -9,8 +9,6 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.engine.data_formats import data_manager, load_method_for, open_scene
-from coliags_plugin.phantom.generate import generate
-from coliags_plugin.phantom.settings import phantom_settings
 from tests.scenes import write_wall
 
 #: Layouts of the phantom whose name is not their format's.
@@ -20,21 +18,6 @@ FORMAT_OF = {"c3vd-raw": "c3vd", "endogslam": "c3vd-endogslam", "pr-endo": "c3vd
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory):
     return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=9)
-
-
-@pytest.mark.parametrize("layout", registry.phantom_layouts)
-def test_every_layout_is_recognised_by_one_format_and_loads(layout, tmp_path):
-    # REIM-NeRF validates on every 25th frame: so short a video has none.
-    settings = {"layout": layout, "width": 64, "height": 52, "frames": 9, "rotation_views": 2, "path_length": 5.0}
-    settings |= {"mesh_spacing": 1.2, "texture_spacing": 0.4, "interreflection": 0.0, "supersampling": 1}
-    output = tmp_path / "colon"
-    generate(phantom_settings(settings), output)
-    folder = next((path for path in output.rglob("color") if layout == "pr-endo"), output / "color").parent
-    assert find_format(folder) == FORMAT_OF.get(layout, layout)
-    scene = open_scene(folder)
-    assert scene.provenance["dataset"] == FORMAT_OF.get(layout, layout)
-    assert scene.train[0].image.shape == (52, 64, 3)
-    assert len(scene.points) > 100
 
 
 def test_every_format_has_a_phantom_layout():
