@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, Protocol
 
 import torch
@@ -257,7 +258,10 @@ class Scene:
         return f"Scene {self.name}: frames {counts}; {len(self.points)} points"
 
     def with_near_plane(self, near_plane: float) -> Scene:
-        """The scene with another near plane of all cameras, scene units."""
+        """The scene with this near plane of all cameras, scene units; itself, where it has it."""
+        frames = chain(self.train, *self.test_sets.values())
+        if all(frame.camera.near_plane == near_plane for frame in frames):
+            return self
         return self._with_frames(lambda frame: frame.with_near_plane(near_plane))
 
     def scaled(self, factor: float) -> Scene:
