@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 
 from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.config.components import make_component
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.engine.light_map import find_true_light
 from coliags_plugin.lighting.photometry import fit_light
 from coliags_plugin.modules.gain import FrameGain
@@ -19,9 +20,15 @@ from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import camera_at, wall_color, wall_scene
 
 
-def gained(gains, width=64, height=48, **options):
+def wall(**options):
+    """The wall with a third of its points, which are enough."""
+    scene = wall_scene(**options)
+    return replace(scene, points=PointCloud(scene.points.positions[::3]))
+
+
+def gained(gains, **options):
     """The wall, lit by a lamp at the camera, with the images of the training frames multiplied by gains."""
-    scene = wall_scene(frames=9, width=width, height=height, **options)
+    scene = wall(width=64, height=48, **options)
     train = [
         replace(frame, image=(frame.rgb * gain * 255).round().to(torch.uint8))
         for frame, gain in zip(scene.train, gains, strict=True)
@@ -106,9 +113,10 @@ OFFSET = torch.tensor([1.0, -0.5, -2.5], dtype=torch.float64)
 EXPONENTS = {"cosine": [0.4, 0.8, 1.2], "incidence": [0.1, 0.3, 0.5]}
 
 
-def lit_wall(offset=OFFSET, frames=24):
+@cache
+def lit_wall(offset, frames=24):
     """The wall, seen from 6 to 15 mm away at all angles, under a lamp beside the lens, with gains."""
-    scene = wall_scene(width=96, height=72)
+    scene = wall(width=96, height=72)
     exponents = {name: torch.tensor(values, dtype=torch.float64) for name, values in EXPONENTS.items()}
     train, gains = [], 0.8 + 0.2 * torch.sin(torch.arange(frames, dtype=torch.float64))
     for index, gain in enumerate(gains):
@@ -144,7 +152,7 @@ def test_a_wall_that_lights_itself(tmp_path):
     scene, truth = load_scene(tmp_path / "phantom"), find_true_light(tmp_path / "phantom")
     expected = torch.tensor([truth.gains[frame.index][1] for frame in scene.train]).log() / truth.gamma
     found = fit_light(scene)
-    assert fit_light(scene) is found
+    assert fit_light(scene.with_near_plane(scene.train[0].camera.near_plane)) is found, "once for all of its runs"
     errors = found.log_gains - expected
     assert float((errors - errors.mean()).square().mean().sqrt()) < 0.015
     torch.testing.assert_close(found.lamp_offset, torch.tensor(truth.offset).float(), atol=0.5, rtol=0.0)
@@ -154,7 +162,7 @@ def test_a_wall_that_lights_itself(tmp_path):
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_law_starts_with_what_was_found(channels):
-    scene, _ = lit_wall()
+    scene, _ = lit_wall(OFFSET)
     appearance = {"name": "attenuated", "head": "plain", "channels": channels, "initial": "points"}
     node = {"name": "anchors", "geometry_head": "plain", "appearance_head": {**appearance, "incidence_exponent": 0.0}}
     component = make_component("fields", node)
