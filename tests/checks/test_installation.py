@@ -9,6 +9,7 @@ import torch
 
 from coliags_plugin.checks import trial_views
 from coliags_plugin.checks.installation import check_installation
+from coliags_plugin.checks.results import CheckFailedError
 from coliags_plugin.checks.trial_views import PRIMITIVES, Trial, TrialView, try_renderers
 from coliags_plugin.renderers import cpu_renderer, triton_renderer
 from tests.commands import refused, run
@@ -19,8 +20,8 @@ CPU = torch.device("cpu")
 SMALL = Trial(TrialView(40, 24, 16), TrialView(20, 16, 8), turns=2, seconds=0.0)
 
 
-def tried(device=CPU):
-    return {result.name: result for result in try_renderers(device, SMALL)}
+def tried():
+    return {result.name: result for result in try_renderers(CPU, SMALL)}
 
 
 def test_the_renderers_of_a_cpu():
@@ -95,8 +96,11 @@ def test_a_wrong_kernel_fails(monkeypatch):
 
     monkeypatch.setattr(triton_renderer, "render_gaussians", wrong)
     with PretendedCuda():
-        results = tried(CUDA)
-    assert [results[f"triton, {primitive}: errors"].status for primitive in PRIMITIVES] == ["failed"] * 2
+        for primitive in PRIMITIVES:
+            (chosen,) = trial_views._chosen(primitive, CUDA)
+            assert chosen.name == "triton"
+            with pytest.raises(CheckFailedError, match="wrong: "):
+                trial_views._errors(chosen.renderer, primitive, CUDA, SMALL.accuracy)
 
 
 def opacities_off(drawn):
