@@ -16,6 +16,8 @@ NVIDIA = (("cuda", 80, 32), ("cuda", 90, 32), ("cuda", 100, 32))
 AMD = (("hip", "gfx942", 64),)
 #: One in every test run, the others in thorough ones.
 TARGETS = [NVIDIA[1], *(pytest.param(target, marks=pytest.mark.thorough) for target in (NVIDIA[0], NVIDIA[2], *AMD))]
+#: What was compiled of these sources before, found by their hash; `make clean` removes it.
+CACHE = Path(__file__).parents[1] / "build" / "triton"
 #: Bytes of shared memory for which every GPU has several programs at work on each multiprocessor.
 SHARED = 16 * 1024
 #: Bytes of registers that a thread may keep in memory, where the compiler so gets another program on a multiprocessor.
@@ -30,7 +32,7 @@ def assert_compiles(path, target, folder, monkeypatch):
     What is spilled is told of NVIDIA's targets alone.
     """
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(folder / "cache"))
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(CACHE))
     command = [sys.executable, "-m", __name__, path, json.dumps(target), str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
