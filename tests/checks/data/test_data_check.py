@@ -276,7 +276,8 @@ def test_a_camera_that_pauses_is_not_suspected_and_its_pauses_are_not_compared(f
         moved[0, 3] += 100.0 * (pose[2, 3] > 7.0)
         return moved
 
-    assert "the camera jumps" in whats(changed(sound, pose=jumping))
+    jumped = path_findings(path_facts(changed(sound, pose=jumping).video))
+    assert [finding.what for finding in jumped] == ["the camera jumps"]
 
 
 def test_a_camera_that_hardly_moves_is_undecided(frames):
@@ -308,11 +309,12 @@ def test_reversed_depth_contradicts_the_lamp(frames):
     assert lamp_facts(sound).correlation < -0.5
     assert lamp_facts(reverse).correlation > 0.5
     assert lamp_facts([only_points(frame) for frame in sound]).correlation < -0.5
-    assert "the far is brighter" not in whats(scene_of(sound))
+    check = check_scene(scene_of(sound))
+    assert "the far is brighter" not in [finding.what for finding in check.findings]
+    assert "rank correlation -" in page_text(check_page(check))
     assert "the far is brighter" in whats(scene_of(reverse))
     assert "the far is brighter" in whats(scene_of([only_points(frame) for frame in reverse]))
     assert lamp_facts([replace(frame, depth=None) for frame in sound]) is None
-    assert "rank correlation -" in page_text(check_page(check_scene(scene_of(sound))))
 
 
 def test_the_moving_step_leaves_out_pauses_and_jumps():
@@ -339,7 +341,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
 
 @pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])
 def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
-    assert run("data", "check", shared_data / name, "--set", "max_frames=8", "--set", f"frame_step={step}") == 0
+    assert run("data", "check", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
     assert "nothing suspect" in capsys.readouterr().out
 
 
