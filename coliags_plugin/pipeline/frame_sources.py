@@ -152,7 +152,8 @@ class VideoFile:
             while number < stop:
                 there, image = video.read()
                 if not there:
-                    found = _beyond_damage(video, number, last)
+                    # Of a file whose first frame cannot be decoded, FFmpeg may take packets of gigabytes for others.
+                    found = _beyond_damage(video, number, last) if number > 0 else None
                     if found is None:
                         break
                     behind, image = found
