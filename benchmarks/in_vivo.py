@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ from coliags_plugin.geometry.poses.association import FrameMatches
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
-from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
+from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction, reconstruct
 
 #: Settings beside those of the preset, with which as few points are followed as through the video of a patient.
 HARD = {"texture": 0.2, "noise": 3.0, "softness": 1.5}
@@ -140,19 +140,7 @@ def row_of(options: Options, wave: float, rate: float, seed: int) -> dict[str, A
     }
 
 
-class PosedModel(Protocol):
-    """Poses of some images, as of a :class:`Reconstruction`."""
-
-    @property
-    def registered(self) -> Sequence[int] | np.ndarray:
-        """Numbers of the images, ascending. [N]"""
-
-    @property
-    def camera_to_world(self) -> np.ndarray:
-        """Their poses. [N, 4, 4]"""
-
-
-def aligned(model: PosedModel, truth: np.ndarray, frames: Sequence[int] | np.ndarray) -> Alignment | None:
+def aligned(model: Reconstruction, truth: np.ndarray, frames: Sequence[int] | np.ndarray) -> Alignment | None:
     """The model's poses of some frames aligned with the truth by a similarity; None for fewer than three."""
     if len(frames) < FEWEST:
         return None
@@ -166,7 +154,7 @@ def aligned(model: PosedModel, truth: np.ndarray, frames: Sequence[int] | np.nda
     )
 
 
-def judged(model: PosedModel, truth: np.ndarray, after: int) -> bool | None:
+def judged(model: Reconstruction, truth: np.ndarray, after: int) -> bool | None:
     """Whether a join is wrong by the true poses; None if both sides have too few frames to tell.
 
     The longer side is aligned with the truth; where it puts the first frames of the other is compared with these.

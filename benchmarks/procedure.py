@@ -26,8 +26,9 @@ from typing import Any, Self
 import cv2
 import numpy as np
 import tyro
-from in_vivo import LOST_MM, aligned, judged, path_length
+from in_vivo import FEWEST, PREDICTED, REACH, WRONG_DEG, WRONG_FACTOR, WRONG_MM, path_length
 from machine import markdown_table, show
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image
@@ -35,7 +36,8 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
-from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.alignment import Similarity
+from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
 from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
@@ -232,7 +234,7 @@ class Judge:
     def run(self) -> None:
         """Print the tables."""
         procedure, truth = read_procedure(self.out), Truth(self.folder)
-        models = {one.key: Model.of(self.out, one) for one in procedure.submaps}
+        models = {one.key: truth.model(self.out, one) for one in procedure.submaps}
         rows = [truth.row(self.out, one, models[one.key]) for one in procedure.submaps]
         numbers = np.arange(procedure.record.first, procedure.record.stop)
         is_tissue, is_posed = truth.phantom(numbers) >= 0, np.isin(numbers, list(procedure.posed))
@@ -246,9 +248,13 @@ class Judge:
             "of these posed, %": 100.0 * is_posed[is_tissue].mean(),
             "others posed": is_posed[~is_tissue].sum(),
             "sub-maps": len(rows),
-            "meshes": sum(row["wall seen, mm2"] is not None for row in rows),
+            "meshes": sum("wall seen, mm2" in row for row in rows),
             "ATE, mm": _spread(rows, "ATE, mm"),
-            "poses far off": sum(row["far off"] for row in rows),
+            "rotation, degrees": _spread(rows, "rotation, degrees"),
+            "depth of points, %": _spread(rows, "depth of points, %"),
+            "scale within sub-maps varies, %": _spread(rows, "scale varies, %"),
+            "scale of sub-maps, of mm": _spread(rows, "scale"),
+            "poses of another phantom": sum(row["of another"] for row in rows),
             "joins of segments": _told(segments),
             "refused": sum(not join.joined for join in procedure.record.joins),
             "joins within models": _told(within),
@@ -260,36 +266,47 @@ class Judge:
 
 @dataclass(frozen=True)
 class Model:
-    """Poses of a sub-map by numbers of frames in the video; see :class:`in_vivo.PosedModel`."""
+    """Poses of a sub-map, and what its scale is, by numbers of frames in the video."""
 
-    registered: np.ndarray
-    camera_to_world: np.ndarray
-
-    @classmethod
-    def of(cls, out: Path, submap: ProcedureSubmap) -> Self:
-        """Those of COLMAP's files."""
-        poses = colmap.read(out / submap.segment / "poses" / submap.model)
-        by_name = dict(zip(poses.names_or_numbers(), poses.camera_to_world, strict=True))
-        numbers = [number for number, name in submap.names.items() if name in by_name]
-        return cls(np.array(numbers), np.stack([by_name[submap.names[number]] for number in numbers]))
+    frames: np.ndarray  # numbers of the frames, ascending [N]
+    poses: np.ndarray  # camera to world [N, 4, 4]
+    scales: np.ndarray  # median ratio of the true depth to that of the points that the frame sees; NaN: unknown [N]
+    errors: np.ndarray  # median error of their depths at that scale, % [N]
 
     def moved(self, transform: np.ndarray) -> Self:
         """In another world, by a similarity."""
-        scale = np.cbrt(np.linalg.det(transform[:3, :3]))
-        poses = transform @ self.camera_to_world
+        scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
+        poses = transform @ self.poses
         poses[:, :3, :3] /= scale
-        return type(self)(self.registered, poses)
+        return replace(self, poses=poses, scales=self.scales / scale)
+
+    def part(self, kept: np.ndarray) -> Self:
+        """Some of the frames."""
+        return type(self)(self.frames[kept], self.poses[kept], self.scales[kept], self.errors[kept])
 
     def beside(self, other: Self) -> Self:
-        """With those frames of another that this has not."""
-        new = ~np.isin(other.registered, self.registered)
-        numbers = np.concatenate([self.registered, other.registered[new]])
-        poses = np.concatenate([self.camera_to_world, other.camera_to_world[new]])
-        return type(self)(numbers[order := np.argsort(numbers)], poses[order])
+        """With those frames of another that this has not, in order."""
+        new = other.part(~np.isin(other.frames, self.frames))
+        order = np.argsort(np.concatenate([self.frames, new.frames]))
+        pairs = ((getattr(self, name), getattr(new, name)) for name in ("frames", "poses", "scales", "errors"))
+        return type(self)(*(np.concatenate(pair)[order] for pair in pairs))
+
+    def placed(self, truth: np.ndarray) -> Similarity:
+        """The similarity to true poses: by orientations and depths, as short ways tell neither rotation nor scale."""
+        turn = Rotation.from_matrix(truth[:, :3, :3] @ self.poses[:, :3, :3].transpose(0, 2, 1)).mean()
+        scale = float(np.nanmedian(self.scales))
+        shift = (truth[:, :3, 3] - scale * turn.apply(self.poses[:, :3, 3])).mean(0)
+        return Similarity(scale, turn.as_matrix(), shift)
+
+
+def _degrees(true: np.ndarray, poses: np.ndarray) -> float:
+    """Median angle between orientations."""
+    turns = Rotation.from_matrix(true[:, :3, :3]).inv() * Rotation.from_matrix(poses[:, :3, :3])
+    return float(np.degrees(np.median(turns.magnitude())))
 
 
 class Truth:
-    """Poses relative to the wall in view of all frames, each in the world of its phantom, and the walls at rest."""
+    """Poses relative to the wall in view of all frames, each in the world of its phantom, depths, and walls at rest."""
 
     def __init__(self, folder: Path) -> None:
         self._folders = sorted(folder.glob("phantom-*"))
@@ -297,52 +314,90 @@ class Truth:
         poses = [np.load(phantom / "truth" / "camera_to_wall.npy") for phantom in self._folders]
         self._poses = np.concatenate([part for own in poses for part in (own, between)])
 
+    def model(self, out: Path, submap: ProcedureSubmap) -> Model:
+        """A sub-map of a procedure, with its scales."""
+        folder = out / submap.segment / "poses" / submap.model
+        suffix = model_suffix(folder, ("images", "points3D"))
+        places = {point.number: point.position for point in read_points(folder / f"points3D{suffix}")}
+        images = {image.name: image for image in read_images(folder / f"images{suffix}")}
+        numbers = [number for number, name in submap.names.items() if name in images]
+        poses, scales, errors = [], [], []
+        for number in numbers:
+            image = images[submap.names[number]]
+            turn = Rotation.from_quat(image.quat_wxyz, scalar_first=True).as_matrix()
+            poses.append(
+                np.block([[turn.T, -turn.T @ np.array(image.translation)[:, None]], [np.zeros(3), np.ones(1)]])
+            )
+            known = np.isin(image.points, list(places))
+            points = np.array([places[point] for point in image.points[known].tolist()]).reshape(-1, 3)
+            ratios = self._depths(number, image.observed[known]) / (points @ turn[2] + image.translation[2])
+            ratios = ratios[np.isfinite(ratios) & (ratios > 0.0)]
+            scales.append(float(np.median(ratios)) if len(ratios) else np.nan)
+            errors.append(100.0 * float(np.median(np.abs(ratios / scales[-1] - 1.0))) if len(ratios) else np.nan)
+        return Model(np.array(numbers), np.stack(poses), np.array(scales), np.array(errors))
+
+    def _depths(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """True depth at pixels of a frame, mm; NaN where it is unknown. [K]"""
+        phantom, index = divmod(number, FRAMES + BETWEEN)
+        if index >= FRAMES:
+            return np.full(len(pixels), np.nan)
+        stored = decode_image(self._folders[phantom] / "depths" / f"{index:04d}_depth.png", cv2.IMREAD_UNCHANGED)
+        column, row = np.clip(pixels.astype(int), 0, np.array(stored.shape[::-1]) - 1).T
+        return np.where(stored[row, column] < 65535, stored[row, column] * (100.0 / 65535.0), np.nan)
+
     def phantom(self, numbers: np.ndarray) -> np.ndarray:
         """Number of the phantom that each frame shows; -1 between two. [N]"""
         return np.where(numbers % (FRAMES + BETWEEN) < FRAMES, numbers // (FRAMES + BETWEEN), -1)
 
     def row(self, out: Path, submap: ProcedureSubmap, model: Model) -> dict[str, Any]:
-        """Poses, mesh and coverage of a sub-map."""
-        shown = self.phantom(model.registered)
+        """Poses, mesh and coverage of a sub-map, aligned with the phantom that most of its frames show."""
+        shown = self.phantom(model.frames)
         most = int(np.bincount(shown[shown >= 0], minlength=1).argmax())
-        frames = model.registered[shown == most]
-        fit = aligned(model, self._poses, frames)
-        elsewhere = len(model.registered) - len(frames)
-        row = {
+        is_own = shown == most
+        model = model.part(is_own)
+        row: dict[str, Any] = {
             "sub-map": submap.name,
             "phantom": most,
-            "frames": len(model.registered),
-            "path, mm": path_length(self._poses[frames]),
-            "ATE, mm": None if fit is None else fit.ate.rmse,
-            "far off": elsewhere + (0 if fit is None else int((fit.position_errors > LOST_MM).sum())),
-        } | dict.fromkeys(("wall seen, mm2", "there, %", "measured - true unseen, %"))
+            "frames": len(shown),
+            "of another": len(shown) - len(model.frames),
+        }
+        if len(model.frames) < FEWEST:
+            return row
+        true = self._poses[model.frames]
+        fit = model.placed(true)
+        row |= {
+            "path, mm": path_length(true),
+            "ATE, mm": float(np.sqrt(np.square(fit.points(model.poses[:, :3, 3]) - true[:, :3, 3]).sum(1).mean())),
+            "rotation, degrees": _degrees(true, fit.rotation @ model.poses[:, :3, :3]),
+            "scale": fit.scale,
+            "scale varies, %": 100.0 * float(np.nanstd(np.log(model.scales))),
+            "depth of points, %": float(np.nanmedian(model.errors)),
+        }
         run = out / submap.segment / ("" if submap.number == 0 else f"submap-{submap.number}") / "run"
-        if fit is None or not (run / "coverage" / "coverage.json").is_file():
+        if not (run / "coverage" / "coverage.json").is_file():
             return row
         lens = _lens(self._folders[most])
-        views = [CoverageView(str(number), self._poses[number], lens) for number in frames]
+        views = [CoverageView(str(number), self._poses[number], lens) for number in model.frames]
         wall = read_mesh(self._folders[most] / "truth" / "mesh.ply")
         seen = see_faces(wall, views).frames > 0
         mesh = read_mesh(run / "mesh" / "mesh.ply")
-        mesh = replace(mesh, vertices=fit.transform.points(mesh.vertices))
+        mesh = replace(mesh, vertices=fit.points(mesh.vertices))
         try:
             compared = compare_meshes(mesh, TrueSurface(run, wall, seen, "cast rays"), samples=20_000)
         except InputError:  # elsewhere
             return row | {"wall seen, mm2": wall.areas[seen].sum(), "there, %": 0.0}
         row |= {"wall seen, mm2": compared.seen_area, "there, %": 100.0 * compared.scores[-1].recall}
         measured = read_json(run / "coverage" / "coverage.json", "coverage")["seen"]
-        true = measure_coverage(wall, views)
-        if measured is None or isinstance(true, PartialCoverage):
+        of_wall = measure_coverage(wall, views)
+        if measured is None or isinstance(of_wall, PartialCoverage):
             return row
-        unseen = true.area(true.level == Level.UNSEEN) / true.area()
+        unseen = of_wall.area(of_wall.level == Level.UNSEEN) / of_wall.area()
         return row | {"measured - true unseen, %": 100.0 * (1.0 - measured - unseen)}
 
     def is_wrong(self, join: SegmentJoin, models: Mapping[ModelKey, Model]) -> bool | None:
         """Whether a join of segments puts the frames after it elsewhere; None where this cannot be told."""
         first, second = (models[key] for key in join.keys)
-        together = first.beside(second.moved(np.array(join.transform)))
-        last = int(first.registered.max())
-        return self._wrong(together, last)
+        return self._wrong(first.beside(second.moved(np.array(join.transform))), int(first.frames.max()))
 
     def wrong_within(self, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
         """The same of the joins within the models of a segment."""
@@ -354,14 +409,27 @@ class Truth:
         return [self._wrong(models[own[0].key], number) for own, number in zip(owners, after, strict=True) if own]
 
     def _wrong(self, model: Model, after: int) -> bool | None:
-        shown = self.phantom(model.registered)
-        before, behind = shown[model.registered <= after], shown[model.registered > after]
-        if not (len(before) and len(behind)) or before[-1] < 0 or behind[0] < 0:
+        """Whether the side with more frames, placed by the truth, puts the first frames of the other elsewhere."""
+        model = model.part(self.phantom(model.frames) >= 0)
+        shown = self.phantom(model.frames)
+        before, behind = np.flatnonzero(model.frames <= after)[-REACH:], np.flatnonzero(model.frames > after)[:REACH]
+        if min(len(before), len(behind)) < FEWEST:
             return None
-        if before[-1] != behind[0]:
+        if shown[before[-1]] != shown[behind[0]]:
             return True
-        same = shown == before[-1]
-        return judged(Model(model.registered[same], model.camera_to_world[same]), self._poses, after)
+        sides = [model.part(side[shown[side] == shown[before[-1]]]) for side in (before, behind)]
+        forwards = len(before) >= len(behind)
+        longer, other = sides if forwards else sides[::-1]
+        other = other.part(
+            np.arange(len(other.frames))[:PREDICTED] if forwards else np.arange(len(other.frames))[-PREDICTED:]
+        )
+        fit, true = longer.placed(self._poses[longer.frames]), self._poses[other.frames]
+        off = np.linalg.norm(fit.points(other.poses[:, :3, 3]) - true[:, :3, 3], axis=1)
+        return bool(
+            _degrees(true, fit.rotation @ other.poses[:, :3, :3]) > WRONG_DEG
+            or np.median(off) > WRONG_MM
+            or abs(np.log(np.nanmedian(other.scales) / fit.scale)) > np.log(WRONG_FACTOR)
+        )
 
 
 def _lens(phantom: Path) -> PinholeLens:
@@ -376,7 +444,7 @@ def _told(wrong: Sequence[bool | None]) -> str:
 
 
 def _spread(rows: Sequence[Mapping[str, Any]], key: str) -> str:
-    values = [row[key] for row in rows if row[key] is not None]
+    values = [row[key] for row in rows if row.get(key) is not None]
     if not values:
         return ""
     return f"{np.median(values):.2f} (median of {len(values)}), {min(values):.2f} to {max(values):.2f}"
