@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,10 @@ log = logging.getLogger(__name__)
 Arrays = Mapping[str, np.ndarray]
 #: What describes the estimation, in the folder of its work files.
 _REQUEST = "request.json"
+
+#: Held while a file is read: CPython 3.11 counts the depth of the syntax trees that NumPy reads headers by for all
+#: threads together, and raises SystemError where two are at it.
+_READING = Lock()
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class WorkFolder:
 
     def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
         """The results of a frame of a pass."""
-        with np.load(self._file(stage, index)) as stored:
+        with _READING, np.load(self._file(stage, index)) as stored:
             return {name: stored[name] for name in stored.files}
 
     def is_done(self, stage: str) -> bool:
