@@ -19,7 +19,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.distillation import STEPS, adjusted_camera, distil, needs_distillation
+from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import THICKNESS_SHARE
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
@@ -172,7 +172,7 @@ def bake(
     most: int | None = None,
     degree: int = MAX_DEGREE,
     kind: type[ExplicitGaussians] = ExplicitGaussians,
-    most_steps: int = STEPS,
+    most_steps: int | None = None,
 ) -> tuple[SplatCloud, dict[str, Any]]:
     """One cloud of Gaussians for all views, under a held light, if any, and facts for its record, if it is changed.
 

@@ -70,15 +70,16 @@ class _Target:
 
 
 def distil(
-    field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float, steps: int = STEPS
+    field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None, seconds: float, steps: int | None = None
 ) -> int:
     """Fit explicit Gaussians, in place, to renderings of a run in a held light; returns the number of steps.
 
     Half of the views are training frames, brought to that light as the held-out ones are that a file is compared with:
     the run's render there, plus what the run's render as recorded misses of the frame. The others are what the run
     renders beside them: between neighbouring ones, moved and turned a little. It ends after so many seconds, or so many
-    steps: without an end in time (``seconds`` infinite), a run gives the same Gaussians again.
+    steps (:data:`STEPS`): without an end in time (``seconds`` infinite), a run gives the same Gaussians again.
     """
+    steps = STEPS if steps is None else steps
     renderer = splatting_of(model_of_gaussians(field, trained))
     unit = trained.scene.pixel_footprint
     unit = unit if unit > 0 else 1.0  # without points it is NaN

@@ -16,7 +16,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import SECONDS, bake
-from coliags_plugin.export.baking.distillation import STEPS, adjusted_camera, best_frame
+from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.viewer.content import NOTHING, ViewerContent, mesh_files
@@ -52,7 +52,7 @@ class ScenePage:
 
 
 def save_page(
-    trained: TrainedRun, output: Path, largest: int, light: str, seconds: float, most_steps: int = STEPS
+    trained: TrainedRun, output: Path, largest: int, light: str, seconds: float, most_steps: int | None = None
 ) -> ScenePage:
     """Write :func:`scene_page` to a file; an existing one is replaced."""
     refuse_folder(output)
@@ -66,7 +66,7 @@ def scene_page(
     largest: int = LARGEST_PAGE,
     light: str = "recorded",
     seconds: float = SECONDS,
-    most_steps: int = STEPS,
+    most_steps: int | None = None,
 ) -> ScenePage:
     """A run as an HTML page of at most so many bytes: its Gaussians, and the meshes in its folder.
 
@@ -109,7 +109,7 @@ def _page_of_gaussians(
     largest: int,
     light: str,
     seconds: float,
-    most_steps: int,
+    most_steps: int | None,
 ) -> ScenePage:
     page, held = _Page(trained), held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     empty = len(page.html(meshes).encode()) + _LINE_BYTES
