@@ -110,7 +110,7 @@ class Volume:
         At least so many views show it, and the sum of their squared qualities, the support, is at least so much. The
         variance of the distance between the views, in truncations squared, over the support is at most the conflict.
         Triangles are counter-clockwise seen from the side of the cameras; vertices between neighbouring voxels are
-        shared.
+        shared. The mesh of a field is always the same, to the bit.
         """
         if not len(self._blocks):
             return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
@@ -120,8 +120,7 @@ class Volume:
         variance = (self._square / weight - (self._distance / weight) ** 2).clamp(min=0.0)
         agreed = (self._seen >= min_views) & (variance <= max_conflict * self._support)
         made = self._grid(torch.where(agreed, self._support, 0.0)).extract_triangle_mesh(least)
-        vertices, triangles = made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64)
-        mesh = TriangleMesh(vertices.copy(), triangles)
+        mesh = _in_order(made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64))
         return mesh.part(mesh.areas > 0.0)
 
     def _grid(self, weight: Float[Tensor, "N"]) -> Any:
@@ -144,6 +143,15 @@ class Volume:
         for name, values in (("tsdf", mean), ("weight", weight)):
             grid.attribute(name).numpy()[places] = values.view(-1, _BLOCK, _BLOCK, _BLOCK, 1).numpy()
         return grid
+
+
+def _in_order(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]) -> TriangleMesh:
+    """A mesh whose order does not depend on the threads that found its parts: sorted, equal vertices made one."""
+    vertices, places = np.unique(vertices, axis=0, return_inverse=True)
+    triangles = places.reshape(-1)[triangles]
+    turned = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    triangles = np.take_along_axis(triangles, turned, axis=1)
+    return TriangleMesh(vertices, triangles[np.lexsort(triangles.T[::-1])])
 
 
 def _in_frustum(centers: Float[Tensor, "B 3"], camera: Camera, edge: float) -> Bool[Tensor, "B"]:

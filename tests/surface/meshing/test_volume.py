@@ -10,8 +10,9 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.meshing.views import DepthView
-from coliags_plugin.surface.meshing.volume import Volume
+from coliags_plugin.surface.meshing.volume import Volume, _in_order
 from tests.scenes import wall_scene
 
 
@@ -99,3 +100,26 @@ def test_voxels_too_small_for_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr("coliags_plugin.surface.meshing.volume._MAX_BLOCKS", 1000)
     with pytest.raises(InputError, match=r"larger voxels\. Try --voxel 0.2"):
         Volume([view_of(turned(0.0), torch.full((90, 120), 20.0))], 0.1, 4.0)
+
+
+def test_a_mesh_does_not_depend_on_the_order_in_which_its_parts_are_found():
+    generator = np.random.default_rng(0)
+    vertices = generator.integers(0, 4, (40, 3)).astype(np.float32)  # some are equal
+    triangles = generator.integers(0, 40, (60, 3))
+    triangles = triangles[TriangleMesh(vertices, triangles).areas > 0.0]
+    first = _in_order(vertices, triangles)
+    new = generator.permutation(40)  # place of each vertex
+    turned = np.stack([np.roll(row, generator.integers(3)) for row in new[triangles]])
+    second = _in_order(vertices[np.argsort(new)], generator.permutation(turned))
+    np.testing.assert_array_equal(first.vertices, second.vertices)
+    np.testing.assert_array_equal(first.triangles, second.triangles)
+    assert len(np.unique(first.vertices, axis=0)) == len(first.vertices)
+
+    def corners(mesh):
+        return sorted((tuple(map(tuple, np.sort(np.array(mesh[0])[face], axis=0).tolist()))) for face in mesh[1])
+
+    assert corners((first.vertices, first.triangles)) == corners((vertices, triangles))
+    same = np.cross(*(np.diff(first.vertices[first.triangles], axis=1)[:, side] for side in (0, 1))).sum(axis=0)
+    np.testing.assert_array_equal(
+        same, np.cross(*(np.diff(vertices[triangles], axis=1)[:, side] for side in (0, 1))).sum(axis=0)
+    )  # no triangle is turned over
