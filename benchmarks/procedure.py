@@ -220,6 +220,13 @@ class Same:
         print("\n".join(map(str, differ)))
 
 
+#: What is measured of a sub-map where it can be.
+_MEASURED = (
+    "path, mm", "ATE, mm", "rotation, degrees", "scale", "scale varies, %", "depth of points, %", "wall seen, mm2",
+    "there, %", "measured - true unseen, %",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Judge:
     """Compare what was made of a video with the truth."""
@@ -248,7 +255,7 @@ class Judge:
             "of these posed, %": 100.0 * is_posed[is_tissue].mean(),
             "others posed": is_posed[~is_tissue].sum(),
             "sub-maps": len(rows),
-            "meshes": sum("wall seen, mm2" in row for row in rows),
+            "meshes": sum(row["wall seen, mm2"] is not None for row in rows),
             "ATE, mm": _spread(rows, "ATE, mm"),
             "rotation, degrees": _spread(rows, "rotation, degrees"),
             "depth of points, %": _spread(rows, "depth of points, %"),
@@ -360,7 +367,7 @@ class Truth:
             "phantom": most,
             "frames": len(shown),
             "of another": len(shown) - len(model.frames),
-        }
+        } | dict.fromkeys(_MEASURED)
         if len(model.frames) < FEWEST:
             return row
         true = self._poses[model.frames]
@@ -444,7 +451,7 @@ def _told(wrong: Sequence[bool | None]) -> str:
 
 
 def _spread(rows: Sequence[Mapping[str, Any]], key: str) -> str:
-    values = [row[key] for row in rows if row.get(key) is not None]
+    values = [row[key] for row in rows if row[key] is not None]
     if not values:
         return ""
     return f"{np.median(values):.2f} (median of {len(values)}), {min(values):.2f} to {max(values):.2f}"

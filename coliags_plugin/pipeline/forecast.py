@@ -13,7 +13,7 @@ from coliags_plugin.reporting.numbers import duration, file_size
 
 #: Seconds of a CPU core, of a patient's clip on an AMD EPYC (docs/reconstruct.md 5): poses of a frame; depth and
 #: evaluation of a frame with a pose; a training step; and what every sub-map takes besides.
-_POSES, _FRAME, _STEP, _SUBMAP = 1.1, 1.7, 0.24, 104.0
+_POSES, _FRAME, _STEP, _SUBMAP = 1.1, 1.7, 0.24, 75.0
 #: Share of the frames that get a pose, and frames of a sub-map, in that clip; training steps of a frame, of 2000.
 _POSED, _SUBMAP_FRAMES, _STEPS = 0.92, 45, 23
 #: Bytes: of a pixel of a frame; of a frame's depth; and of a sub-map.
