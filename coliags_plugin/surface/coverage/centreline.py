@@ -113,7 +113,7 @@ class LumenSection:
 def find_section(
     arc: Float[np.ndarray, "F"], areas: Float[np.ndarray, "F"], seen: Bool[np.ndarray, "F"]
 ) -> LumenSection:
-    """From the first to the last place at which half of the wall was seen, over windows of 10 mm.
+    """From the first to the last place at which half of the wall was seen, over windows of 10 mm; not shorter than one.
 
     ``arc`` is the place of each triangle along the centreline, mm; wall that is missing has to be among them.
     """
@@ -122,10 +122,11 @@ def find_section(
     whole = uniform_filter1d(np.bincount(index, areas).astype(float), _WINDOW, mode="constant")
     shown = uniform_filter1d(np.bincount(index, areas * seen).astype(float), _WINDOW, mode="constant")
     half = np.flatnonzero((shown >= _SEEN_SHARE * whole) & (whole > 0.0))
-    if not len(half):
+    if not len(half) or half[-1] - half[0] + 1 < _WINDOW:
+        where = f"along {half[-1] - half[0] + 1} mm only" if len(half) else "nowhere along the lumen"
         raise NoLumenError(
-            "nowhere along the lumen was half of the wall seen",
-            "a recording that shows a section of a lumen",
+            f"{where} was half of the wall seen",
+            f"a recording that shows a section of a lumen, {_WINDOW} mm of it at least",
             "Check that the mesh is the wall that the camera filmed, in the world of its poses",
         )
     return LumenSection(first + float(half[0]), first + float(half[-1]) + 1.0)

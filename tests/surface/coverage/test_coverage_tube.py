@@ -147,6 +147,8 @@ def test_a_section_ends_where_less_than_half_was_seen_but_not_at_a_gap_within_it
     assert section.holds(np.array([19.0, 45.0, 72.0])).tolist() == [False, True, False]
     with pytest.raises(NoLumenError, match="half of the wall"):
         find_section(arc, areas, np.zeros(400, bool))
+    with pytest.raises(NoLumenError, match=r"along [1-9] mm only was half of the wall seen"):
+        find_section(arc, areas, (arc > 40.0) & (arc < 46.0))
 
 
 def test_of_a_wall_without_a_lumen_the_seen_area_remains():
