@@ -83,7 +83,7 @@ def test_the_page_tells_what_came_out(out):
         "mm of 2 of 6 sub-maps",
     ):
         assert fact in text
-    assert f"Not reconstructed: segment-002 (poses failed: {FAILURE})" in text
+    assert f"Failed or not finished: segment-002 (poses failed: {FAILURE})" in text
     assert "The poses of 2 sub-maps (segment-000/0, segment-001/0): there the surface may be bent" in text
     assert "joined: 5 shared frames, cameras turned by 0.5 degrees, 2 % of the depth apart" in text
     assert "12 frames between them" in text and "washed with water" in text

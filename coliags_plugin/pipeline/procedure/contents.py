@@ -110,7 +110,8 @@ class SegmentContents:
         own = {name: stage for name, stage in stages.items() if "/" not in name}
         for name, stage in own.items():
             if stage.state == "failed":
-                return f"{name} failed: {stage.summary}"
+                of = "" if name in ("frames", "poses") else " of its largest sub-map"
+                return f"{name}{of} failed: {stage.summary}"
         if self.problem:
             return self.problem
         if not stages:

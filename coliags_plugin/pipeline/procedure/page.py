@@ -151,7 +151,7 @@ def _cautions(procedure: ProcedureContents) -> Iterator[str]:
     failed = [f"{segment.span.name} ({segment.failure})" for segment in procedure.segments if segment.failure]
     if failed:
         rest = f", and {len(failed) - _NAMED} others" if len(failed) > _NAMED else ""
-        yield f"Not reconstructed: {', '.join(failed[:_NAMED])}{rest}"
+        yield f"Failed or not finished: {', '.join(failed[:_NAMED])}{rest}"
     suspect = [
         submap.name
         for submap in procedure.submaps
