@@ -14,8 +14,7 @@ import pytest
 #: A100, H100, B200; MI300.
 NVIDIA = (("cuda", 80, 32), ("cuda", 90, 32), ("cuda", 100, 32))
 AMD = (("hip", "gfx942", 64),)
-#: One in every test run, the others in thorough ones.
-TARGETS = [NVIDIA[1], *(pytest.param(target, marks=pytest.mark.thorough) for target in (NVIDIA[0], NVIDIA[2], *AMD))]
+TARGETS = [pytest.param(target, marks=pytest.mark.thorough) for target in (*NVIDIA, *AMD)]
 #: What was compiled of these sources before, found by their hash; `make clean` removes it.
 CACHE = Path(__file__).parents[1] / "build" / "triton"
 #: Bytes of shared memory for which every GPU has several programs at work on each multiprocessor.

@@ -24,6 +24,7 @@ def tried():
     return {result.name: result for result in try_renderers(CPU, SMALL)}
 
 
+@pytest.mark.thorough
 def test_the_renderers_of_a_cpu():
     results = tried()
     drawn = [f"cpu, {name}: {what}" for name in PRIMITIVES for what in ("errors", "speed")]

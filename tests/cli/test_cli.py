@@ -327,6 +327,7 @@ def test_help_and_the_package_import_nothing_heavy():
     assert not loaded & (heavy | {"viser", "gsplat", "nerfstudio"})
 
 
+@pytest.mark.thorough
 def test_ctrl_c_saves_and_exits_cleanly(scene, tmp_path):
     argv = ["train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 100_000, *SETS]
     command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]

@@ -144,6 +144,7 @@ def test_lamp_and_exponents_and_gains_are_found(offset):
     torch.testing.assert_close(found.log_gains.double(), log_gains, atol=0.01, rtol=0.0)
 
 
+@pytest.mark.thorough
 def test_a_wall_that_lights_itself(tmp_path):
     """On a phantom's wall, whose gains err by 3 % where its interreflections are not part of the fit."""
     size = {"width": 96, "height": 77, "supersampling": 1, "mesh_spacing": 1.0, "texture_spacing": 0.4}

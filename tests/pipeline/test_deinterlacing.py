@@ -116,6 +116,7 @@ def test_frames_are_written_so_and_the_record_says_it(tmp_path):
                 np.testing.assert_array_equal(read_rgb(written), image)
 
 
+@pytest.mark.thorough
 def test_a_procedure_decides_once(tmp_path, done, workers):
     """Of which the last segment would not look interlaced by itself."""
     video = tmp_path / "long.mp4"

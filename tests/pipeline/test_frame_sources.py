@@ -129,6 +129,7 @@ def test_of_how_many_frames_one_is_used(tmp_path, rate, wanted, every, caplog):
     assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
     generator = np.random.default_rng(0)
     images = [

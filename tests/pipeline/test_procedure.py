@@ -182,6 +182,7 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
     assert {path.name for path in (tmp_path / "out").glob("segment-*")} == set(again.segments) < set(names)
 
 
+@pytest.mark.thorough
 def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     long_video, tmp_path, workers, done, monkeypatch
 ):
@@ -266,6 +267,7 @@ def test_a_long_video_that_is_cut_off_is_reconstructed_as_far_as_it_goes(done, t
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.thorough
 def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
     noise = np.random.default_rng(0)
     images = [np.clip(image + noise.normal(0, 12, image.shape), 0, 255).astype(np.uint8) for image in film(range(150))]
@@ -296,6 +298,7 @@ def files_of_at_most(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.thorough
 def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, done, capsys):
     argv = ["reconstruct", long_video, "--output", tmp_path / "out"]
     argv += [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
@@ -333,6 +336,7 @@ def test_a_node_without_the_video_is_told_before_the_survey(long_video, tmp_path
     assert len(cp.reconstruct("long.mp4", "out", settings=OPTIONS, executor="ray").segments) == 3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("file", ["procedure.json", "survey.npz"])
 def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, workers, monkeypatch, file):
     workers()

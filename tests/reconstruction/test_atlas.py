@@ -181,6 +181,7 @@ def test_places_between_models_are_told(tmp_path):
     assert link.points > 30
 
 
+@pytest.mark.thorough
 def test_a_wall_that_moves_is_split(tmp_path, monkeypatch, caplog):
     """Into stretches of 12 images at least."""
     images = list_images(write_tube(tmp_path / "scene", 25, 1.0) / "images")
@@ -231,6 +232,7 @@ def test_more_models_than_colours_are_told_apart(tracked):
     assert len({tuple(row[int((number + 0.2) * 1160 / 16)].tolist()) for number in range(14)}) == 14
 
 
+@pytest.mark.thorough
 def test_tracks_choose_the_lens_that_took_the_video(tmp_path):
     images = list_images(write_tube(tmp_path / "scene", 16, 2.0) / "images")
     atlas = reconstruct(images, SfmSettings(matching="tracks"))

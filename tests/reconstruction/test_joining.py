@@ -94,6 +94,7 @@ def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatc
     )
 
 
+@pytest.mark.thorough
 def test_what_is_split_and_joined_again_is_told_as_joined(tmp_path, monkeypatch):
     monkeypatch.setattr(sfm, "rigid_frames", lambda model, tracks: HALF)
     atlas = reconstruct(images_of(tmp_path, tube_frames(COUNT, 1.0)), TRACKED)
@@ -102,6 +103,7 @@ def test_what_is_split_and_joined_again_is_told_as_joined(tmp_path, monkeypatch)
     assert atlas.refused == ()
 
 
+@pytest.mark.thorough
 def test_unrelated_walls_are_not_joined(tmp_path):
     frames = [*tube_frames(HALF, 1.0), *tube_frames(HALF, 1.0, coarseness=1.4)]
     atlas = reconstruct(images_of(tmp_path, frames), TRACKED)

@@ -205,6 +205,7 @@ def test_nothing_is_printed(viewer, capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_the_command_cleanly(anchors, request):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
