@@ -215,6 +215,10 @@ def test_the_atlas_is_written(tracked, tmp_path):
     assert record["frames"] == [path.name for path in tracked.images]
     assert pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "1")).num_reg_images() == 8
     np.testing.assert_array_equal(read_rgb(tmp_path / "scene" / "atlas.png"), draw_ribbon(atlas))
+    write_sfm_scene(tmp_path / "linked", atlas, link=True)
+    for folder, is_same in (("scene", False), ("linked", True)):
+        image = tmp_path / folder / "images" / tracked.images[0].name
+        assert image.samefile(tracked.images[0]) == is_same and image.read_bytes() == tracked.images[0].read_bytes()
 
 
 def test_the_ribbon_has_a_colour_for_every_model(tracked):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -124,6 +125,14 @@ def test_distillation_comes_nearer_to_the_frames(runs, monkeypatch):
     with torch.no_grad():
         baked.sh0 += 1.0
     assert distillation.needs_distillation(baked, trained, light)
+
+
+def test_a_fit_of_so_many_steps_is_the_same_again(runs):
+    trained = runs("coliags", settings=ANCHORS).load()
+    first, second = (field_of_cloud(bake(trained, None)[0]) for _ in range(2))
+    assert [distillation.distil(one, trained, None, math.inf, 5) for one in (first, second)] == [5, 5]
+    for name, values in first.state_dict().items():
+        assert torch.equal(values, second.state_dict()[name])
 
 
 def test_distilled_colours_fall_with_the_distance_to_the_lamp(runs, monkeypatch):
