@@ -12,8 +12,10 @@ from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.reporting.numbers import duration, file_size
 
 #: Seconds of a CPU core, of a patient's clip on an AMD EPYC (docs/reconstruct.md 5): poses of a frame; depth and
-#: evaluation of a frame with a pose; a training step; and what every sub-map takes besides.
+#: evaluation of a frame with a pose; a training step; and what every sub-map takes besides. Depth and training are of
+#: so many pixels there, and of so many at most.
 _POSES, _FRAME, _STEP, _SUBMAP = 1.1, 1.7, 0.24, 75.0
+_TRAINED_PIXELS, _MOST_PIXELS = 270 * 270, 338 * 270
 #: Share of the frames that get a pose, and frames of a sub-map, in that clip; training steps of a frame, of 2000.
 _POSED, _SUBMAP_FRAMES, _STEPS = 0.92, 45, 23
 #: Bytes: of a pixel of a frame; of a frame's depth; and of a sub-map.
@@ -54,13 +56,18 @@ class Forecast:
 
 def forecast(source: FrameSource, settings: ReconstructionSettings) -> Forecast:
     """The forecast of a video by the number and size of its frames."""
+    return _forecast(-(-source.expected // settings.frames.every), settings.steps, _pixels(source))
+
+
+def _pixels(source: FrameSource) -> int:
     height, width = next(iter(source))[1].shape[:2]
-    return _forecast(-(-source.expected // settings.frames.every), settings.steps, height * width)
+    return int(height * width)
 
 
 def _forecast(frames: int, steps: int, pixels: int) -> Forecast:
     posed, submaps = _POSED * frames, max(1.0, frames / _SUBMAP_FRAMES)
-    seconds = _POSES * frames + _FRAME * posed + _STEP * _STEPS * posed * steps / 2000 + _SUBMAP * submaps
+    share = min(pixels, _MOST_PIXELS) / _TRAINED_PIXELS
+    seconds = _POSES * frames + share * posed * (_FRAME + _STEP * _STEPS * steps / 2000) + _SUBMAP * submaps
     return Forecast(frames, seconds, frames * (_PIXEL * pixels + _DEPTH) + submaps * _SUBMAP_BYTES)
 
 
@@ -78,10 +85,11 @@ def within_budget(
     Raises:
         InputError: It takes longer with a quarter of the steps and one of twelve frames.
     """
+    pixels = _pixels(source)
     for every in range(settings.frames.every, max(settings.frames.every, _MOST_EVERY) + 1):
         for share in _SHARES:
             steps = max(1, round(share * settings.steps))
-            expected = _forecast(-(-source.expected // every), steps, 1)
+            expected = _forecast(-(-source.expected // every), steps, pixels)
             if expected.seconds <= seconds * cores:
                 frames = settings.frames.model_copy(update={"every": every})
                 return settings.model_copy(update={"steps": steps, "frames": frames})
