@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +18,11 @@ from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from tests.faults import content
+from tests.faults import content, largest_file
 
 pytestmark = pytest.mark.thorough
 
 FRAMES = np.random.default_rng(0).integers(0, 255, (12, 48, 64, 3)).astype(np.uint8)
-
-
-@contextmanager
-def largest_file(size):
-    """Let no file grow beyond so many bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def a_trajectory(count):

@@ -6,7 +6,6 @@ import ast
 import hashlib
 import os
 import random
-import resource
 import socket
 import threading
 from pathlib import Path
@@ -18,6 +17,7 @@ from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.download import download
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.progress import progress_callback
+from tests.faults import largest_file
 from tests.file_server import file_server
 
 DATA = random.Random(0).randbytes(300_000)
@@ -270,12 +270,8 @@ def test_the_proxy_of_the_environment_is_asked(server, target, monkeypatch):
 
 @pytest.mark.parametrize("room", [100_000, len(DATA) - 1])
 def test_a_full_disk_keeps_what_fitted(server, target, part, room):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
+    with largest_file(room):
         message = refusal(server, target)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert f"cannot write to {target.parent}: File too large" in message
     assert part.read_bytes() == DATA[:room]
     fetch(server, target)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import resource
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -33,6 +31,7 @@ from coliags_plugin.pipeline.procedure.survey import Survey, survey_video
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from tests import commands
+from tests.faults import largest_file
 from tests.pipeline.conftest import TRAINING, write_atlas
 from tests.pipeline.films import film, write_avi
 
@@ -287,23 +286,12 @@ def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
         assert all(np.array_equal(image, frames[frame]) for frame, image in written.items())
 
 
-@contextmanager
-def files_of_at_most(size):
-    """A disk with space for small files alone, for this process and those it starts."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.thorough
 def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, done, capsys):
     argv = ["reconstruct", long_video, "--output", tmp_path / "out"]
     argv += [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
     executor = workers()
-    with files_of_at_most(20_000):
+    with largest_file(20_000):
         message = commands.refused(capsys, *argv)
     assert "stage frames: cannot write to" in message and "Free some, or choose another output" in message
     assert len(executor.tasks) == 1, "the other segments are not tried"
