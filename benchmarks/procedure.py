@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,19 +32,24 @@ from machine import markdown_table, show
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import decode_image
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
 from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
+from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
 from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
+from coliags_plugin.pipeline.submaps import Submap
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import Level, see_faces
+from coliags_plugin.surface.coverage.visibility import Level
 
 #: Of each phantom: seeds count from here; lengths of the withdrawals, mm; frames, and frames between two phantoms.
 SEED, LENGTHS, FRAMES, BETWEEN = 4100, (60, 45, 55, 35, 60, 50, 40, 60), 700, 50
@@ -56,15 +62,15 @@ RATE = 30.0
 
 @dataclass(frozen=True)
 class Make:
-    """Render the phantoms, and write the videos and where each phantom is in them."""
+    """Command that renders the phantoms and writes the videos."""
 
     folder: tyro.conf.Positional[Path]
-    """Of all that is made; what it holds already is not made again."""
+    """Output folder; phantoms and videos that it holds already are kept."""
     lengths: tuple[int, ...] = (1500, 3000, 6000)
     """Frames of the videos: each is the beginning of the next."""
 
     def run(self) -> None:
-        """Make what is missing."""
+        """Render the phantoms and write the videos that are missing."""
         from coliags_plugin.api.scenes import make_phantom
 
         for number, length in enumerate(LENGTHS[: -(-max(self.lengths) // (FRAMES + BETWEEN))]):
@@ -85,28 +91,24 @@ def _frames(folder: Path) -> Iterator[np.ndarray]:
     for number in range(len(LENGTHS)):
         files = sorted((folder / f"phantom-{number}" / "images").glob("*.png"))
         for file in files:
-            yield _read(file)
+            yield read_rgb(file)
         following = folder / f"phantom-{number + 1}" / "images"
-        after = _read(min(following.glob("*.png"))) if following.is_dir() else _read(files[0])
+        after = read_rgb(min(following.glob("*.png")) if following.is_dir() else files[0])
+        last = read_rgb(files[-1])
         disturbed = (_contact, _fast, _washed)[number % 3]
         for place in np.linspace(0.0, 1.0, BETWEEN):
-            image = _read(files[-1]) if place < 0.5 else after
-            yield disturbed(image, float(1.0 - abs(2.0 * place - 1.0)), rng)
-
-
-def _read(file: Path) -> np.ndarray:
-    return np.ascontiguousarray(decode_image(file, cv2.IMREAD_COLOR)[..., ::-1])
+            yield disturbed(last if place < 0.5 else after, float(1.0 - abs(2.0 * place - 1.0)), rng)
 
 
 def _contact(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
-    """The wall at the lens: out of focus, red and overexposed."""
+    """Wall contact: an image out of focus, red and overexposed."""
     blurred = cv2.GaussianBlur(image, (0, 0), 0.1 + 40.0 * min(1.0, 4.0 * strength)).astype(np.float32)
     share = 0.8 * min(1.0, 2.0 * strength)
     return _noisy((1.0 - share) * blurred + share * np.array([235.0, 120.0, 95.0]), rng)
 
 
 def _fast(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
-    """The camera turned fast: blur along a direction, from elsewhere in every frame."""
+    """Motion blur along a random direction, of an image shifted by a random amount."""
     size, angle = image.shape[0], rng.uniform(0.0, np.pi)
     length = max(3, round(0.5 * size * min(1.0, 3.0 * strength)))
     kernel = np.zeros((length, length), np.float32)
@@ -118,7 +120,7 @@ def _fast(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.nd
 
 
 def _washed(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
-    """Water over the lens: a distortion that changes in every frame, and glare."""
+    """Wash: a random smooth distortion of an image, blur and glare."""
     height, width = image.shape[:2]
     shifts = 300.0 * min(1.0, 3.0 * strength) * rng.standard_normal((2, height, width)).astype(np.float32)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -141,7 +143,7 @@ _TIMED = ("reconstruction.json", "metrics.jsonl", "provenance.json", "result.jso
 
 @dataclass(frozen=True)
 class Run:
-    """Reconstruct a video by two processes of one thread, and tell what it took."""
+    """Command that reconstructs a video by two processes of one thread, and prints time and memory."""
 
     video: tyro.conf.Positional[Path]
     """The video."""
@@ -162,10 +164,10 @@ class Run:
             if cluster is not None:
                 self._disturb(cluster, child)
             _, status, used = os.wait4(child.pid, 0)
-        row = {"wall, s": time.monotonic() - start, "CPU, s": used.ru_utime + used.ru_stime}
-        if self.nodes:  # whose workers are not children
-            row = {"wall, s": row["wall, s"]}
-        print(markdown_table([row | {"largest process, MB": used.ru_maxrss / 1024, "status": status}]))
+        row = {"status": status, "wall, s": time.monotonic() - start}
+        if not self.nodes:  # whose workers are not children
+            row |= {"CPU, s": used.ru_utime + used.ru_stime, "largest process, MB": used.ru_maxrss / 1024}
+        print(markdown_table([row]))
 
     def _disturb(self, cluster: Any, child: subprocess.Popen[bytes]) -> None:
         """Kill a node while it works, and add another one."""
@@ -197,7 +199,7 @@ def _cluster() -> Iterator[Any]:
 
 @dataclass(frozen=True)
 class Same:
-    """Compare the files of two runs byte by byte, but those that hold times."""
+    """Command that compares the files of two folders byte by byte, but those that hold times."""
 
     first: tyro.conf.Positional[Path]
     """One folder."""
@@ -229,7 +231,7 @@ _MEASURED = (
 
 @dataclass(frozen=True)
 class Judge:
-    """Compare what was made of a video with the truth."""
+    """Command that compares poses, joins, meshes and coverage of a procedure with the truth."""
 
     folder: tyro.conf.Positional[Path]
     """Of the phantoms."""
@@ -273,7 +275,7 @@ class Judge:
 
 @dataclass(frozen=True)
 class Model:
-    """Poses of a sub-map, and what its scale is, by numbers of frames in the video."""
+    """Poses and scales of the frames of a sub-map."""
 
     frames: np.ndarray  # numbers of the frames, ascending [N]
     poses: np.ndarray  # camera to world [N, 4, 4]
@@ -287,7 +289,7 @@ class Model:
         poses[:, :3, :3] /= scale
         return replace(self, poses=poses, scales=self.scales / scale)
 
-    def part(self, kept: np.ndarray) -> Self:
+    def part(self, kept: np.ndarray | slice) -> Self:
         """Some of the frames."""
         return type(self)(self.frames[kept], self.poses[kept], self.scales[kept], self.errors[kept])
 
@@ -328,29 +330,27 @@ class Truth:
         places = {point.number: point.position for point in read_points(folder / f"points3D{suffix}")}
         images = {image.name: image for image in read_images(folder / f"images{suffix}")}
         numbers = [number for number, name in submap.names.items() if name in images]
-        poses, scales, errors = [], [], []
+        to_camera, scales, errors = [], [], []
         for number in numbers:
             image = images[submap.names[number]]
             turn = Rotation.from_quat(image.quat_wxyz, scalar_first=True).as_matrix()
-            poses.append(
-                np.block([[turn.T, -turn.T @ np.array(image.translation)[:, None]], [np.zeros(3), np.ones(1)]])
-            )
+            to_camera.append(rigid(turn[None], np.array([image.translation]))[0])
             known = np.isin(image.points, list(places))
             points = np.array([places[point] for point in image.points[known].tolist()]).reshape(-1, 3)
             ratios = self._depths(number, image.observed[known]) / (points @ turn[2] + image.translation[2])
             ratios = ratios[np.isfinite(ratios) & (ratios > 0.0)]
             scales.append(float(np.median(ratios)) if len(ratios) else np.nan)
             errors.append(100.0 * float(np.median(np.abs(ratios / scales[-1] - 1.0))) if len(ratios) else np.nan)
-        return Model(np.array(numbers), np.stack(poses), np.array(scales), np.array(errors))
+        return Model(np.array(numbers), inverse(np.stack(to_camera)), np.array(scales), np.array(errors))
 
     def _depths(self, number: int, pixels: np.ndarray) -> np.ndarray:
-        """True depth at pixels of a frame, mm; NaN where it is unknown. [K]"""
+        """Ground-truth z-depth at pixels of a frame, mm; NaN where it is unknown. [K]"""
         phantom, index = divmod(number, FRAMES + BETWEEN)
         if index >= FRAMES:
             return np.full(len(pixels), np.nan)
-        stored = decode_image(self._folders[phantom] / "depths" / f"{index:04d}_depth.png", cv2.IMREAD_UNCHANGED)
-        column, row = np.clip(pixels.astype(int), 0, np.array(stored.shape[::-1]) - 1).T
-        return np.where(stored[row, column] < 65535, stored[row, column] * (100.0 / 65535.0), np.nan)
+        depth = C3VD_DEPTH.z_depth(C3VD_DEPTH.read(self._folders[phantom] / "depths" / f"{index:04d}_depth.png"))
+        column, row = np.clip(pixels.astype(int), 0, np.array(depth.shape[::-1]) - 1).T
+        return np.asarray(depth[row, column])
 
     def phantom(self, numbers: np.ndarray) -> np.ndarray:
         """Number of the phantom that each frame shows; -1 between two. [N]"""
@@ -360,8 +360,7 @@ class Truth:
         """Poses, mesh and coverage of a sub-map, aligned with the phantom that most of its frames show."""
         shown = self.phantom(model.frames)
         most = int(np.bincount(shown[shown >= 0], minlength=1).argmax())
-        is_own = shown == most
-        model = model.part(is_own)
+        model = model.part(shown == most)
         row: dict[str, Any] = {
             "sub-map": submap.name,
             "phantom": most,
@@ -380,13 +379,15 @@ class Truth:
             "scale varies, %": 100.0 * float(np.nanstd(np.log(model.scales))),
             "depth of points, %": float(np.nanmedian(model.errors)),
         }
-        run = out / submap.segment / ("" if submap.number == 0 else f"submap-{submap.number}") / "run"
+        run = out / submap.segment / Submap(submap.number).folder / "run"
         if not (run / "coverage" / "coverage.json").is_file():
             return row
-        lens = _lens(self._folders[most])
-        views = [CoverageView(str(number), self._poses[number], lens) for number in model.frames]
-        wall = read_mesh(self._folders[most] / "truth" / "mesh.ply")
-        seen = see_faces(wall, views).frames > 0
+        lens = PinholeLens.of(read_intrinsics(self._folders[most] / "camera.json"))
+        wall = _wall(self._folders[most] / "truth" / "mesh.ply")
+        of_wall = measure_coverage(
+            wall, [CoverageView(str(number), self._poses[number], lens) for number in model.frames]
+        )
+        seen = of_wall.views.seen[: len(wall)]  # guessed wall is behind it
         mesh = read_mesh(run / "mesh" / "mesh.ply")
         mesh = replace(mesh, vertices=fit.points(mesh.vertices))
         try:
@@ -395,19 +396,18 @@ class Truth:
             return row | {"wall seen, mm2": wall.areas[seen].sum(), "there, %": 0.0}
         row |= {"wall seen, mm2": compared.seen_area, "there, %": 100.0 * compared.scores[-1].recall}
         measured = read_json(run / "coverage" / "coverage.json", "coverage")["seen"]
-        of_wall = measure_coverage(wall, views)
         if measured is None or isinstance(of_wall, PartialCoverage):
             return row
         unseen = of_wall.area(of_wall.level == Level.UNSEEN) / of_wall.area()
         return row | {"measured - true unseen, %": 100.0 * (1.0 - measured - unseen)}
 
     def is_wrong(self, join: SegmentJoin, models: Mapping[ModelKey, Model]) -> bool | None:
-        """Whether a join of segments puts the frames after it elsewhere; None where this cannot be told."""
+        """Whether a join of two segments contradicts the true poses; None for too few frames."""
         first, second = (models[key] for key in join.keys)
         return self._wrong(first.beside(second.moved(np.array(join.transform))), int(first.frames.max()))
 
     def wrong_within(self, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
-        """The same of the joins within the models of a segment."""
+        """Whether each join within the models of a segment contradicts the true poses; None for too few frames."""
         if segment.atlas is None:
             return []
         numbers = {Path(name).stem: number for number, name in segment.kept.items()}
@@ -416,7 +416,7 @@ class Truth:
         return [self._wrong(models[own[0].key], number) for own, number in zip(owners, after, strict=True) if own]
 
     def _wrong(self, model: Model, after: int) -> bool | None:
-        """Whether the side with more frames, placed by the truth, puts the first frames of the other elsewhere."""
+        """Whether the longer side of a join, aligned with the true poses, mispredicts the other's nearest frames."""
         model = model.part(self.phantom(model.frames) >= 0)
         shown = self.phantom(model.frames)
         before, behind = np.flatnonzero(model.frames <= after)[-REACH:], np.flatnonzero(model.frames > after)[:REACH]
@@ -427,9 +427,7 @@ class Truth:
         sides = [model.part(side[shown[side] == shown[before[-1]]]) for side in (before, behind)]
         forwards = len(before) >= len(behind)
         longer, other = sides if forwards else sides[::-1]
-        other = other.part(
-            np.arange(len(other.frames))[:PREDICTED] if forwards else np.arange(len(other.frames))[-PREDICTED:]
-        )
+        other = other.part(slice(PREDICTED) if forwards else slice(-PREDICTED, None))
         fit, true = longer.placed(self._poses[longer.frames]), self._poses[other.frames]
         off = np.linalg.norm(fit.points(other.poses[:, :3, 3]) - true[:, :3, 3], axis=1)
         return bool(
@@ -439,10 +437,9 @@ class Truth:
         )
 
 
-def _lens(phantom: Path) -> PinholeLens:
-    """The camera of a phantom."""
-    stored = read_json(phantom / "camera.json", "a phantom's camera")
-    return PinholeLens(stored["w"], stored["h"], *(stored[key] for key in ("fx", "fy", "cx", "cy")))
+@cache
+def _wall(path: Path) -> TriangleMesh:
+    return read_mesh(path)
 
 
 def _told(wrong: Sequence[bool | None]) -> str:
@@ -461,7 +458,7 @@ Options = Make | Run | Judge | Same
 
 
 def main(options: Options) -> None:
-    """Do what was asked for."""
+    """Run the chosen command."""
     options.run()
 
 
