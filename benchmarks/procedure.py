@@ -3,12 +3,12 @@
 python benchmarks/procedure.py make FOLDER
 python benchmarks/procedure.py run FOLDER/procedure-6000.mp4 OUT
 python benchmarks/procedure.py judge FOLDER OUT
-python benchmarks/procedure.py run FOLDER/procedure-1500.mp4 OUT2 --nodes
+python benchmarks/procedure.py run FOLDER/procedure-1500.mp4 OUT2 --nodes 2 --kill
 python benchmarks/procedure.py same OUT1 OUT2
 
-``make`` renders the phantoms, and writes a video for each of the lengths. ``run`` reconstructs one by two processes,
-here or on a cluster of two nodes of which one is killed on the way. ``judge`` compares poses, joins and coverage with
-the truth, ``same`` the files of two runs.
+``make`` renders the phantoms, and writes a video for each of the lengths. ``run`` reconstructs one by two processes
+here, or on a cluster of nodes of one processor each, of which one may be killed on the way. ``judge`` compares poses,
+joins and coverage with the truth, ``same`` the files of two runs.
 """
 
 from __future__ import annotations
@@ -149,19 +149,23 @@ class Run:
     """The video."""
     out: tyro.conf.Positional[Path]
     """New folder of the procedure."""
-    nodes: bool = False
-    """On a Ray cluster of two nodes of this machine, of which one is killed when a third of the segments have poses."""
+    nodes: int = 0
+    """Nodes of a Ray cluster on this machine, of one processor each; 0: no cluster, two processes."""
+    kill: bool = False
+    """Whether a node is killed, and another one added, when a third of the segments have poses."""
 
     def run(self) -> None:
         """Reconstruct."""
+        if self.kill and not self.nodes:
+            raise InputError("--kill without --nodes", "a cluster whose node can be killed")
         command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", "reconstruct", str(self.video)]
         command += ["--output", str(self.out), *OPTIONS, "--jobs", "2", "--threads", "1"]
         start = time.monotonic()
-        with _cluster() if self.nodes else nullcontext() as cluster:
+        with _cluster(self.nodes) if self.nodes else nullcontext() as cluster:
             if cluster is not None:
                 command += ["--executor", "ray", "--ray-address", cluster.address]
             child = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
-            if cluster is not None:
+            if self.kill:
                 self._disturb(cluster, child)
             _, status, used = os.wait4(child.pid, 0)
         row = {"status": status, "wall, s": time.monotonic() - start}
@@ -183,13 +187,13 @@ class Run:
 
 
 @contextmanager
-def _cluster() -> Iterator[Any]:
-    """Two nodes of one processor each, and a head that does no work."""
+def _cluster(nodes: int) -> Iterator[Any]:
+    """Nodes of one processor each, and a head that does no work."""
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     try:
-        for _ in range(2):
+        for _ in range(nodes):
             cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes(timeout=120)
         yield cluster
