@@ -241,6 +241,8 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
     },
     ("protocols", "protocol"): {
         "paper": "coliags_plugin.metrics.protocols:PaperProtocol",
+        "expected-depth": "coliags_plugin.metrics.protocols:ExpectedDepthProtocol",
+        "median-depth": "coliags_plugin.metrics.protocols:MedianDepthProtocol",
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
     ("pose_formats", "pose format"): {

@@ -40,7 +40,9 @@ class PaperProtocol(Protocol):
         "Float images and depth_accumulated (sum w z), no quantisation; masked pixels and unknown depths are "
         "ignored. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
-    wants: ClassVar[frozenset[str]] = frozenset({"depth_accumulated"})
+    #: The rendered depth that is scored.
+    depth: ClassVar[str] = "depth_accumulated"
+    wants: ClassVar[frozenset[str]] = frozenset({depth})
     metrics: ClassVar[MetricTable] = MappingProxyType(
         {
             "psnr": ("psnr", {}),
@@ -60,7 +62,7 @@ class PaperProtocol(Protocol):
 
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
         """Pair the rendered image, clamped to [0, 1], and the unchanged rendered depth with the frame."""
-        depth = output["depth_accumulated"].detach()
+        depth = output[self.depth].detach()
         image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
         if frame.sparse_depth is not None:
             rendered, known = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
@@ -68,6 +70,29 @@ class PaperProtocol(Protocol):
         if (truth := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         return replace(image, depth=depth, true_depth=truth, depth_valid=torch.isfinite(truth) & frame.valid)
+
+
+class ExpectedDepthProtocol(PaperProtocol):
+    """The paper's depth metrics, of the expected depth: the weighted mean z, 0 where nothing was drawn."""
+
+    name: ClassVar[str] = "expected-depth"
+    description: ClassVar[str] = (
+        "The depth metrics of the protocol paper, of depth_expected (sum w z / sum w); and PSNR."
+    )
+    depth: ClassVar[str] = "depth_expected"
+    wants: ClassVar[frozenset[str]] = frozenset({depth})
+    metrics: ClassVar[MetricTable] = MappingProxyType({name: (name, {}) for name in ("psnr", *_DEPTH_METRICS)})
+
+
+class MedianDepthProtocol(ExpectedDepthProtocol):
+    """The paper's depth metrics, of the median depth: z where half of the light is stopped, 0 where it never is."""
+
+    name: ClassVar[str] = "median-depth"
+    description: ClassVar[str] = (
+        "The depth metrics of the protocol paper, of depth_median (z where the transmittance falls to 1/2); and PSNR."
+    )
+    depth: ClassVar[str] = "depth_median"
+    wants: ClassVar[frozenset[str]] = frozenset({depth})
 
 
 class AuthorsCodeProtocol(Protocol):

@@ -15,7 +15,7 @@ from tests.metrics.made import make, make_output
 from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 12, 15
-NAMES = ["paper", "authors-code"]
+NAMES = ["paper", "expected-depth", "median-depth", "authors-code"]
 
 
 def protocol(name):
@@ -38,7 +38,8 @@ def scene():
     mask[5, 6] = False
     rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator).requires_grad_()
     drawn = torch.full((HEIGHT, WIDTH), 21.0)
-    output = make_output(rgb, depth_accumulated=drawn, inverse_depth_accumulated=1 / drawn)
+    kinds = {"depth_accumulated": drawn, "depth_expected": drawn, "depth_median": drawn}
+    output = make_output(rgb, **kinds, inverse_depth_accumulated=1 / drawn)
     return output, make_frame(image, depth, mask)
 
 
@@ -46,7 +47,7 @@ def scene():
 def test_what_a_protocol_promises(name):
     made = protocol(name)
     assert made.name == name
-    assert made.version == {"paper": 1, "authors-code": 2}[name]
+    assert made.version == {"authors-code": 2}.get(name, 1)
     assert made.description
     assert made.wants <= set(OUTPUTS)
     for metric, options in made.metrics.values():
@@ -59,7 +60,7 @@ def test_the_metrics_of_each():
         "psnr", "ssim", "lpips", "lpips_squeeze", "depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse",
         "depth_mae", "depth_abs_rel",
     ]  # fmt: skip
-    for name in NAMES:
+    for name in ("paper", "authors-code"):
         assert protocol(name).metrics["lpips"] == ("lpips", {"net": "vgg", "input_range": "zero-one"})
 
 
@@ -68,6 +69,16 @@ def test_nothing_compared_carries_a_graph(name, scene):
     comparison = protocol(name).compare(*scene)
     values = [getattr(comparison, field.name) for field in fields(comparison)]
     assert not any(value.requires_grad for value in values if isinstance(value, torch.Tensor))
+
+
+@pytest.mark.parametrize(("name", "kind"), [("expected-depth", "depth_expected"), ("median-depth", "depth_median")])
+def test_each_kind_of_depth_has_its_protocol(name, kind, scene):
+    output, frame = scene
+    others = {other: torch.full((HEIGHT, WIDTH), 99.0) for other in output.maps if other != kind}
+    kept = replace(output, maps={**others, kind: torch.full((HEIGHT, WIDTH), 22.0)})
+    comparison = protocol(name).compare(kept, frame)
+    assert score(name, "depth_mse", comparison) == pytest.approx(4.0)
+    assert torch.equal(comparison.depth_valid, protocol("paper").compare(output, frame).depth_valid)
 
 
 @pytest.mark.parametrize("name", NAMES)
