@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Schedule:
     """Length of a run, and the run length for which the step numbers in its config were written.
 
-    The one rule for every method (docs/configs.md): step numbers in a config keep their share of the run, so
-    ``--steps`` moves them; intervals between events do not change.
+    The one rule for every method (docs/configs.md): step numbers and intervals in a config keep their share of the run,
+    so ``--steps`` moves them, and a shorter run has as many events.
 
     Attributes:
         steps: Steps of this run.
@@ -24,15 +24,20 @@ class Schedule:
         """The step of this run at which the config's ``step`` falls."""
         return round(step * self.steps / self.written_for)
 
+    def interval(self, steps: int) -> int:
+        """The steps of this run between events that the config places ``steps`` apart; at least 1."""
+        return max(1, self.at(steps))
+
     def events(self, after: int, until: int, every: int) -> range:
-        """Steps of this run at which something happens that the config places between two of its steps.
+        """Steps of this run at which something happens: multiples of an interval, between two steps.
 
         Args:
             after: Step of the config after which it happens.
             until: Step of the config before which it happens.
-            every: Interval, in steps of this run: its multiples are the events.
+            every: Interval, in steps of the config.
         """
-        return range((self.at(after) // every + 1) * every, self.at(until), every)
+        interval = self.interval(every)
+        return range((self.at(after) // interval + 1) * interval, self.at(until), interval)
 
 
 def log_linear(start: float, end: float, progress: float) -> float:

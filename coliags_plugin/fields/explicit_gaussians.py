@@ -61,8 +61,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
 
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Raise the active degree of spherical harmonics every ``sh_every`` steps."""
-        every = max(1, schedule.at(self.settings.sh_every))
-        self.degree.fill_(min(self.settings.sh_degree, step // every))
+        self.degree.fill_(min(self.settings.sh_degree, step // schedule.interval(self.settings.sh_every)))
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians in the camera's view with their colours from there."""

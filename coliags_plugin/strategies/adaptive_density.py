@@ -25,11 +25,11 @@ class AdaptiveDensitySettings(Settings):
 
     densify_from: int = Field(default=500, ge=0)  # step after which events clone, split and prune
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
-    every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
+    every: int = Field(default=100, ge=1)  # steps between events
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
     dense_share: float = Field(default=0.01, gt=0)  # of the extent: larger Gaussians are split, smaller ones cloned
     min_opacity: float = Field(default=0.005, ge=0)  # of a Gaussian that stays
-    reset_every: int = Field(default=3000, ge=1)  # steps between resets of the opacities, whatever the run's length
+    reset_every: int = Field(default=3000, ge=1)  # steps between resets of the opacities
     reset_opacity: float = Field(default=0.01, gt=0, lt=1)  # the most that a reset leaves
     max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
     max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
@@ -72,6 +72,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
     ) -> None:
         super().__init__(settings, generator, schedule, extent)
         self.until = schedule.at(settings.until)
+        self.every, self.reset_every = schedule.interval(settings.every), schedule.interval(settings.reset_every)
         self.events = schedule.events(settings.densify_from, settings.until, settings.every)
         self.gradient_sum = torch.zeros(0)  # [N]
         self.drawn = torch.zeros(0)  # [N]
@@ -79,18 +80,18 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
 
     def plan(self) -> str:
         """Steps at which this run densifies and resets opacities, for the log."""
-        every, reset, events = self.settings.every, self.settings.reset_every, self.events
+        every, reset, events = self.every, self.reset_every, self.events
         if len(events) == 0:
             return (
                 f"this run neither densifies nor prunes: its {self.schedule.steps} steps leave no multiple of {every} "
                 f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
             )
         resets = range(reset, self.until, reset)
-        resetting = (
-            f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
+        resetting = f"at {len(resets)}, from {resets[0]} to {resets[-1]}" if resets else "never"
+        return (
+            f"this run clones, splits and prunes at {len(events)} steps, from {events[0]} to {events[-1]}, and resets "
+            f"opacities {resetting}"
         )
-        densifying = f"clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}"
-        return f"this run {densifying}, and {resetting}"
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep[ExplicitRows], rows: ParameterRows) -> dict[str, int]:
@@ -106,7 +107,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
             grown = self._densify(field, rows)
             done = {"grown": grown, "pruned": self._prune(field, rows, step.step)}
             self._forget(field.means)
-        if step.step % self.settings.reset_every == 0:
+        if step.step % self.reset_every == 0:
             highest = math.log(self.settings.reset_opacity / (1.0 - self.settings.reset_opacity))
             rows.replace_values("opacities", field.opacities.clamp_max(highest))
         return done
@@ -158,7 +159,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         """Remove transparent and, after the first reset, oversized Gaussians; returns their number."""
         options = self.settings
         gone = field.opacities.sigmoid() < options.min_opacity
-        if step > options.reset_every:
+        if step > self.reset_every:
             if options.max_radius is not None:
                 gone |= self.largest_radius > options.max_radius
             if options.max_scale_share is not None:

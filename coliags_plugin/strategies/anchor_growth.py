@@ -22,7 +22,7 @@ class AnchorGrowthSettings(Settings):
     statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
     growth_from: int = Field(default=1500, ge=0)  # step after which events grow and prune
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
-    every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
+    every: int = Field(default=100, ge=1)  # steps between events
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
     # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
     success_share: float = Field(default=0.8, gt=0, le=1)
@@ -77,6 +77,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         super().__init__(settings, generator, schedule, extent)
         self.statistics_from = schedule.at(settings.statistics_from)
         self.until = schedule.at(settings.until)
+        self.every = schedule.interval(settings.every)
         self.events = schedule.events(settings.growth_from, settings.until, settings.every)
         self.opacity_sum = torch.zeros(0)  # [M]
         self.seen = torch.zeros(0)  # [M]
@@ -85,13 +86,13 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
 
     def plan(self) -> str:
         """Steps at which this run grows and prunes, for the log."""
-        every, events = self.settings.every, self.events
+        every, events = self.every, self.events
         if len(events) == 0:
             return (
                 f"this run neither grows nor prunes anchors: its {self.schedule.steps} steps leave no multiple of "
                 f"{every} between steps {self.schedule.at(self.settings.growth_from)} and {self.until}"
             )
-        return f"this run grows and prunes anchors every {every} steps from step {events[0]} to {events[-1]}"
+        return f"this run grows and prunes anchors at {len(events)} steps, from {events[0]} to {events[-1]}"
 
     def most_added(self, pixels: int) -> int:
         """The births of all events."""
@@ -134,7 +135,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
 
     def _grow(self, field: Anchors, rows: ParameterRows, children: int, most_births: int) -> int:
         options = self.settings
-        ready = self.drawn > options.every * options.success_share * 0.5
+        ready = self.drawn > self.every * options.success_share * 0.5
         gradient = self.gradient_sum / self.drawn.clamp_min(1.0)
         positions = field.child_positions().reshape(-1, 3)
         first_count = len(field.anchors)
@@ -168,7 +169,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         options = self.settings
         if options.max_scale is not None:
             field.scalings[:, 3:].clamp_(max=math.log(options.max_scale * float(field.spacing)))
-        judged = self.seen > options.every * options.success_share
+        judged = self.seen > self.every * options.success_share
         faint = judged & (self.opacity_sum < options.min_opacity * self.seen)
         self.opacity_sum[judged] = 0.0
         self.seen[judged] = 0.0

@@ -27,8 +27,8 @@ Generated from `method_configs/`. Formulas and differences from released
 code are in [methods.md](methods.md) and in the pages on rivals; the meaning of options is in [options.md](options.md).
 Ablations (`method_configs/ablations/`) change one part of `coliags` each and are not listed.
 
-Step numbers are written for the run length in the column `steps` and keep their share of a run of another length;
-intervals (`every`, `reset_every`) do not change with it ([configs.md](configs.md)).
+Step numbers and intervals (`every`, `reset_every`) are written for the run length in the column `steps` and keep their
+share of a run of another length ([configs.md](configs.md)).
 """
 
 #: Parts of a method config that hold constants, in the order of the tables.

@@ -17,7 +17,8 @@ def keeps_rows_together(context: CheckContext) -> str:
     node = context.loaded.config.strategy
     if node.target.serves is None:
         raise CheckSkippedError(f"strategy '{node.name}' changes no rows")
-    method = context.load(_hastened(node.settings, context.steps))
+    written_for = context.loaded.config.schedule.written_for
+    method = context.load(_spread_out(node.settings, context.steps, written_for))
     with as_in_new_process():
         trainer = context.build("events", method=method)
         trainer.start()
@@ -47,15 +48,16 @@ def keeps_rows_together(context: CheckContext) -> str:
     return f"{start.count} to {before.count} rows in {events} events; resumed after step {changed_at} to the same bits"
 
 
-def _hastened(settings: Settings, steps: int) -> list[str]:
-    """Overrides that make a strategy's intervals, which do not scale with a run, short enough for ``steps``.
+def _spread_out(settings: Settings, steps: int, written_for: int) -> list[str]:
+    """Overrides with which a strategy has a few events in ``steps``, between which training goes on.
 
-    Intervals are the whole numbers among its options that are called ``every`` or ``..._every``.
+    Intervals, in steps of a run of ``written_for``, are the whole numbers among its options that are called ``every``
+    or ``..._every``.
     """
     names = [name for name in type(settings).model_fields if name == "every" or name.endswith("_every")]
     given = {name: getattr(settings, name) for name in names if isinstance(getattr(settings, name), int)}
     shortest = min(given.values(), default=0)
-    short = max(1, steps // 5)
+    short = max(1, written_for // 5)
     return [f"strategy.{name}={short if every == shortest else 2 * short}" for name, every in given.items()]
 
 

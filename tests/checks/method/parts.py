@@ -129,7 +129,7 @@ class Division(Strategy):
     class Settings(Settings):
         """One interval."""
 
-        every: int = 1000
+        every: int = 100_000
         born: int = 3
 
     serves = frozenset({"balls"})
@@ -138,9 +138,10 @@ class Division(Strategy):
     def __init__(self, settings, generator, schedule, extent):
         super().__init__(settings, generator, schedule, extent)
         self.steps = torch.zeros(0)
+        self.every = schedule.interval(settings.every)
 
     def plan(self):
-        return f"every {self.settings.every} steps"
+        return f"every {self.every} steps"
 
     @torch.no_grad()
     def after_backward(self, step, rows):
@@ -148,7 +149,7 @@ class Division(Strategy):
         if len(self.steps) == 0:
             self.steps = torch.zeros(len(field.means))
         self.steps += 1
-        if step.step % self.settings.every:
+        if step.step % self.every:
             return {}
         self.add(field, rows, born)
         return {"grown": born}
