@@ -23,8 +23,8 @@ class ReportCommand:
     methods: arguments.OptionalText = None
     """Names of methods to show, in this order, separated by commas; default: all."""
     columns: arguments.OptionalText = None
-    """Metrics to show, separated by commas, or `all`; default: psnr,ssim,lpips,depth_mse,depth_mse_inner,
-    depth_median_error."""
+    """Metrics to show, separated by commas, or `all`; default: psnr,psnr_gain_fitted,ssim,lpips,depth_mse,
+    depth_mse_inner,depth_median_error."""
     reference: arguments.OptionalText = None
     """Method that the others are compared with; default: coliags, or the best where it is not there."""
     protocol: str = "paper"

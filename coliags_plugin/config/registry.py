@@ -229,6 +229,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
     },
     ("metrics", "metric"): {
         "psnr": "coliags_plugin.metrics.image:PSNR",
+        "psnr_gain_fitted": "coliags_plugin.metrics.image:GainFittedPSNR",
         "ssim": "coliags_plugin.metrics.image:SSIM",
         "lpips": "coliags_plugin.metrics.lpips:LPIPS",
         "depth_mse": "coliags_plugin.metrics.depth:DepthMSE",

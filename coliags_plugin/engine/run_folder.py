@@ -196,8 +196,8 @@ class RunFolder:
         if self.provenance()["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
             raise InputError(f"{scene_path} is not the data this run was started on", "unchanged data")
 
-    def record_schedule(self, config: MethodConfig, step: int) -> None:
-        """Write a schedule that differs from the run's own into its config, and the change into its provenance."""
+    def record_schedule(self, config: MethodConfig, step: int, plan: str) -> None:
+        """Write a schedule that differs from the run's own into its config; change and plan into its provenance."""
         before, now = self.method().config.schedule, config.schedule
         if now.steps < step:
             raise InputError(f"{self.path} has taken {step} steps already", f"--steps {step} or more, not {now.steps}")
@@ -206,7 +206,8 @@ class RunFolder:
         provenance = self.provenance()
         change = {"at_step": step, "from": before.model_dump(), "to": now.model_dump()}
         changes = [*provenance.get("schedule_changes", []), change]
-        self.rewrite(config.to_yaml(), {**provenance, "steps": now.steps, "schedule_changes": changes})
+        changed = {"steps": now.steps, "plan": plan, "schedule_changes": changes}
+        self.rewrite(config.to_yaml(), {**provenance, **changed})
         if (now.steps, now.written_for) != (before.steps, before.written_for):
             logger.warning(
                 "the schedule changes at step %d from %d to %d steps: rates and weights jump there, and the result is "

@@ -99,7 +99,7 @@ class Trainer:
         self.run.check_same(self.method, self.scene, self.scene_path)
         saved = checkpoints.take_newest(self.run.checkpoints, self.method.name, self.device)
         cost = None if saved is None else self._restore(saved)
-        self.run.record_schedule(self.method.config, self.step)
+        self.run.record_schedule(self.method.config, self.step, self.strategy.plan())
         rows = self._cut_log()
         if cost is None and saved is not None:  # of a version that measured seconds alone
             cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)
@@ -242,7 +242,8 @@ class Trainer:
 
     def provenance(self) -> JsonObject:
         """Provenance of the run."""
-        return run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
+        made = run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
+        return {**made, "plan": self.strategy.plan()}
 
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
         count, first = self.model.field.element_count, str(error).partition("\n")[0]

@@ -1,7 +1,8 @@
-"""Image quality metrics PSNR and SSIM."""
+"""Image quality metrics: PSNR, PSNR with a fitted gain, and SSIM."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -34,6 +35,20 @@ class PSNR(Metric[ImageMetricSettings]):
         if squared_error == 0:
             raise UnavailableError("the images are identical, so the PSNR is infinite")
         return float(-10.0 * torch.log10(squared_error))
+
+
+class GainFittedPSNR(PSNR):
+    """PSNR after all colours of the render are multiplied by one factor, that of least squared error.
+
+    It uses the true image: what it is above the PSNR is an error of exposure, not of the model.
+    """
+
+    def __call__(self, comparison: Comparison) -> float:
+        """PSNR of one frame with its best factor, dB; unavailable where the PSNR is."""
+        require_image(comparison)
+        rendered, true = (rgb[comparison.valid].double() for rgb in (comparison.rgb, comparison.true_rgb))
+        gain = (rendered * true).sum() / rendered.square().sum().clamp_min(1e-12)
+        return super().__call__(replace(comparison, rgb=comparison.rgb.double() * gain))
 
 
 class SSIM(Metric[ImageMetricSettings]):

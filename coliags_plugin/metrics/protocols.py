@@ -55,6 +55,7 @@ class PaperProtocol(Protocol):
     )
     optional_metrics: ClassVar[MetricTable] = MappingProxyType(
         {
+            "psnr_gain_fitted": ("psnr_gain_fitted", {}),
             "sparse_depth_median": ("sparse_depth", {"quantile": 0.5}),
             "sparse_depth_p90": ("sparse_depth", {"quantile": 0.9}),
         }

@@ -9,11 +9,11 @@ import numpy as np
 
 from coliags_plugin.results.paired import (
     FEWEST_SCENES,
-    bootstrap_interval,
     cohen_dz,
     holm,
     rank_biserial,
     smallest_p,
+    t_interval,
     t_test_p,
     wilcoxon_p,
 )
@@ -26,7 +26,7 @@ BySeed = Mapping[str, Mapping[int, float]]
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and spread of a method's metric.
+    """Mean, median and spread of a method's metric.
 
     That over seeds is the root mean square, over the scenes with two seeds or more, of the standard deviation (n - 1)
     over the seeds of a scene; None where there is no such scene.
@@ -36,6 +36,12 @@ class Spread:
     over_scenes: float | None  # standard deviation (n - 1) of these means; None for a single scene
     over_seeds: float | None
     scenes: int
+    median: float | None  # over the same means over seeds
+
+    @property
+    def ruled_by_few(self) -> bool:
+        """Whether few scenes rule the mean: it is more than twice the median."""
+        return self.mean is not None and self.median is not None and self.mean > 2.0 * self.median > 0.0
 
 
 def scene_means(values: BySeed) -> dict[str, float]:
@@ -44,7 +50,7 @@ def scene_means(values: BySeed) -> dict[str, float]:
 
 
 def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
-    """Mean and spread over scenes that all have a value."""
+    """Mean, median and spread over scenes that all have a value."""
     means = [float(np.mean([*values[scene].values()])) for scene in scenes]
     variances = [np.var([*values[scene].values()], ddof=1) for scene in scenes if len(values[scene]) > 1]
     return Spread(
@@ -52,6 +58,7 @@ def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
         over_scenes=float(np.std(means, ddof=1)) if len(means) > 1 else None,
         over_seeds=float(np.sqrt(np.mean(variances))) if variances else None,
         scenes=len(means),
+        median=float(np.median(means)) if means else None,
     )
 
 
@@ -69,7 +76,7 @@ class PairedTests:
     wilcoxon_holm: float  # the same, adjusted for the number of rivals
     t_test: float | None  # two-sided p of the paired t-test; None where all leads are equal
     t_test_holm: float | None  # the same, adjusted for the number of rivals that have one
-    interval: tuple[float, float]  # 95 % percentile bootstrap interval of the mean lead
+    interval: tuple[float, float]  # 95 % t interval of the mean lead
     cohen_dz: float | None  # None where all leads are equal
     rank_biserial: float  # matched-pairs rank-biserial correlation
 
@@ -93,16 +100,14 @@ class RivalComparison:
         return "*" * sum(self.tests.wilcoxon_holm < level for level in possible)
 
 
-def compare_with_rivals(
-    values: Mapping[str, BySeed], reference: str, higher_is_better: bool, seed: int = 0
-) -> list[RivalComparison]:
+def compare_with_rivals(values: Mapping[str, BySeed], reference: str, higher_is_better: bool) -> list[RivalComparison]:
     """Compare a reference with every other method, each pair on their common scenes, seeds averaged first."""
     leads = {
         rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
         for rival, by_seed in values.items()
         if rival != reference
     }
-    tests = _adjusted({rival: _tested(own, seed) for rival, own in leads.items() if len(own) >= FEWEST_SCENES})
+    tests = _adjusted({rival: _tested(own) for rival, own in leads.items() if len(own) >= FEWEST_SCENES})
     return [
         RivalComparison(
             rival=rival,
@@ -121,11 +126,10 @@ def _leads(reference: BySeed, rival: BySeed, sign: float) -> dict[str, float]:
     return {scene: sign * (one[scene] - other[scene]) for scene in common_scenes([reference, rival])}
 
 
-def _tested(leads: Mapping[str, float], seed: int) -> PairedTests:
+def _tested(leads: Mapping[str, float]) -> PairedTests:
     sample = np.array([*leads.values()])
     wilcoxon, t_test = wilcoxon_p(sample), t_test_p(sample)
-    interval = bootstrap_interval(sample, seed)
-    return PairedTests(wilcoxon, wilcoxon, t_test, t_test, interval, cohen_dz(sample), rank_biserial(sample))
+    return PairedTests(wilcoxon, wilcoxon, t_test, t_test, t_interval(sample), cohen_dz(sample), rank_biserial(sample))
 
 
 def _adjusted(tests: Mapping[str, PairedTests]) -> dict[str, PairedTests]:

@@ -109,8 +109,8 @@ def test_its_values_are_those_of_the_metrics(result, whole, scene):
             scores = scorer.score(scorer.compare(whole.model, frame, CPU))
             assert scores.values == {
                 metric: part.values[metric][index]
-                for metric in scorer.metrics
-                if part.values[metric][index] is not None
+                for metric in scorer.metrics | scorer.optional_metrics
+                if metric in part.values and part.values[metric][index] is not None
             }
         assert list(part.values)[: len(scorer.metrics)] == list(scorer.metrics)
 
@@ -119,7 +119,12 @@ def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
     assert "psnr_seen" not in result.sets["test"].values
     seen, everywhere = (result.sets["rotation"].values[name] for name in ("psnr_seen", "psnr"))
     assert all(value is not None for value in seen) and seen != everywhere
-    assert list(result.metrics)[-4:] == ["psnr_seen", "ssim_seen", "depth_mse_seen", "depth_median_error_seen"]
+    assert list(result.metrics)[-5:] == [
+        "psnr_seen", "psnr_gain_fitted_seen", "ssim_seen", "depth_mse_seen", "depth_median_error_seen",
+    ]  # fmt: skip
+    for suffix in ("", "_seen"):
+        fitted, plain = (result.sets["rotation"].values[name + suffix] for name in ("psnr_gain_fitted", "psnr"))
+        assert all(one >= other for one, other in zip(fitted, plain, strict=True))
     assert result.metrics["depth_mse_seen"] == result.metrics["depth_mse"]
 
 

@@ -243,6 +243,7 @@ def test_a_changed_schedule_is_recorded(tmp_path):
     longer.train()
     found = longer.run.provenance()
     assert found["steps"] == longer.run.method().config.schedule.steps == 6
+    assert found["plan"] == longer.strategy.plan()
     (change,) = found["schedule_changes"]
     assert (change["at_step"], change["from"]["steps"], change["to"]["steps"]) == (4, 4, 6)
     make_trainer(tmp_path / "run", steps=6).resume()

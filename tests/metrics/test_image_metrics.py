@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scipy.optimize import minimize_scalar
 from skimage.metrics import peak_signal_noise_ratio
 
 from coliags_plugin.config import registry
@@ -26,13 +27,33 @@ def test_psnr_against_scikit_image(pair):
     assert make("psnr")(images(a, b)) == pytest.approx(expected, abs=1e-9)
 
 
+def test_psnr_with_a_fitted_gain_is_that_of_the_best_factor(pair, mask):
+    """The best factor is searched for, and scikit-image scores it."""
+    a, b = (image[mask].double().numpy() for image in pair)
+
+    def negative(gain):
+        return -peak_signal_noise_ratio(b, gain * a, data_range=1.0)
+
+    best = minimize_scalar(negative, bounds=(0.0, 3.0), method="bounded", options={"xatol": 1e-9})
+    assert make("psnr_gain_fitted")(images(*pair, mask)) == pytest.approx(-best.fun, abs=1e-9)
+
+
+def test_a_wrong_exposure_does_not_change_psnr_with_a_fitted_gain(pair):
+    a, b = pair
+    fitted = make("psnr_gain_fitted")
+    assert fitted(images(0.5 * a, b)) == pytest.approx(fitted(images(a, b)), abs=1e-5)
+    assert fitted(images(a, b)) >= make("psnr")(images(a, b)) > make("psnr")(images(0.5 * a, b))
+    black = torch.zeros_like(a)
+    assert fitted(images(black, b)) == make("psnr")(images(black, b))
+
+
 def test_ssim_is_the_masked_flavour_in_double_precision(pair, mask):
     a, b = pair
     assert make("ssim")(images(a, b, mask)) == ssim(a.double(), b.double(), mask).item()
     assert make("ssim")(images(b, b, mask)) == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ["psnr", "ssim"])
+@pytest.mark.parametrize("name", ["psnr", "psnr_gain_fitted", "ssim"])
 def test_ignored_pixels_do_not_change_a_metric(name, pair, mask):
     a, b = pair
     hidden = a.clone()
@@ -41,7 +62,7 @@ def test_ignored_pixels_do_not_change_a_metric(name, pair, mask):
     assert make(name)(images(a, b, torch.ones_like(mask))) != make(name)(images(a, b, mask))
 
 
-@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips"])
+@pytest.mark.parametrize("name", ["psnr", "psnr_gain_fitted", "ssim", "lpips"])
 def test_metrics_of_no_pixel_or_of_a_render_that_is_not_finite_are_unavailable(name, pair, mask):
     a, b = pair
     with pytest.raises(UnavailableError, match="the mask leaves no pixel"):
@@ -51,15 +72,17 @@ def test_metrics_of_no_pixel_or_of_a_render_that_is_not_finite_are_unavailable(n
         make(name)(images(a, b))
 
 
-def test_identical_images_have_no_psnr(pair):
+@pytest.mark.parametrize("name", ["psnr", "psnr_gain_fitted"])
+def test_identical_images_have_no_psnr(name, pair):
     with pytest.raises(UnavailableError, match="images are identical"):
-        make("psnr")(images(pair[1], pair[1]))
+        make(name)(images(pair[1], pair[1]))
 
 
 def test_every_metric_says_its_direction_and_unit():
     metrics = {name: registry.metrics.get(name) for name in registry.metrics}
     assert {name: (metric.higher_is_better, metric.unit) for name, metric in metrics.items()} == {
-        "psnr": (True, "dB"), "ssim": (True, ""), "lpips": (False, ""), "depth_mse": (False, "mm^2"),
+        "psnr": (True, "dB"), "psnr_gain_fitted": (True, "dB"), "ssim": (True, ""), "lpips": (False, ""),
+        "depth_mse": (False, "mm^2"),
         "depth_mse_inner": (False, "mm^2"), "depth_rmse": (False, "mm"), "depth_mae": (False, "mm"),
         "depth_median_error": (False, "mm"), "depth_abs_rel": (False, ""), "sparse_depth": (False, "%"),
     }  # fmt: skip

@@ -60,6 +60,7 @@ def test_the_metrics_of_each():
         "psnr", "ssim", "lpips", "lpips_squeeze", "depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse",
         "depth_mae", "depth_abs_rel",
     ]  # fmt: skip
+    assert list(protocol("paper").optional_metrics) == ["psnr_gain_fitted", "sparse_depth_median", "sparse_depth_p90"]
     for name in ("paper", "authors-code"):
         assert protocol(name).metrics["lpips"] == ("lpips", {"net": "vgg", "input_range": "zero-one"})
 

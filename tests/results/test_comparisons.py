@@ -23,6 +23,9 @@ def test_spread_by_hand():
     assert (found.mean, found.scenes) == (pytest.approx(16 / 3), 3)
     assert found.over_scenes == pytest.approx(np.std([2, 5, 9], ddof=1))
     assert found.over_seeds == pytest.approx(np.sqrt((2 + 12) / 2))
+    assert (found.median, found.ruled_by_few) == (5.0, False)
+    far = spread({"a": {0: 1.0}, "b": {0: 2.0}, "c": {0: 9.1}}, ["a", "b", "c"])
+    assert (far.median, far.ruled_by_few) == (2.0, True)
     alone = spread(values, ["b"])
     assert (alone.mean, alone.over_scenes, alone.over_seeds) == (5.0, None, None)
 

@@ -82,10 +82,20 @@ def cost_table(study: Study) -> Table:
         title="Costs",
         columns=[METHOD, *columns],
         rows=method_rows(study, columns, in_order),
-        notes=_notes(study, shared, devices),
+        notes=[*_notes(study, shared, devices), *_plans(study)],
         count=f"means over {counted(len(shared), 'scene')}" if len(shared) > 1 else "",
         name="costs",
     )
+
+
+def _plans(study: Study) -> list[str]:
+    """What each method's strategy planned for its runs, as far as that was recorded."""
+    return [
+        f"{method}: {plan}"
+        for method, own in study.by_method.items()
+        for plan in dict.fromkeys(run.result.provenance.get("training", {}).get("plan") for run in own)
+        if plan
+    ]
 
 
 def _hidden_marks(cells: dict[str, list[TableCell]]) -> set[str]:

@@ -12,15 +12,15 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
 from coliags_plugin.results.comparisons import LEVELS, PairedTests, RivalComparison, compare_with_rivals
-from coliags_plugin.results.paired import FEWEST_SCENES, RESAMPLES, smallest_p
+from coliags_plugin.results.paired import FEWEST_SCENES, smallest_p
 
 #: The reference where it is among the methods.
 PREFERRED = "coliags"
 #: What the columns of a table of leads are.
 EXPLANATION = (
     "Lead: by how much the reference is better, mean over the scenes that both methods have; seeds are averaged "
-    f"first. 95 % interval: percentile bootstrap of the lead over scenes, {RESAMPLES:,} resamples. Smallest p: what "
-    "the two-sided Wilcoxon signed-rank test of so many scenes can give. Holm: adjusted for the number of rivals. "
+    "first. 95 % t interval: of the mean lead over scenes, by Student's t. Smallest p: what the two-sided Wilcoxon "
+    "signed-rank test of so many scenes can give. Holm: adjusted for the number of rivals. "
     "Cohen's d: of paired samples, the mean lead over its standard deviation. Rank-biserial: matched-pairs "
     "correlation, 1 where the reference is better on every scene."
 )
@@ -77,7 +77,7 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
         Column("better", "Better on"),
     ]
     if any(row.tests for row in compared):
-        columns += [Column("interval", "95 % interval", column.unit), *starmap(Column, _TESTS.items())]
+        columns += [Column("interval", "95 % t interval", column.unit), *starmap(Column, _TESTS.items())]
     decimals = column_decimals(column.unit, [row.lead for row in compared])
     untested = dict.fromkeys(
         [each.key for each in columns[4:]], TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")

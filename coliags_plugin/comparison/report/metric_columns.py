@@ -12,11 +12,11 @@ from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
 
 #: Shown unless the reader chooses others.
 DEFAULT_COLUMNS = (
-    *("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
+    *("psnr", "psnr_gain_fitted", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
     *("sparse_depth_median", "sparse_depth_p90"),
 )
 #: The same for other sets, whose views leave the path, so that much of what they see was never filmed.
-_BEYOND_THE_PATH = ("psnr", "psnr_seen", *DEFAULT_COLUMNS[1:])
+_BEYOND_THE_PATH = ("psnr", "psnr_seen", "psnr_gain_fitted_seen", *DEFAULT_COLUMNS[2:])
 #: Of the default columns, what is shown where no result has the first.
 _INSTEAD = {"lpips": "lpips_squeeze"}
 #: Chooses all.
@@ -24,6 +24,7 @@ ALL_COLUMNS = "all"
 
 _NAMES = {
     "psnr": "PSNR",
+    "psnr_gain_fitted": "PSNR, gain fitted",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "lpips_squeeze": "LPIPS, SqueezeNet",

@@ -1,4 +1,4 @@
-"""Tables of metrics: over all scenes, on single scenes, and of the spread over seeds."""
+"""Tables of metrics: means and medians over all scenes, on single scenes, and of the spread over seeds."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def summary_table(
         rows += [_published_row(method, columns, numbers) for method, numbers in published.methods.items()]
     frames = counted(sum(len(part.frames(scene)) for scene in part.scenes), "frame")
     several = len(part.scenes) > 1
-    notes = [*_not_shown_notes(part, columns), *_left_out_notes(part, columns)]
+    notes = [*_not_shown_notes(part, columns), *_left_out_notes(part, columns), *_ruled_notes(part, columns)]
     if any(cell.spread for own in cells for cell in own):
         notes.append(f"± standard deviation over {'scenes' if several else 'seeds'}")
     if any(row.stars for compared in comparisons.values() for row in compared):
@@ -67,6 +67,39 @@ def summary_table(
         count=f"{counted(len(part.scenes), 'scene')}, {frames}" if several else frames,
         name=f"summary-{part.name}",
     )
+
+
+def median_table(part: Part, columns: Sequence[Column]) -> Table | None:
+    """Median over the same scenes of the metrics that are errors, which single scenes can rule; None of one scene."""
+    errors = [column for column in columns if column.direction == "lower"]
+    if len(part.scenes) < 2 or not any(column.shown for column in errors):
+        return None
+    cells = []
+    for column in errors:
+        values = part.values(column.key)
+        medians = [own.median for own in spreads(values, shared_scenes(values))]
+        cells.append(ranked_cells(medians, column.unit, column.direction))
+    return Table(
+        title=f"Medians over scenes, {part.title}",
+        columns=[METHOD, *errors],
+        rows=method_rows(part.study, errors, cells),
+        name=f"medians-{part.name}",
+    )
+
+
+def _ruled_notes(part: Part, columns: Sequence[Column]) -> list[str]:
+    """Of which methods the mean of an error is more than twice the median over scenes."""
+    notes = []
+    for column in (column for column in columns if column.shown and column.direction == "lower"):
+        values = part.values(column.key)
+        found = zip(part.study.methods, spreads(values, shared_scenes(values)), strict=True)
+        ruled = [method for method, own in found if own.ruled_by_few]
+        if ruled:
+            notes.append(
+                f"{column.title}: few scenes rule the mean, which is more than twice the median over scenes, of "
+                f"{', '.join(ruled)}"
+            )
+    return notes
 
 
 def _summary_cells(part: Part, column: Column, compared: Sequence[RivalComparison]) -> list[TableCell]:

@@ -19,7 +19,7 @@ from coliags_plugin.comparison.report.leads import (
     statistics_text,
 )
 from coliags_plugin.comparison.report.metric_columns import check_columns, metric_columns
-from coliags_plugin.comparison.report.metric_tables import scene_table, seed_table, summary_table
+from coliags_plugin.comparison.report.metric_tables import median_table, scene_table, seed_table, summary_table
 from coliags_plugin.comparison.report.provenance import provenance_section
 from coliags_plugin.comparison.report.published import published_for
 from coliags_plugin.comparison.report.study import MissingResult, Part, Study
@@ -125,7 +125,9 @@ def _metrics(study: Study, choices: Choices, reference: str) -> Section:
 def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     columns = metric_columns(part, choices.columns)
     compared = {column.key: compare(part, column, reference) for column in columns}
+    medians = median_table(part, columns)
     blocks: list[Block] = [summary_table(part, columns, compared, published_for(part))]
+    blocks += [] if medians is None else [medians]
     shown = [column for column in columns if column.shown and compared[column.key]]
     if shown:
         chosen = choices.reference is not None or reference == PREFERRED

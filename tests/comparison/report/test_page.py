@@ -113,6 +113,35 @@ def test_the_summary_of_many_scenes_is_the_mean_over_scenes(study_of):
     assert any("standard deviation over scenes" in note for note in table.notes)
 
 
+def test_medians_stand_beside_means_that_one_scene_rules(study_of):
+    depths = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
+    results = [result_of(m, f"s{i}", depth=depth) for m, own in depths.items() for i, depth in enumerate(own)]
+    found = tables(of(study_of, results))
+    means, medians = (entries(found[f"{name}-test"], "depth_mse") for name in ("summary", "medians"))
+    assert [(cell.value, cell.rank) for cell in means.values()] == [
+        (pytest.approx(1.0075), 2),
+        (pytest.approx(0.0525), 1),
+    ]
+    assert [(cell.value, cell.rank) for cell in medians.values()] == [
+        (pytest.approx(0.01), 1),
+        (pytest.approx(0.04), 2),
+    ]
+    ruled = [note for note in found["summary-test"].notes if "rule the mean" in note]
+    assert ruled[0] == (
+        "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags"
+    )
+    assert "psnr" not in [column.key for column in found["medians-test"].columns]
+    assert "medians-test" not in tables(of(study_of, results[:1]))
+
+
+def test_the_plan_of_a_methods_strategy_is_told_with_its_costs(study_of):
+    planned, plain = result_of("coliags"), result_of("3dgs")
+    training = {**planned.provenance["training"], "plan": "this run densifies 12 times"}
+    planned = planned.model_copy(update={"provenance": {**planned.provenance, "training": training}})
+    assert "coliags: this run densifies 12 times" in tables(of(study_of, [planned, plain]))["costs"].notes
+    assert not any(note.startswith("3dgs:") for note in tables(of(study_of, [planned, plain]))["costs"].notes)
+
+
 def test_seeds_of_one_scene_spread_over_seeds(study_of):
     results = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
     found = tables(of(study_of, results))
