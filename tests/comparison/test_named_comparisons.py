@@ -111,9 +111,19 @@ def test_the_papers_rows_take_away_what_their_names_lack():
         geometry, appearance = heads(variant)
         assert (geometry.name == "imve") == ("imve" in parts)
         assert (appearance.name == "imia") == ("imia" in parts)
+        sees_distance = appearance.name == "plain" and appearance.settings.distance
+        assert sees_distance == ("distance" in parts)
         losses = load_method(variant.method, variant.overrides).config.losses
         assert ("depth" in losses) == ("depth" in parts)
-    assert len(load_ablation("paper-rows")) == 5
+    assert len(load_ablation("paper-rows")) == 8
+
+
+def test_rivals_get_depth_and_gains_as_their_names_say():
+    for variant in load_ablation("rivals"):
+        config = load_method(variant.method, variant.overrides).config
+        supervised = "depth" in config.losses
+        assert supervised != (variant.name.endswith("no-depth") or variant.name in ("scaffold-gs", "3dgs", "2dgs"))
+        assert ("exposure" in config.modules) == (variant.name.endswith("gain") or variant.name == "coliags-plus")
 
 
 def test_the_sizes_of_embeddings_are_in_their_names():
