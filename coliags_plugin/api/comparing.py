@@ -24,6 +24,8 @@ def compare(
     splits: Sequence[str] = (),
     steps: int | None = None,
     settings: Mapping[str, Any] | None = None,
+    reference: str | None = None,
+    primary: Sequence[str] = (),
     jobs: int | None = None,
     threads: int | None = None,
     device: str = "auto",
@@ -43,6 +45,8 @@ def compare(
         splits: Splits, each trained apart; empty: each scene's own.
         steps: Training steps of all runs; None: each method's own.
         settings: Changes of all method configs, see :func:`~coliags_plugin.api.training.train`.
+        reference: Method that reports compare the others with, decided before the first run; only of a new folder.
+        primary: Metrics decided likewise; in reports, p-values of others are exploratory and have no stars.
         jobs: Runs at a time; None: one per CPU, or per GPU.
         threads: CPU threads of each run; None: the CPUs divided by the runs at a time.
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
@@ -62,7 +66,8 @@ def compare(
 
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     scenes = [scenes] if isinstance(scenes, (str, Path)) else scenes
-    request = make_request(methods, scenes, data, seeds, protocol, splits, steps, assignments(settings))
+    changes = assignments(settings)
+    request = make_request(methods, scenes, data, seeds, protocol, splits, steps, changes, reference, primary)
     options = ExecutionOptions(jobs, threads, device, executor, ray_address, retries)
     return carry_out(request, ComparisonFolder(Path(output)), options)
 

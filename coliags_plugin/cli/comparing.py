@@ -32,6 +32,10 @@ class ComparisonArguments:
     """Training steps of all runs; default: each method's own."""
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
     """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
+    reference: arguments.OptionalText = None
+    """Method that reports compare the others with, decided before the first run; only where the folder is new."""
+    primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
+    """Metrics decided likewise; in reports, p-values of others are exploratory and have no stars."""
     jobs: arguments.OptionalInt = None
     """Runs at a time; default: one per CPU, or per GPU."""
     threads: arguments.OptionalInt = None
@@ -58,7 +62,16 @@ class ComparisonArguments:
         from coliags_plugin.execution.choice import ExecutionOptions
 
         request = make_request(
-            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set
+            methods,
+            self.scenes,
+            self.data,
+            self.seeds,
+            self.protocol,
+            self.splits,
+            self.steps,
+            self.set,
+            self.reference,
+            self.primary,
         )
         options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         folder = ComparisonFolder(self.output)

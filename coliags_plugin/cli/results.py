@@ -21,7 +21,7 @@ class ReportCommand:
     output: arguments.OptionalOutput = None
     """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
     methods: arguments.OptionalText = None
-    """Names of methods to show, in this order, separated by commas; default: all."""
+    """Names of methods to show, in this order, separated by commas; default: all. Tests count the others too."""
     columns: arguments.OptionalText = None
     """Metrics to show, separated by commas, or `all`; default: psnr,psnr_gain_fitted,ssim,lpips,depth_mse,
     depth_mse_inner,depth_median_error."""

@@ -16,6 +16,7 @@ from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.runner import CellRuns
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
+from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, check_name, check_number, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
@@ -23,7 +24,7 @@ from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.reporting.model import Column
 from coliags_plugin.reporting.terminal import DisplayTable
-from coliags_plugin.results.record import Result
+from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +109,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
         scenes = {cell.scene.path for cell in cells if finished.of(cell) is None}
         if scenes:
             executor.check(folder.path, sorted(scenes))
-        folder.record(request, cells)
+        folder.record(request, cells, has_results=bool(finished))
         failures = CellRuns(folder, executor, options, cells, finished, sizes).run()
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
@@ -136,6 +137,8 @@ def make_request(
     splits: Sequence[str] = (),
     steps: int | None = None,
     overrides: Sequence[str] = (),
+    reference: str | None = None,
+    primary: Sequence[str] = (),
 ) -> Request:
     """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
@@ -150,5 +153,29 @@ def make_request(
     check_number("steps", steps)
     for split in splits:
         check_name("split", split, get_args(Split))
+    _check_decision([variant.name for variant in variants], protocol, reference, primary)
     sources = find_scenes([str(scene) for scene in scenes], None if data is None else Path(data))
-    return Request(variants, sources, range(seeds), protocol, tuple(dict.fromkeys(splits)), steps, tuple(overrides))
+    return Request(
+        variants,
+        sources,
+        range(seeds),
+        protocol,
+        tuple(dict.fromkeys(splits)),
+        steps,
+        tuple(overrides),
+        reference,
+        tuple(dict.fromkeys(primary)),
+    )
+
+
+def _check_decision(methods: Sequence[str], protocol: str, reference: str | None, primary: Sequence[str]) -> None:
+    """Refuse a reference without primary metrics, and the reverse, and names that are not there."""
+    if (reference is None) == bool(primary):
+        given, lacking = ("--primary", "--reference") if reference is None else ("--reference", "--primary")
+        raise InputError(f"{given} without {lacking}", "both: what is decided before the first run")
+    if reference is not None:
+        check_name("method", reference, methods)
+    kind = registry.protocols.get(protocol)
+    metrics = [*kind.metrics, *kind.optional_metrics]
+    for name in primary:
+        check_name("metric", name, [*metrics, *(metric + SEEN_SUFFIX for metric in metrics)])

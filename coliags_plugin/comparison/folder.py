@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
 
 from coliags_plugin._version import __version__
@@ -15,6 +16,7 @@ from coliags_plugin.comparison.plan_file import (
     RESULTS,
     RUNS,
     ComparisonPlan,
+    Decision,
     FailureRecord,
     PlannedCell,
     PlannedScene,
@@ -84,8 +86,9 @@ class ComparisonFolder:
         return read_plan(self.path) or ComparisonPlan()
 
     def check_extends(self, request: Request) -> None:
-        """Refuse to mix runs of different length or with different changes."""
+        """Refuse to mix runs of different length or with different changes, and to decide after the first run."""
         before = read_plan(self.path)
+        self._check_decided(request, before)
         if before is None:
             return
         if before.steps != request.steps:
@@ -100,9 +103,25 @@ class ComparisonFolder:
             )
             raise InputError(f"{self.path} compares runs with {earlier}, not {now}", "the same, or another --output")
 
-    def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:
-        """Add to the plan what is asked for now; a cell whose key has changed replaces the former one."""
-        before = self.plan()
+    def _check_decided(self, request: Request, before: ComparisonPlan | None) -> None:
+        if request.reference is None or (before is None and not (self.path / RESULTS).is_dir()):
+            return
+        decided = None if before is None else before.decided
+        if decided is None or (decided.reference, decided.primary) != (request.reference, tuple(request.primary)):
+            earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
+            raise InputError(
+                f"--reference {request.reference} --primary {' '.join(request.primary)}, where {self.path} had decided "
+                f"{earlier} when it was begun",
+                "no other decision after the first run",
+                "Leave both out, or choose another --output",
+            )
+
+    def record(self, request: Request, cells: Sequence[ComparisonCell], has_results: bool) -> None:
+        """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
+
+        With results in the folder, new and changed cells are recorded as later. Only a new plan takes up a decision.
+        """
+        before, is_new = self.plan(), read_plan(self.path) is None
         entries = {entry.identity: entry for entry in before.cells}
         changed = [
             cell for cell in cells if cell.identity in entries and entries[cell.identity].key != cell.known_keys.result
@@ -115,16 +134,27 @@ class ComparisonFolder:
             )
         scenes = dict(before.scenes)
         for cell in cells:
+            former = entries.get(cell.identity)
+            is_kept = former is not None and former.key == cell.known_keys.result
             entries[cell.identity] = PlannedCell(
                 **cell.named,
                 run=self.run(cell).path.relative_to(self.path).as_posix(),
                 result=self.result(cell).relative_to(self.path).as_posix(),
+                later=former.later if former is not None and is_kept else has_results,
             )
             scenes[cell.scene.name] = PlannedScene(
                 phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__
             )
+        decided = before.decided
+        if is_new and request.reference is not None:
+            today = datetime.now(timezone.utc).date().isoformat()
+            decided = Decision(reference=request.reference, primary=tuple(request.primary), date=today)
         plan = ComparisonPlan(
-            steps=request.steps, overrides=tuple(request.overrides), scenes=scenes, cells=tuple(entries.values())
+            steps=request.steps,
+            overrides=tuple(request.overrides),
+            decided=decided,
+            scenes=scenes,
+            cells=tuple(entries.values()),
         )
         write_json(self.path / PLAN_FILE, plan.model_dump(mode="json"))
 
@@ -172,6 +202,10 @@ class FinishedCells:
         self._folder = folder
         self._by_path = dict(results)
         self._by_key = {result.key: result for result in results.values()}
+
+    def __len__(self) -> int:
+        """Number of results, of whatever cells."""
+        return len(self._by_path)
 
     def of(self, cell: ComparisonCell) -> Result | None:
         """The result of a cell; under another name where another method is the same; None where it is not done."""

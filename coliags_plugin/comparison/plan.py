@@ -106,6 +106,8 @@ class Request:
     splits: Sequence[str] = ()  # names of splits, one run for each; empty: each scene's own
     steps: int | None = None  # length of all runs; None: each method's own
     overrides: Sequence[str] = ()  # ``key.path=value`` changes of all methods
+    reference: str | None = None  # method that was decided to compare the others with
+    primary: Sequence[str] = ()  # metrics that were decided to compare them by; none without a reference
 
     @property
     def changes(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from coliags_plugin.core.settings import first_error
 #: Names within the folder of a comparison.
 PLAN_FILE, RESULTS, RUNS, FAILURES = "plan.json", "results", "runs", "failures"
 #: Of the schema below.
-VERSION = 1
+VERSION = 2
 _EXPECTED = "what `coliags compare` wrote"
 
 
@@ -30,6 +30,14 @@ class PlannedScene(_PlanPart):
     package_version: str  # that computed the fingerprint
 
 
+class Decision(_PlanPart):
+    """What was decided before the first run of a comparison."""
+
+    reference: str  # method that the others are compared with
+    primary: tuple[str, ...] = Field(min_length=1)  # metrics whose p-values are not exploratory
+    date: str  # YYYY-MM-DD, UTC
+
+
 class _NamedCell(_PlanPart):
     scene: str  # with the name of the split where it is not the scene's own
     method: str
@@ -43,6 +51,7 @@ class PlannedCell(_NamedCell):
 
     run: str = Field(pattern=f"^{RUNS}/")  # run folder, relative to the comparison's
     result: str = Field(pattern=f"^{RESULTS}/")  # results file, likewise; there once the cell is done
+    later: bool = False  # asked for, or changed, after the first result
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
@@ -57,6 +66,7 @@ class ComparisonPlan(_PlanPart):
     version: int = VERSION  # of this schema
     steps: int | None = None  # length of all runs; None: each method's own
     overrides: tuple[str, ...] = ()  # changes of all methods
+    decided: Decision | None = None  # when the plan was first written
     scenes: dict[str, PlannedScene] = {}
     cells: tuple[PlannedCell, ...] = ()  # in the order in which they were asked for
 

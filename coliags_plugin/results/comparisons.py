@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,9 +73,9 @@ class PairedTests:
     """Tests and effect sizes of a lead; positive effects speak for the reference."""
 
     wilcoxon: float  # two-sided p of the Wilcoxon signed-rank test
-    wilcoxon_holm: float  # the same, adjusted for the number of rivals
+    wilcoxon_holm: float  # the same, adjusted for the family of rivals
     t_test: float | None  # two-sided p of the paired t-test; None where all leads are equal
-    t_test_holm: float | None  # the same, adjusted for the number of rivals that have one
+    t_test_holm: float | None  # the same, adjusted for the family of rivals
     interval: tuple[float, float]  # 95 % t interval of the mean lead
     cohen_dz: float | None  # None where all leads are equal
     rank_biserial: float  # matched-pairs rank-biserial correlation
@@ -90,24 +90,35 @@ class RivalComparison:
     lead: float | None  # mean over the scenes, positive where the reference is better; None without a common scene
     better_on: int  # number of scenes on which the reference is better
     tests: PairedTests | None  # None with fewer than six common scenes
+    exploratory: bool = False  # not decided beforehand, so that no p is significant
 
     @property
     def stars(self) -> str:
-        """One star for each level that the adjusted Wilcoxon p stays below, as far as so many scenes can give it."""
-        if self.tests is None:
+        """One star for each level that the adjusted Wilcoxon p stays below, as far as so many scenes can give it.
+
+        What is exploratory has none.
+        """
+        if self.tests is None or self.exploratory:
             return ""
         possible = [level for level in LEVELS if smallest_p(len(self.scenes)) < level]
         return "*" * sum(self.tests.wilcoxon_holm < level for level in possible)
 
 
-def compare_with_rivals(values: Mapping[str, BySeed], reference: str, higher_is_better: bool) -> list[RivalComparison]:
-    """Compare a reference with every other method, each pair on their common scenes, seeds averaged first."""
+def compare_with_rivals(
+    values: Mapping[str, BySeed], reference: str, higher_is_better: bool, family: Sequence[Collection[str]] = ()
+) -> list[RivalComparison]:
+    """Compare a reference with every other method, each pair on their common scenes, seeds averaged first.
+
+    p-values are adjusted for the family: all methods that were to be compared, with or without values, each with all
+    names that it has; empty: those that have values.
+    """
     leads = {
         rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
         for rival, by_seed in values.items()
         if rival != reference
     }
-    tests = _adjusted({rival: _tested(own) for rival, own in leads.items() if len(own) >= FEWEST_SCENES})
+    rivals = [names for names in family or [[rival] for rival in leads] if reference not in names]
+    tests = _adjusted({rival: _tested(own) for rival, own in leads.items() if len(own) >= FEWEST_SCENES}, rivals)
     return [
         RivalComparison(
             rival=rival,
@@ -132,15 +143,19 @@ def _tested(leads: Mapping[str, float]) -> PairedTests:
     return PairedTests(wilcoxon, wilcoxon, t_test, t_test, t_interval(sample), cohen_dz(sample), rank_biserial(sample))
 
 
-def _adjusted(tests: Mapping[str, PairedTests]) -> dict[str, PairedTests]:
-    """The tests with p-values adjusted for the number of rivals tested."""
-    wilcoxon = _holm_by_name({rival: test.wilcoxon for rival, test in tests.items()})
-    t_test = _holm_by_name({rival: test.t_test for rival, test in tests.items() if test.t_test is not None})
+def _adjusted(tests: Mapping[str, PairedTests], rivals: Sequence[Collection[str]]) -> dict[str, PairedTests]:
+    """The tests with p-values adjusted for the rivals; the reference under another name is none."""
+    wilcoxon = _holm_by_name({rival: test.wilcoxon for rival, test in tests.items()}, rivals)
+    t_test = _holm_by_name({rival: test.t_test for rival, test in tests.items() if test.t_test is not None}, rivals)
     return {
-        rival: replace(test, wilcoxon_holm=wilcoxon[rival], t_test_holm=t_test.get(rival))
+        rival: replace(test, wilcoxon_holm=wilcoxon.get(rival, 1.0), t_test_holm=t_test.get(rival))
         for rival, test in tests.items()
     }
 
 
-def _holm_by_name(p_values: Mapping[str, float]) -> dict[str, float]:
-    return dict(zip(p_values, holm([*p_values.values()]), strict=True))
+def _holm_by_name(p_values: Mapping[str, float], rivals: Sequence[Collection[str]]) -> dict[str, float]:
+    """Of one rival under several names, the largest p counts, and once."""
+    tested = [[name for name in names if name in p_values] for names in rivals]
+    tested = [names for names in tested if names]
+    adjusted = holm([max(p_values[name] for name in names) for names in tested], len(rivals))
+    return {name: p for names, p in zip(tested, adjusted, strict=True) for name in names}

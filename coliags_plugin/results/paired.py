@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
@@ -87,15 +89,17 @@ def t_interval(differences: Differences, confidence: float = 0.95) -> tuple[floa
     return mean - reach, mean + reach
 
 
-def holm(p_values: list[float]) -> list[float]:
-    """p-values adjusted for their number by Holm's step-down procedure, in the given order.
+def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
+    """p-values adjusted by Holm's step-down procedure, in the given order.
+
+    They are adjusted for the size of their family, by default their number; those that are not there count as 1.
 
     Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
     """
-    count = len(p_values)
-    adjusted = [0.0] * count
+    count = len(p_values) if family is None else family
+    adjusted = [0.0] * len(p_values)
     largest = 0.0
-    for rank, index in enumerate(sorted(range(count), key=lambda index: p_values[index])):
+    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda index: p_values[index])):
         largest = max(largest, min(1.0, (count - rank) * p_values[index]))
         adjusted[index] = largest
     return adjusted

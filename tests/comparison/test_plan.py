@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
+
 import pytest
 
 from coliags_plugin.comparison.compare import make_request
+from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
 from coliags_plugin.comparison.plan_file import file_name
@@ -15,8 +18,8 @@ from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 
 
-def cells(wall, methods=("coliags",), *, seeds=1, protocol="paper", splits=(), steps=5, overrides=()):
-    return make_cells(make_request(methods, [wall], None, seeds, protocol, splits, steps, overrides))
+def cells(wall, methods=("coliags",), *, seeds=1, protocol="paper", splits=(), steps=5, overrides=(), **decided):
+    return make_cells(make_request(methods, [wall], None, seeds, protocol, splits, steps, overrides, **decided))
 
 
 def keys(wall, **options):
@@ -94,6 +97,10 @@ def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, 
         ({"seeds": 0}, "--seeds 0"),
         ({"steps": 0}, "--steps 0"),
         ({"splits": ["blok"]}, "no split 'blok'.*Did you mean 'block'"),
+        ({"reference": "coliags"}, "--reference without --primary"),
+        ({"primary": ["psnr"]}, "--primary without --reference"),
+        ({"reference": "3dgs", "primary": ["psnr"]}, "no method '3dgs'"),
+        ({"reference": "coliags", "primary": ["psnrs"]}, "no metric 'psnrs'.*Did you mean 'psnr'"),
         ({"protocol": "papre"}, "no protocol 'papre'.*Did you mean 'paper'"),
         ({"overrides": ["field.featurs=8"]}, "--set field.featurs=8.*Did you mean 'features'"),
     ],
@@ -101,3 +108,43 @@ def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, 
 def test_what_cannot_be_compared_is_refused(wall, options, told):
     with pytest.raises(InputError, match=told):
         cells(wall, **options)
+
+
+def requested(wall, methods, **options):
+    return make_request(methods, [wall], None, 1, "paper", (), 5, (), **options)
+
+
+def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
+    folder = ComparisonFolder(tmp_path / "comparison")
+    first = requested(wall, ["coliags"], reference="coliags", primary=["psnr", "depth_mse_inner"])
+    folder.check_extends(first)
+    folder.path.mkdir()
+    folder.record(first, make_cells(first), has_results=False)
+    decided = folder.plan().decided
+    assert (decided.reference, decided.primary) == ("coliags", ("psnr", "depth_mse_inner"))
+    assert decided.date == datetime.now(timezone.utc).date().isoformat()
+    folder.check_extends(first)
+    with pytest.raises(InputError, match="had decided coliags by psnr, depth_mse_inner when it was begun"):
+        folder.check_extends(requested(wall, ["coliags"], reference="coliags", primary=["psnr"]))
+    more = requested(wall, ["coliags", "3dgs"])
+    folder.check_extends(more)
+    folder.record(more, make_cells(more), has_results=True)
+    assert folder.plan().decided is not None
+    assert [(cell.method, cell.later) for cell in folder.plan().cells] == [("coliags", False), ("3dgs", True)]
+    changed = make_cells(requested(wall, [Variant("coliags", "coliags", ("field.features=8",))]))
+    folder.record(first, changed, has_results=True)
+    assert [(cell.method, cell.later) for cell in folder.plan().cells] == [("coliags", True), ("3dgs", True)]
+    folder.record(more, make_cells(more), has_results=False)
+    assert [cell.later for cell in folder.plan().cells] == [False, True]
+
+
+def test_nothing_is_decided_after_the_first_run(wall, tmp_path):
+    folder = ComparisonFolder(tmp_path / "comparison")
+    (folder.path / "results").mkdir(parents=True)
+    late = requested(wall, ["coliags"], reference="coliags", primary=["psnr"])
+    with pytest.raises(InputError, match="had decided nothing when it was begun"):
+        folder.check_extends(late)
+    plain = requested(wall, ["coliags"])
+    folder.record(plain, make_cells(plain), has_results=False)
+    with pytest.raises(InputError, match="had decided nothing"):
+        folder.check_extends(late)

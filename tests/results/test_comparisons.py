@@ -56,11 +56,23 @@ def test_a_comparison_is_the_references():
     assert [row.tests.wilcoxon_holm for row in rows] == pytest.approx(holm.tolist())
     assert rows[0].tests.t_test == pytest.approx(stats.ttest_rel(ours, rivals["x"]).pvalue)
     assert rows[2].tests.t_test is None  # all differences are -0.5
-    t_holm = multipletests([rows[0].tests.t_test, rows[1].tests.t_test], method="holm")[1]
-    assert [rows[0].tests.t_test_holm, rows[1].tests.t_test_holm] == pytest.approx(t_holm.tolist())
+    t_holm = multipletests([rows[0].tests.t_test, rows[1].tests.t_test, 1.0], method="holm")[1]
+    assert [rows[0].tests.t_test_holm, rows[1].tests.t_test_holm] == pytest.approx(t_holm[:2].tolist())
     assert rows[2].lead == pytest.approx(-0.5)
     assert (rows[2].better_on, rows[2].tests.rank_biserial) == (0, -1.0)
     assert rows[0].tests.interval[0] < rows[0].lead < rows[0].tests.interval[1]
+
+
+def test_p_values_are_adjusted_for_the_family():
+    rng = np.random.default_rng(3)
+    values = {name: one_seed(rng.normal(lead, 0.5, 8)) for name, lead in (("ours", 1.0), ("x", 0.5), ("y", 0.3))}
+    values |= {"ours again": values["ours"], "x again": values["x"]}
+    family = [("ours", "ours again"), ("x", "x again"), ("y",), ("planned",)]
+    rows = {row.rival: row.tests for row in compare_with_rivals(values, "ours", True, family)}
+    expected = multipletests([rows["x"].wilcoxon, rows["y"].wilcoxon, 1.0], method="holm")[1]
+    assert [rows[name].wilcoxon_holm for name in ("x", "y")] == pytest.approx(expected[:2].tolist())
+    assert rows["x again"].wilcoxon_holm == rows["x"].wilcoxon_holm
+    assert (rows["ours again"].wilcoxon_holm, rows["ours again"].t_test_holm) == (1.0, None)
 
 
 def test_lower_is_better_turns_the_lead():

@@ -136,6 +136,12 @@ def test_effect_sizes_by_hand():
     assert rank_biserial(np.array([0.0, 1.0, 2.0])) == 1.0
 
 
+@given(probabilities, st.integers(0, 4))
+def test_holm_counts_those_of_the_family_that_are_not_there_as_one(p_values, more):
+    expected = multipletests([*p_values, *[1.0] * more], method="holm")[1][: len(p_values)]
+    assert holm(p_values, len(p_values) + more) == pytest.approx(expected.tolist())
+
+
 def test_the_t_interval_is_scipys():
     sample = np.random.default_rng(5).gamma(2.0, size=8)
     reference = stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)

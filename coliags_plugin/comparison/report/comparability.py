@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import leaves
+from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.results.record import Result
 
 
@@ -104,6 +106,7 @@ def cautions(study: Study) -> list[str]:
     texts = [
         *_missing_scenes(study),
         *_unpaired_seeds(study),
+        *_later(study),
         *_steps(study),
         *_untrained_views(study),
         *_transparent(study),
@@ -153,6 +156,15 @@ def _unpaired_seeds(study: Study) -> list[str]:
     more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
     first = differing[0]
     return [f"The methods were trained with different seeds on {first}{more}; a mean over more seeds varies less."]
+
+
+def _later(study: Study) -> list[str]:
+    """Results that a comparison whose reference and metrics were decided did not plan before its first one."""
+    later = Counter(run.method for run in study.runs if not run.planned)
+    if study.decided is None or not later:
+        return []
+    each = ", ".join(f"{method} ({counted(count, 'result')})" for method, count in later.items())
+    return [f"Planned or changed after the first result, so that comparisons with them are exploratory: {each}."]
 
 
 def _steps(study: Study) -> list[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import starmap
+from dataclasses import replace
+from itertools import product, starmap
 
-from coliags_plugin.comparison.report.metric_columns import metric_columns
+from coliags_plugin.comparison.report.metric_columns import metric_columns, metric_title
 from coliags_plugin.comparison.report.metric_tables import shared_scenes, spreads
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -20,11 +21,12 @@ PREFERRED = "coliags"
 EXPLANATION = (
     "Lead: by how much the reference is better, mean over the scenes that both methods have; seeds are averaged "
     "first. 95 % t interval: of the mean lead over scenes, by Student's t. Smallest p: what the two-sided Wilcoxon "
-    "signed-rank test of so many scenes can give. Holm: adjusted for the number of rivals. "
+    "signed-rank test of so many scenes can give. Holm: adjusted for all rivals that were planned or given. "
     "Cohen's d: of paired samples, the mean lead over its standard deviation. Rank-biserial: matched-pairs "
     "correlation, 1 where the reference is better on every scene."
 )
 _SMALLEST_PRINTED = 1e-4
+_LATER = "planned or changed after the first result: exploratory"
 _TESTS = {
     "smallest": "Smallest p",
     "wilcoxon": "Wilcoxon p",
@@ -37,8 +39,10 @@ _TESTS = {
 
 
 def choose_reference(study: Study, chosen: str | None) -> str:
-    """The method that the others are compared with: the one chosen, else ``coliags``, else the best."""
+    """The method that the others are compared with: that chosen, else that decided, else ``coliags``, else the best."""
     if chosen is None:
+        if study.decided is not None and study.decided.reference in study.methods:
+            return study.decided.reference
         return PREFERRED if PREFERRED in study.methods else _best_method(study.parts[0])
     if chosen not in study.methods:
         known = ", ".join(study.methods)
@@ -59,12 +63,29 @@ def _best_method(part: Part) -> str:
 
 
 def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
-    """The reference compared with every other method by one metric; empty where it has no value."""
-    values = part.values(column.key)
+    """The reference compared with every other method shown, by one metric; empty where it has no value."""
+    study, values = part.study, part.values(column.key, hidden=True)
     if column.direction is None or not values[reference]:
         return []
     rivals = {method: by_scene for method, by_scene in values.items() if by_scene}
-    return compare_with_rivals(rivals, reference, column.direction == "higher")
+    compared = compare_with_rivals(rivals, reference, column.direction == "higher", study.family)
+    is_primary = is_decided(study, reference) and study.decided is not None and column.key in study.decided.primary
+    return [
+        replace(row, exploratory=not (is_primary and _planned(part, row, reference)))
+        for row in compared
+        if row.rival in study.methods
+    ]
+
+
+def is_decided(study: Study, reference: str) -> bool:
+    """Whether the reference is that which was decided before the first result."""
+    return study.decided is not None and study.decided.reference == reference
+
+
+def _planned(part: Part, row: RivalComparison, reference: str) -> bool:
+    """Whether all that a comparison is of was planned before the first result."""
+    pairs = product(row.scenes, (reference, row.rival))
+    return all(run.planned for scene, method in pairs for run in part.runs(scene, method))
 
 
 def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
@@ -87,7 +108,11 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
         columns=columns,
         rows=[
             {
-                "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
+                "over": TableCell(
+                    row.rival,
+                    style=part.study.methods.index(row.rival),
+                    note="" if _planned(part, row, reference) or part.study.decided is None else _LATER,
+                ),
                 "scenes": len(row.scenes),
                 "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
                 "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
@@ -95,6 +120,7 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
             }
             for row in compared
         ],
+        notes=["Exploratory: no stars"] if all(row.exploratory for row in compared) else [],
         count=part.title + (f", {unit}" if unit else ""),
         name=f"lead-{part.name}-{column.key}",
     )
@@ -121,10 +147,11 @@ def _signed(value: float, decimals: int) -> TableCell:
     return TableCell(f"+{text}" if value > 0 and text.strip("0.") else text, value)
 
 
-def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen: bool) -> list[str]:
+def statistics_text(study: Study, compared: Sequence[RivalComparison], reference: str, chosen: bool) -> list[str]:
     """Sentences on the unit, the number of scenes and the smallest possible p of one metric; or why no test is run.
 
-    A reference that was not chosen beforehand, but for being the best, is warned of.
+    They tell what was decided beforehand, and the family that p-values are adjusted for. A reference that was not
+    chosen beforehand, but for being the best, is warned of.
     """
     most = max((len(row.scenes) for row in compared), default=0)
     if not most:
@@ -136,7 +163,7 @@ def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen:
             f"{smallest_p_text(most)}; tests are run from {FEWEST_SCENES} scenes on "
             f"(p = {smallest_p_text(FEWEST_SCENES)})."
         ]
-    rivals = sum(row.tests is not None for row in compared)
+    rivals = sum(reference not in names for names in study.family)
     text = [
         f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
         f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or "
@@ -145,12 +172,46 @@ def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen:
     if min(1.0, rivals * smallest_p(most)) >= LEVELS[0]:
         needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
         text.append(f"No star is possible, as that is not below {p_text(LEVELS[0])}; it takes {needed} scenes.")
+    text += [*_family_text(study), _decision_text(study, reference)]
     if not chosen:
         text.append(
             f"{reference} is the reference because it came out best, so that the p-values are too small: choose one "
             "beforehand, with --reference."
         )
     return text
+
+
+def _family_text(study: Study) -> list[str]:
+    """Which rivals the adjustment counts without that they are shown, and which under several names once."""
+    results = {run.method for run in study.hidden}
+    unseen = [names[0] for names in study.family if not {*names} & {*study.methods}]
+    told = {
+        "not shown": [name for name in unseen if name in results],
+        "without a result that can be compared": [name for name in unseen if name not in results],
+        "the same under several names, and counted once": [" = ".join(names) for names in study.family if names[1:]],
+    }
+    return [
+        f"Of all methods that were planned or given, {what}: {', '.join(names)}."
+        for what, names in told.items()
+        if names
+    ]
+
+
+def _decision_text(study: Study, reference: str) -> str:
+    """What was decided before the first result, and what follows for the p-values."""
+    decided = study.decided
+    if decided is None:
+        return (
+            "All p-values are exploratory, without stars: reference and primary metrics were not decided before the "
+            "first run (`coliags compare --reference METHOD --primary METRIC`)."
+        )
+    text = (
+        f"Decided on {decided.date}, before the first run: {decided.reference} is compared with the others by "
+        f"{', '.join(map(metric_title, decided.primary))}."
+    )
+    if is_decided(study, reference):
+        return f"{text} p-values of other metrics are exploratory, without stars."
+    return f"{text} {reference} is another reference, so that all p-values are exploratory, without stars."
 
 
 def p_text(p: float, digits: int = 2) -> str:

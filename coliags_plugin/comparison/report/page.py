@@ -15,6 +15,7 @@ from coliags_plugin.comparison.report.leads import (
     PREFERRED,
     choose_reference,
     compare,
+    is_decided,
     lead_table,
     statistics_text,
 )
@@ -130,8 +131,8 @@ def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     blocks += [] if medians is None else [medians]
     shown = [column for column in columns if column.shown and compared[column.key]]
     if shown:
-        chosen = choices.reference is not None or reference == PREFERRED
-        blocks += [Paragraph(text) for text in statistics_text(compared[shown[0].key], reference, chosen)]
+        chosen = choices.reference is not None or reference == PREFERRED or is_decided(part.study, reference)
+        blocks += [Paragraph(text) for text in statistics_text(part.study, compared[shown[0].key], reference, chosen)]
     if shown and len(part.scenes) > 1:
         leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
         blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, PlannedCell, file_name, read_plan
+from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, ComparisonPlan, file_name, read_plan
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -26,17 +26,21 @@ _SEED = re.compile(r"s(\d+)-")
 def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
     """Read run folders, results files and folders of a comparison, and check that the results are comparable.
 
-    Of folders, the evaluation by a protocol is read. Methods, where named, are kept alone, in that order.
+    Of folders, the evaluation by a protocol is read. Methods, where named, are shown alone, in that order; the others
+    stay in the family that p-values are adjusted for.
     """
     if not paths:
         raise InputError("no results", "run folders, results files or the folder of a comparison", "Name at least one")
     runs: list[StudyRun] = []
     missing: list[MissingResult] = []
+    plans: list[ComparisonPlan] = []
     for path in paths:
         if not path.is_dir():
             runs.append(_read_file(path, path.stem))
         elif _is_comparison(path):
-            results, failed = _read_comparison(path, protocol)
+            plan = read_plan(path)
+            results, failed = _read_comparison(path, plan, protocol)
+            plans += [] if plan is None else [plan]
             runs += results
             missing += failed
         else:
@@ -44,11 +48,45 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     _refuse_twice(runs)
     if not runs:
         raise _nothing_yet(paths, missing)
+    planned = [(entry.method, entry.key) for plan in plans for entry in plan.cells]
+    planned += [(one.method, "") for one in missing]
+    with_results = {run.method for run in runs}
     runs = disambiguate_labels(runs)
-    if methods:
-        runs, missing = _only(methods, runs, missing)
-    refuse_incomparable(runs)
-    return Study(tuple(runs), tuple(missing))
+    keys = [(run.method, run.result.key) for run in runs]
+    family = _one_methods([*keys, *(each for each in planned if each[0] not in with_results)])
+    decisions = {plan.decided for plan in plans}
+    shown, missing = _only(methods, runs, missing) if methods else (runs, missing)
+    refuse_incomparable(shown)
+    return Study(
+        tuple(shown),
+        tuple(missing),
+        tuple(_comparable([run for run in runs if methods and run.method not in methods], shown)),
+        family,
+        decisions.pop() if len(decisions) == 1 else None,
+    )
+
+
+def _one_methods(keys: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
+    """Names of one method together: those with the key of a result in common; without a key, a name stands alone."""
+    owner: dict[str, str] = {}
+    first: dict[str, str] = {}
+    for name, key in keys:
+        first.setdefault(name, name)
+        other = owner.setdefault(key or name, name)
+        if other != name:
+            first[name] = first[other]
+    return tuple(tuple(name for name in first if first[name] == one) for one in dict.fromkeys(first.values()))
+
+
+def _comparable(hidden: Sequence[StudyRun], shown: Sequence[StudyRun]) -> Iterator[StudyRun]:
+    """The runs of those methods that are comparable with what is shown."""
+    for name in dict.fromkeys(run.method for run in hidden):
+        own = [run for run in hidden if name == run.method]
+        try:
+            refuse_incomparable([*shown, *own])
+        except InputError:
+            continue
+        yield from own
 
 
 def _only(
@@ -101,26 +139,26 @@ def _is_comparison(folder: Path) -> bool:
     return (folder / PLAN_FILE).is_file() or (folder / RESULTS).is_dir() or any(folder.glob(_CELL))
 
 
-def _read_comparison(folder: Path, protocol: str) -> tuple[list[StudyRun], list[MissingResult]]:
+def _read_comparison(
+    folder: Path, plan: ComparisonPlan | None, protocol: str
+) -> tuple[list[StudyRun], list[MissingResult]]:
     """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan."""
-    plan = read_plan(folder)
     if plan is not None:
-        return _read_planned(folder, plan.cells, protocol)
+        return _read_planned(folder, plan, protocol)
     if (folder / RESULTS).is_dir():
         return _read_unplanned(folder / RESULTS, folder / RUNS, protocol), list(_read_failures(folder))
     return _read_unplanned(folder, None, protocol), []
 
 
-def _read_planned(
-    folder: Path, cells: Sequence[PlannedCell], protocol: str
-) -> tuple[list[StudyRun], list[MissingResult]]:
+def _read_planned(folder: Path, plan: ComparisonPlan, protocol: str) -> tuple[list[StudyRun], list[MissingResult]]:
     found, missing = [], []
     runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
-    for entry in (entry for entry in cells if entry.protocol == protocol):
+    for entry in (entry for entry in plan.cells if entry.protocol == protocol):
         file = folder / entry.result
         if file.is_file():
             own = _with_images(folder / entry.run, protocol)
-            one = replace(_read_file(file, file.stem, own), method=entry.method)
+            is_planned = plan.decided is not None and not entry.later
+            one = replace(_read_file(file, file.stem, own), method=entry.method, planned=is_planned)
             if own is not None:
                 runs[one.result.key] = own
             found.append(one)
@@ -128,7 +166,7 @@ def _read_planned(
             failure = folder / FAILURES / Path(entry.result).relative_to(RESULTS)
             reason = _failure_reason(failure) if failure.is_file() else None
             missing.append(MissingResult(entry.scene, entry.method, entry.seed, reason))
-    _refuse_other_protocols(folder, protocol, {entry.protocol for entry in cells})
+    _refuse_other_protocols(folder, protocol, {entry.protocol for entry in plan.cells})
     return [replace(one, run=one.run or runs.get(one.result.key)) for one in found], missing
 
 

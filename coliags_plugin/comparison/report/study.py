@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
+from coliags_plugin.comparison.plan_file import Decision
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.results.comparisons import BySeed
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
@@ -23,6 +24,7 @@ class StudyRun:
     file: Path  # its results file
     stamp: str  # name of its run folder or results file
     run: Path | None = None  # folder with the images of this evaluation; None: only the results file is there
+    planned: bool = False  # whether its comparison had it in its plan, with a decision, before the first result
 
     @property
     def scene(self) -> str:
@@ -90,14 +92,14 @@ class Part:
         records = (self.record(run) for run in self.study.runs if run.scene == scene)
         return next((record.frames for record in records if record is not None), ())
 
-    def values(self, metric: str) -> dict[str, BySeed]:
-        """Means over the frames, by method, scene and seed; empty where a method has none."""
-        values: dict[str, dict[str, dict[int, float]]] = {method: {} for method in self.study.methods}
-        for run in self.study.runs:
-            record = self.record(run)
+    def values(self, metric: str, hidden: bool = False) -> dict[str, BySeed]:
+        """Means over the frames, by method, scene and seed; empty where a method has none. Hidden methods on demand."""
+        values: dict[str, dict[str, dict[int, float]]] = {}
+        for run in (*self.study.runs, *(self.study.hidden if hidden else ())):
+            own, record = values.setdefault(run.method, {}), self.record(run)
             mean = None if record is None else record.mean(metric)
             if mean is not None:
-                values[run.method].setdefault(run.scene, {})[run.result.seed] = mean
+                own.setdefault(run.scene, {})[run.result.seed] = mean
         return dict(values)
 
     def frame_means(self, scene: str, method: str, metric: str) -> dict[str, float]:
@@ -127,11 +129,15 @@ class Study:
 
     runs: tuple[StudyRun, ...]  # at least one
     missing: tuple[MissingResult, ...] = ()  # cells without a result
+    hidden: tuple[StudyRun, ...] = ()  # of methods that are not shown, as far as they are comparable
+    family: tuple[tuple[str, ...], ...] = ()  # all methods that were planned or given, with all names that each has
+    decided: Decision | None = None  # before the first result
 
     def anonymous(self) -> Study:
         """The same without absolute paths."""
         runs = tuple(replace(run, result=_without_places(run.result)) for run in self.runs)
-        return Study(runs, tuple(replace(one, reason=without_places(one.reason)) for one in self.missing))
+        missing = tuple(replace(one, reason=without_places(one.reason)) for one in self.missing)
+        return replace(self, runs=runs, missing=missing)
 
     @cached_property
     def by_method(self) -> dict[str, list[StudyRun]]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from coliags_plugin.comparison.plan_file import Decision
+from coliags_plugin.comparison.report.study import Study
 from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
 from coliags_plugin.results.reading import write_result
 from coliags_plugin.results.record import (
@@ -176,6 +179,13 @@ def write_comparison(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"reason": reason}))
     return folder
+
+
+def decided(study: Study, *primary: str, reference: str = "coliags") -> Study:
+    """The study as of a comparison that decided its reference and primary metrics before the first run."""
+    runs = tuple(replace(run, planned=True) for run in study.runs)
+    decision = Decision(reference=reference, primary=primary, date="2026-11-01")
+    return replace(study, runs=runs, decided=decision)
 
 
 def made_scenes(methods: Mapping[str, float], scenes: int = 8, seeds: int = 1, **options) -> list[Result]:

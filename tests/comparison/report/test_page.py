@@ -19,7 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_cell
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import MetricRecord
-from tests.comparison.report.made import FRAMES, NO_LPIPS, made_scenes, result_of, write_comparison
+from tests.comparison.report.made import FRAMES, NO_LPIPS, decided, made_scenes, result_of, write_comparison
 
 
 def blocks_of(section):
@@ -242,7 +242,7 @@ def test_reference(study_of):
 )  # fmt: skip
 def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
     methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
-    page = of(study_of, made_scenes(methods, scenes))
+    page = text_page(decided(study_of(made_scenes(methods, scenes)), "psnr"), Choices())
     assert said in paragraphs(page)
     table = tables(page)["summary-test"]
     stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
@@ -262,7 +262,41 @@ def test_a_rival_with_few_scenes_is_not_tested(study_of):
     assert entries(lead, "wilcoxon")["2dgs"].note == "fewer than 6 scenes in common"
     assert entries(lead, "wilcoxon")["3dgs"].text == ".0078"
     assert entries(lead, "smallest")["3dgs"].text == ".00781"
-    assert "for 1 rival" in paragraphs(page)
+    assert "for 2 rivals" in paragraphs(page)
+    assert entries(lead, "wilcoxon_holm")["3dgs"].text == ".016"
+
+
+def stars(page, metric, name="summary-test"):
+    return {method: cell.stars for method, cell in entries(tables(page)[name], metric).items() if cell.stars}
+
+
+def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
+    study = study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0}))
+    page = text_page(study, Choices())
+    assert "All p-values are exploratory, without stars" in paragraphs(page)
+    assert not stars(page, "psnr") and page.cautions == []
+    assert tables(page)["lead-test-psnr"].notes == ["Exploratory: no stars"]
+    page = text_page(decided(study, "depth_mse"), Choices())
+    assert stars(page, "depth_mse") == {"3dgs": "*", "2dgs": "*"} and not stars(page, "psnr")
+    assert "Decided on 2026-11-01, before the first run: coliags is compared with the others by Depth MSE" in (
+        paragraphs(page)
+    )
+    assert tables(page)["lead-test-depth_mse"].notes == []
+    other = text_page(decided(study, "psnr"), Choices(reference="3dgs"))
+    assert not stars(other, "psnr") and "3dgs is another reference" in paragraphs(other)
+    best = text_page(decided(study, "psnr", reference="2dgs"), Choices())
+    assert stars(best, "psnr") == {"coliags": "*", "3dgs": "*"} and "came out best" not in paragraphs(best)
+
+
+def test_what_was_planned_after_the_first_result_is_exploratory(study_of):
+    study = decided(study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0})), "psnr")
+    runs = tuple(replace(run, planned=(run.method, run.scene) != ("2dgs", "scene-8")) for run in study.runs)
+    page = text_page(replace(study, runs=runs), Choices())
+    assert stars(page, "psnr") == {"3dgs": "*"}
+    assert entries(tables(page)["lead-test-psnr"], "over")["2dgs"].note.startswith("planned or changed after")
+    assert page.cautions == [
+        "Planned or changed after the first result, so that comparisons with them are exploratory: 2dgs (1 result)."
+    ]
 
 
 @pytest.mark.parametrize(

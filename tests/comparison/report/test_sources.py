@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 
 import pytest
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
+from coliags_plugin.comparison.report.leads import compare
+from coliags_plugin.comparison.report.page import Choices, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.reporting.model import Column, Paragraph
 from coliags_plugin.results.reading import write_result
 from tests.comparison.report.made import FRAMES, made_scenes, result_of, write_comparison, write_run
 
@@ -90,7 +95,7 @@ def test_failures_are_kept_unless_there_is_a_result(tmp_path):
     assert (failure.scene, failure.method, failure.seed, failure.reason) == failed
 
 
-def plan(folder, results, *more):
+def plan(folder, results, *more, decided=None, later=()):
     """The plan of results, and of cells (scene, method, seed) without one."""
     cells = []
     for result in results:
@@ -102,7 +107,10 @@ def plan(folder, results, *more):
          "result": f"results/{place}.json"}
         for scene, method, seed, place in cells
     ]  # fmt: skip
-    (folder / "plan.json").write_text(json.dumps({"format": "coliags-comparison", "cells": entries}))
+    for entry in entries:
+        entry["later"] = entry["scene"] in later
+    content = {"format": "coliags-comparison", "decided": decided, "cells": entries}
+    (folder / "plan.json").write_text(json.dumps(content))
 
 
 def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
@@ -125,6 +133,75 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
     text = (folder / "plan.json").read_text()
     (folder / "plan.json").write_text(text.replace('"results/', '"elsewhere/'))
     refuses([folder], "plan.json: cells.0.result: String should match pattern")
+
+
+@pytest.fixture
+def compared(tmp_path):
+    """A comparison of four methods on eight scenes, one of them under two names, and of one without results."""
+    results = made_scenes({"coliags": 1.0, "a": 0.7, "b": 0.6, "c": 0.9})
+    results += [one.model_copy(update={"method": "row-5"}) for one in results if one.method == "coliags"]
+    folder = write_comparison(tmp_path / "comparison", results)
+    plan(folder, results, ("scene-1", "later", 0))
+    return folder
+
+
+def holm_of(study):
+    (part,) = [part for part in study.parts if part.set_name == "test"]
+    column = Column("psnr", direction="higher")
+    return {row.rival: row.tests.wilcoxon_holm for row in compare(part, column, "coliags")}
+
+
+def test_methods_that_are_not_shown_stay_in_the_family(compared):
+    whole = read_study([compared])
+    names = (("coliags", "row-5"), ("a",), ("b",), ("c",), ("later",))
+    assert whole.family == names
+    adjusted = holm_of(whole)
+    raw = {name: stats.wilcoxon(*(values_of(whole, each) for each in ("coliags", name))).pvalue for name in "abc"}
+    expected = multipletests([*raw.values(), 1.0], method="holm")[1]  # later may have any p
+    assert [adjusted[name] for name in "abc"] == pytest.approx(expected[:3].tolist())
+    assert adjusted["row-5"] == 1.0
+    for shown in (["coliags", "a"], ["b", "coliags"], ["coliags", "row-5", "c"]):
+        study = read_study([compared], methods=shown)
+        assert (study.methods, study.family) == (shown, names)
+        assert holm_of(study) == {name: adjusted[name] for name in shown if name != "coliags"}
+
+
+def values_of(study, method):
+    return [run.result.sets["test"].mean("psnr") for run in study.runs if run.method == method]
+
+
+def test_the_report_tells_the_family(compared):
+    page = text_page(read_study([compared], methods=["coliags", "a"]), Choices())
+    said = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
+    assert "after Holm's adjustment for 4 rivals" in said
+    assert "given, not shown: b, c." in said and "without a result that can be compared: later." in said
+    assert "the same under several names, and counted once: coliags = row-5." in said
+
+
+def test_what_is_not_comparable_with_what_is_shown_still_counts(tmp_path):
+    files = [tmp_path / f"{index}.json" for index in range(3)]
+    for file, result in zip(
+        files, [result_of("coliags"), result_of("3dgs"), result_of("2dgs", split="block")], strict=True
+    ):
+        write_result(file, result)
+    study = read_study(files, methods=["coliags", "3dgs"])
+    assert study.hidden == () and study.family == (("coliags",), ("3dgs",), ("2dgs",))
+
+
+def test_a_decision_holds_where_all_plans_have_it(tmp_path):
+    decision = {"reference": "coliags", "primary": ["psnr"], "date": "2026-11-01"}
+    folders = [
+        write_comparison(tmp_path / name, [result_of(name, scene) for scene in "pq"]) for name in ("coliags", "3dgs")
+    ]
+    for folder, name in zip(folders, ("coliags", "3dgs"), strict=True):
+        plan(folder, [result_of(name, scene) for scene in "pq"], decided=decision, later={"q"})
+    study = read_study(folders)
+    assert study.decided.primary == ("psnr",)
+    assert [(run.scene, run.planned) for run in study.runs] == [("p", True), ("q", False)] * 2
+    plan(folders[1], [result_of("3dgs", scene) for scene in "pq"])
+    study = read_study(folders)
+    assert study.decided is None
+    assert [run.planned for run in study.runs] == [True, False, False, False]
 
 
 def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
