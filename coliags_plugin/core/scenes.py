@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -314,6 +314,19 @@ class Scene:
         for frame in self.train[:: max(1, len(self.train) // 16)]:
             camera = frame.camera.to(points.device, points.dtype)
             yield camera, *camera.sees(points)
+
+
+def held_out_uses(used: Mapping[str, Sequence[str] | None]) -> list[str]:
+    """Sentences on a scene whose provenance has this ``held_out_used``: test frames by what was made from their images.
+
+    None stands for an unknown choice of frames.
+    """
+    return [
+        f"its {what} may come from images of held-out frames, as it is not recorded which it was made from"
+        if names is None
+        else f"its {what} comes from images of {len(names)} held-out frames too, whose scores are too good for that"
+        for what, names in used.items()
+    ]
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:

@@ -16,6 +16,7 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import sizes_text
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
@@ -119,6 +120,7 @@ class RecordedDataManager(DataManager):
             "fingerprint": recording.fingerprint,
             "split": split,
             "points": described,
+            **_held_out_used(recording, test_indices),
             "frames": {
                 "in_sequence": len(recording.shots),
                 "train": len(train),
@@ -194,6 +196,17 @@ class RecordedDataManager(DataManager):
         if isinstance(source, Path) and source.is_file():
             facts["sha256"] = file_sha256(source)
         return facts
+
+
+def _held_out_used(recording: Recording, test: Sequence[int]) -> JsonObject:
+    """Provenance ``held_out_used``: by what was estimated from images of test frames, their names; None: unknown."""
+    sources: dict[str, Any] = {"depth": None} if any(shot.confidence for shot in recording.shots) else {}
+    used = {
+        what: indices if indices is None else [recording.shots[index].name for index in test if index in indices]
+        for what, indices in (sources | dict(recording.made_from)).items()
+    }
+    used = {what: names for what, names in used.items() if names is None or names}
+    return {"held_out_used": used} if test and used else {}
 
 
 def _invalid_depth_share(frames: Sequence[Frame]) -> float | None:

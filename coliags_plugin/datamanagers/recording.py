@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,6 +64,8 @@ class Recording:
     own_split: Mapping[str, Sequence[int]] | None = None  # the dataset's: "train" and "test" indices into ``shots``
     own_points: Callable[[], PointCloud] | None = None  # reads the dataset's initial points; None where there are none
     points_source: Path | None = None  # the file or folder of these points
+    #: Indices into ``shots`` of the images that "depth", or "points" with their depth, were made from, where known.
+    made_from: Mapping[str, Collection[int]] = field(default_factory=dict)
 
 
 #: Bytes read at once.

@@ -40,7 +40,7 @@ from coliags_plugin.results.record import (
 SEEN_METRICS = ("psnr", "psnr_gain_fitted", "ssim", "depth_mse", "depth_median_error")
 
 #: Keys of the provenance of a run and of its scene that a result has in another place, or that name a local path.
-_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint")
+_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint", "held_out_used")
 
 
 class EvaluatedSet:
@@ -172,6 +172,7 @@ def run_result(
             "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
             "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
             "scene": {name: value for name, value in data.provenance.items() if name not in _LEFT_OUT},
+            **{name: used for name in ("held_out_used",) if (used := trained.scene.provenance.get(name))},
             **({"learned": learned} if (learned := trained.model.learned) else {}),
             **({} if truth is None else {"truth": _described(truth, trained.scene)}),
         },

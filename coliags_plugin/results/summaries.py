@@ -22,7 +22,7 @@ def means_summary(result: Result) -> dict[str, Any]:
         "scene": result.scene.name,
         "step": result.steps,
         "untrained_views": result.provenance.get("untrained_views", {}),
-        **{name: result.provenance[name] for name in ("learned",) if name in result.provenance},
+        **{name: result.provenance[name] for name in ("held_out_used", "learned") if name in result.provenance},
         **{name: main.mean(name) for name in protocols_own},
         "reasons": reasons,
         "directions": {name: metric.direction for name, metric in result.metrics.items()},

@@ -117,6 +117,14 @@ def test_points_are_initial_points(scene_folder):
         assert known[tuple(position)] == tuple(color)
 
 
+def test_points_that_test_frames_observe_are_told(scene_folder):
+    scene = load(scene_folder)
+    observing = [frame.name for frame in scene.test_sets["test"] if frame.sparse_depth is not None]
+    assert observing
+    assert scene.provenance["held_out_used"] == {"points": observing}
+    assert "held_out_used" not in load(scene_folder, split="all-train").provenance
+
+
 def test_scale_makes_millimetres(tmp_path):
     write_colmap(tmp_path, unit=25.0)
     raw, metric = load(tmp_path), load(tmp_path, scale=25.0)

@@ -314,6 +314,7 @@ def test_the_fingerprint_sees_the_file(folder):
         ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
         ({"train_filenames": ["images/frame_0001.png"]}, r"train_filenames names .*Did you mean"),
         ({"train_filenames": "all"}, "train_filenames is not a list"),
+        ({"depth_estimated_from": ["images/frame_1.png"]}, r"depth_estimated_from names .*Did you mean"),
         (
             {"train_filenames": ["images/frame_00001.png"], "test_filenames": ["images/frame_00001.png"]},
             "is in train_filenames and test_filenames",

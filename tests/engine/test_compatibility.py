@@ -28,6 +28,14 @@ def start(folder, overrides=(), method="scaffold-gs", scene=None):
     return Trainer(loaded, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
 
 
+def test_what_was_made_from_held_out_images_is_warned_of(tmp_path, caplog):
+    scene, used = wall_scene(), {"depth": ["0004", "0008"]}
+    start(tmp_path / "own", scene=scene)
+    assert "held-out" not in caplog.text
+    start(tmp_path / "other", scene=replace(scene, provenance={**scene.provenance, "held_out_used": used}))
+    assert f"scene '{scene.name}': its depth comes from images of 2 held-out frames too" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("method", "overrides", "message"),
     [

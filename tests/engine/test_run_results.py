@@ -32,12 +32,13 @@ STEPS = 6
 
 @pytest.fixture(scope="module")
 def scene():
-    """With a second test set, whose frames have seen masks."""
+    """With a second test set, whose frames have seen masks, and points from a test frame's image."""
     made = wall_scene()
     left = torch.zeros(24, 32, dtype=torch.bool)
     left[:, :16] = True
     turned = [replace(frame, name=f"turned-{frame.name}", seen=left) for frame in made.test_sets["test"]]
-    return replace(made, test_sets={**made.test_sets, "rotation": turned})
+    provenance = {**made.provenance, "held_out_used": {"points": ["0000"]}}
+    return replace(made, test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +99,7 @@ def test_it_says_what_the_run_was(result, whole, scene):
     assert (result.scene.name, result.scene.size) == ("wall", (32, 24))
     assert result.software["package_version"] == __version__
     assert result.provenance["training"]["renderer"] == "cpu"
+    assert result.provenance["held_out_used"] == means_summary(result)["held_out_used"] == {"points": ["0000"]}
 
 
 def test_its_values_are_those_of_the_metrics(result, whole, scene):

@@ -176,6 +176,7 @@ def test_held_out_frames_are_written_and_see_nothing(tmp_path):
     scene = open_scene(tmp_path / "scene")
     assert [frame.name for frame in scene.test_sets["test"]] == ["0000", "0008"]
     assert all(frame.sparse_depth is None and frame.mask is None for frame in scene.test_sets["test"])
+    assert "held_out_used" not in scene.provenance
     assert all(len(frame.sparse_depth.depth) > 20 for frame in scene.train)
     assert all((frame.mask == mask).all() for frame in scene.train)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import held_out_uses
 from coliags_plugin.reporting.model import leaves
 from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.results.record import Result
@@ -110,6 +111,7 @@ def cautions(study: Study) -> list[str]:
         *_steps(study),
         *_untrained_views(study),
         *_transparent(study),
+        *_held_out_used(study),
     ]
     for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
         if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
@@ -191,6 +193,15 @@ def _transparent(study: Study) -> list[str]:
         for name, part in run.result.sets.items()
         if part.transparency_warning
     ]
+
+
+def _held_out_used(study: Study) -> list[str]:
+    texts = [
+        f"{run.scene}, split {run.result.scene.split}: {use}."
+        for run in study.runs
+        for use in held_out_uses(run.result.provenance.get("held_out_used", {}))
+    ]
+    return list(dict.fromkeys(texts))
 
 
 def _differing_data(results: Sequence[Result]) -> list[str]:

@@ -149,6 +149,7 @@ class ColmapDataManager(RecordedDataManager):
             fingerprint=fingerprint(path, [*paths, *masks, *depths], model.files),
             own_points=(lambda: self._points(model)) if len(model.positions) else None,
             points_source=model.files[-1],
+            made_from={"points": [index for index, image in enumerate(model.images) if len(image.points)]},
         )
 
     def _model_folder(self, path: Path) -> Path:

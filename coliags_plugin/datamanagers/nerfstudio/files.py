@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import posixpath
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,6 +19,8 @@ from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.geometry.lenses.models import Lens
 
 FILE = "transforms.json"
+#: Key of the list of frames that estimated depth was made from.
+ESTIMATED_FROM = "depth_estimated_from"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 
@@ -96,16 +98,20 @@ class Transforms:
         listed = {part: self.content.get(f"{part}_filenames") for part in ("train", "val", "test")}
         if not listed["train"]:
             return None
-        index_of = {posixpath.normpath(name): index for index, name in enumerate(names)}
         test = "test" if listed["test"] else "val"
         chosen = {
-            "train": self._indices("train_filenames", listed["train"], index_of),
-            "test": self._indices(f"{test}_filenames", listed[test] or [], index_of),
+            "train": self._indices("train_filenames", listed["train"], names),
+            "test": self._indices(f"{test}_filenames", listed[test] or [], names),
         }
         if both := set(chosen["train"]) & set(chosen["test"]):
             name = names[min(both)]
             raise InputError(f"{self.path}: {name} is in train_filenames and {test}_filenames", "one of the two")
         return chosen
+
+    def made_from(self, names: Sequence[str]) -> dict[str, list[int]]:
+        """Indices among ``names`` of the frames that estimated depth was made from, if the file tells."""
+        listed = self.content.get(ESTIMATED_FROM)
+        return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed, names)}
 
     def depth_unit(self) -> float | None:
         """World units before applied_scale per stored depth unit; None if not given."""
@@ -113,7 +119,8 @@ class Transforms:
             return None
         return read_number(self.content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
 
-    def _indices(self, key: str, listed: Any, index_of: Mapping[str, int]) -> list[int]:
+    def _indices(self, key: str, listed: Any, names: Sequence[str]) -> list[int]:
+        index_of = {posixpath.normpath(name): index for index, name in enumerate(names)}
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{self.path}: {key} is not a list of names", "file_paths of frames")
         unknown = [name for name in listed if posixpath.normpath(name) not in index_of]

@@ -124,6 +124,7 @@ class NerfstudioDataManager(RecordedDataManager):
             facts=facts,
             fingerprint=fingerprint(path, [*images, *others], [file]),
             own_split=transforms.split(names),
+            made_from=transforms.made_from(names),
             own_points=own_points,
             points_source=source,
         )

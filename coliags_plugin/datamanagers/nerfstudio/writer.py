@@ -13,6 +13,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.datamanagers.nerfstudio.files import ESTIMATED_FROM
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 _POINTS = "points.ply"
@@ -63,16 +64,18 @@ class EstimatedSceneWriter:
         self,
         positions: Float[np.ndarray, "N 3"],
         colors: UInt8[np.ndarray, "N 3"],
+        sources: Sequence[str],
         split: tuple[Sequence[str], Sequence[str]] | None,
     ) -> None:
-        """Write the initial points and ``transforms.json``; ``split`` names training and test frames."""
+        """Write the initial points and ``transforms.json``.
+
+        ``sources`` names the frames that depth and points were made from, ``split`` training and test frames.
+        """
         write_ply(self.folder / _POINTS, point_properties(positions, colors))
-        lists = {}
+        listed = {ESTIMATED_FROM: sources}
         if split is not None:
-            lists = {
-                f"{part}_filenames": [f"images/{name}.png" for name in names]
-                for part, names in zip(("train", "test"), split, strict=True)
-            }
+            listed |= {"train_filenames": split[0], "test_filenames": split[1]}
+        lists = {key: [f"images/{name}.png" for name in names] for key, names in listed.items()}
         content = {
             "camera_model": "OPENCV",
             "depth_unit_scale_factor": self.depth_unit,

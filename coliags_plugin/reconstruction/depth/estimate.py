@@ -38,11 +38,16 @@ _HELD, _HELD_PIXELS = 40, 12_000_000
 
 
 class Estimation:
-    """Estimation of the depth of a video of pinhole cameras, resumable at every frame of every pass."""
+    """Estimation of the depth of a video of pinhole cameras, resumable at every frame of every pass.
+
+    A frame's depth is made of its own image and those of neighbours among ``sources``, indices of frames; that of the
+    sources themselves depends on no other image.
+    """
 
     def __init__(
         self,
         frames: Sequence[Frame],
+        sources: Sequence[int],
         prior: DepthPrior,
         depth_range: DepthRange,
         settings: DepthEstimationSettings,
@@ -50,8 +55,8 @@ class Estimation:
         jobs: int = 1,
         progress: Progress | None = None,
     ) -> None:
-        check_video(frames)
         self.frames, self.prior, self.range, self.settings = frames, prior, depth_range, settings
+        self.sources = sources
         self.work, self.jobs, self.progress = work, jobs, progress
         camera = frames[0].camera
         self.held = max(_HELD, _HELD_PIXELS // (camera.width * camera.height))
@@ -83,7 +88,7 @@ class Estimation:
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
         neighbours: list[list[int]] = self.work.value(
             f"neighbours-{number}",
-            lambda: choose_neighbours(centers, axes, self.medians, sweep.baselines, self.settings),
+            lambda: choose_neighbours(centers, axes, self.sources, self.medians, sweep.baselines, self.settings),
         )
         lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in neighbours)
         if lonely == len(neighbours):
@@ -186,9 +191,9 @@ def _one_thread_of_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def check_video(frames: Sequence[Frame]) -> None:
-    """Check that a video can give depth at all."""
-    check_motion(frames, FEWEST_FRAMES)
+def check_video(frames: Sequence[Frame], sources: Sequence[int]) -> None:
+    """Check that a video can give depth at all, from the frames of these indices."""
+    check_motion([frames[index] for index in sources], FEWEST_FRAMES)
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         raise InputError(
@@ -202,11 +207,12 @@ def check_video(frames: Sequence[Frame]) -> None:
 def choose_neighbours(
     centers: Float[np.ndarray, "N 3"],
     axes: Float[np.ndarray, "N 3"],
+    sources: Sequence[int],
     depths: Sequence[float],
     baselines: Sequence[float],
     settings: DepthEstimationSettings,
 ) -> list[list[int]]:
-    """Neighbours of every frame of a video: for each baseline the first frame so far away, before and after it.
+    """Neighbours of every frame of a video: for each baseline the first source so far away, before and after it.
 
     Where the video ends on one side, the other gives more frames, farther away. A pause adds no frames, as they are
     chosen by distance (in units of the frame's median depth), not by number.
@@ -214,11 +220,12 @@ def choose_neighbours(
     baselines = sorted(baselines)
     farther = [baselines[-1] + (baselines[-1] / len(baselines)) * step for step in range(1, len(baselines) + 1)]
     least_cosine = np.cos(np.radians(settings.max_turn))
+    candidates = np.asarray(sources)
     neighbours = []
     for index in range(len(centers)):
         distance = np.linalg.norm(centers - centers[index], axis=1) / depths[index]
         is_candidate = (axes @ axes[index] >= least_cosine) & (distance <= settings.max_baseline)
-        before, after = np.arange(index - 1, -1, -1), np.arange(index + 1, len(centers))
+        before, after = candidates[candidates < index][::-1], candidates[candidates > index]
         sides = [_first_beyond(distance, side, is_candidate, baselines) for side in (before, after)]
         for own, other, side in ((0, 1, before), (1, 0, after)):
             lacking = len(baselines) - len(sides[other])

@@ -35,7 +35,7 @@ _KNOWN = 0.5
 #: Shares of the known pixels between whose depths the summary's range is, and the number of logarithmic bins of depth.
 _SHARES, _BINS = (0.01, 0.99), 2000
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 5
+_VERSION = 6
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 
@@ -62,18 +62,22 @@ def estimate_scene(
 ) -> EstimatedDepth:
     """Estimate the depth of a posed scene's video, and write it as a scene in nerfstudio's layout.
 
-    Training and test frames take part; test sets of their own do not. Work files stay beside ``out`` until all is
-    written, and the same request resumes from them.
+    The depth of training frames, the range and the points are made of training frames alone; that of a test frame of
+    its own image and training frames. Test sets of other names are left out. Work files stay beside ``out`` until all
+    is written, and the same request resumes from them.
     """
     frames = scene.video
+    trained = {frame.name for frame in scene.train}
+    sources = [index for index, frame in enumerate(frames) if frame.name in trained]
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
-    check_video(frames)
+    check_video(frames, sources)
     prior: DepthPrior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
     described = {
         "version": _VERSION,
         "data": scene.provenance["fingerprint"],
         "frames": [frame.name for frame in frames],
+        "sources": sources,
         "size": [frames[0].camera.width, frames[0].camera.height],
         "poses": [frame.camera.camera_to_world.flatten().tolist() for frame in frames],
         "settings": request.settings.model_dump(),
@@ -81,9 +85,9 @@ def estimate_scene(
         "prior": prior.described(),
     }
     with work_folder(out, described) as work:
-        depth_range = _range(frames, request, work, progress)
+        depth_range = _range(frames, sources, request, work, progress)
         jobs = request.jobs or os.cpu_count() or 1
-        estimation = Estimation(frames, prior, depth_range, request.settings, work, jobs, progress)
+        estimation = Estimation(frames, sources, prior, depth_range, request.settings, work, jobs, progress)
         estimation.run()
         with atomic_folder(out, overwrite) as folder:
             estimated = _write(scene, frames, estimation, folder, progress)
@@ -99,12 +103,20 @@ def training_options(scene: Scene) -> list[str]:
     return options
 
 
-def _range(frames: Sequence[Frame], request: DepthRequest, work: WorkFolder, progress: Progress | None) -> DepthRange:
+def _range(
+    frames: Sequence[Frame],
+    sources: Sequence[int],
+    request: DepthRequest,
+    work: WorkFolder,
+    progress: Progress | None,
+) -> DepthRange:
+    """The range stated, or that of the sources; other frames' medians are interpolated between theirs."""
     if request.near_far is not None:
         return given_range(*request.near_far, len(frames))
-    settings = request.settings
-    kept = work.value("range", lambda: vars(find_range(frames, settings.features, settings.max_turn, progress)))
-    return DepthRange(kept["near"], kept["far"], tuple(kept["medians"]))
+    settings, used = request.settings, [frames[index] for index in sources]
+    kept = work.value("range", lambda: vars(find_range(used, settings.features, settings.max_turn, progress)))
+    medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(kept["medians"])))
+    return DepthRange(kept["near"], kept["far"], tuple(medians.tolist()))
 
 
 def _write(
@@ -112,9 +124,9 @@ def _write(
 ) -> EstimatedDepth:
     """Write all frames, the points and the unit."""
     writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
-    trained = {frame.name for frame in scene.train}
     k = frames[0].camera
-    footprint = float(np.median(estimation.medians)) / float(np.sqrt(k.fx * k.fy))
+    typical = np.median([estimation.medians[index] for index in estimation.sources])
+    footprint = float(typical) / float(np.sqrt(k.fx * k.fy))
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
     pixels = 0
     distrusted: dict[str, list[str]] = {}
@@ -128,7 +140,7 @@ def _write(
         if mask is not None:
             confidence = np.where(mask, confidence, np.float32(0.0))
         writer.write_frame(frame.name, frame.camera, image, mask, depth, confidence)
-        if frame.name in trained:
+        if index in estimation.sources:
             voxels.add(Pose.of(frame.camera), depth, confidence, image)
         pixels += int(frame.valid.sum())
         logs = np.clip(np.log(depth[confidence >= _KNOWN]), *log_range)
@@ -142,9 +154,10 @@ def _write(
             "sharp frames of the same surface from different positions, with correct poses",
             "Check the poses (coliags data check), or the images: blurred or dark frames give no depth",
         )
-    own = scene.provenance["split"]["name"] == "own"
+    train = [frame.name for frame in scene.train]
     test = [frame.name for frame in scene.test_sets.get("test", ())]
-    writer.finish(positions, colors, ([frame.name for frame in scene.train], test) if own else None)
+    own = scene.provenance["split"]["name"] == "own"
+    writer.finish(positions, colors, train, (train, test) if own else None)
     write_unit(folder, scene.provenance["unit"])
     bins = np.searchsorted(np.cumsum(counts), np.multiply(known, _SHARES))
     near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)

@@ -348,6 +348,18 @@ def test_cautions(study_of):
     assert of(study_of, [ours, result_of("3dgs")]).cautions == []
 
 
+def test_what_was_made_from_held_out_images_is_said(study_of):
+    results = [result_of(method) for method in ("coliags", "3dgs")]
+    used = {"held_out_used": {"depth": ["0004", "0012"], "points": None}}
+    results = [result.model_copy(update={"provenance": {**result.provenance, **used}}) for result in results]
+    assert of(study_of, results).cautions == [
+        "cecum, split every-8th: its depth comes from images of 2 held-out frames too, whose scores are too good for "
+        "that.",
+        "cecum, split every-8th: its points may come from images of held-out frames, as it is not recorded which it "
+        "was made from.",
+    ]
+
+
 def test_unpaired_seeds_are_said(study_of):
     said = of(study_of, [result_of("coliags", seed=seed) for seed in range(2)] + [result_of("3dgs")]).cautions
     assert said == [

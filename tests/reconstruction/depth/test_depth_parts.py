@@ -78,15 +78,22 @@ def along(distances):
     return centers
 
 
-def chosen(distances, depth=10.0, settings=SETTINGS, axes=None):
+def chosen(distances, depth=10.0, settings=SETTINGS, axes=None, sources=None):
     ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
     directions = ahead if axes is None else axes
-    return choose_neighbours(along(distances), directions, [depth] * len(distances), (0.1, 0.2), settings)
+    sources, depths = sources or range(len(distances)), [depth] * len(distances)
+    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2), settings)
 
 
 def test_the_first_frame_beyond_each_baseline_on_either_side():
     # A baseline of 0.1 at depth 10 is 1.
     assert chosen([0.5 * k for k in range(12)])[6] == [2, 4, 8, 10]
+
+
+def test_other_frames_than_the_sources_are_no_neighbours():
+    found = chosen([0.5 * k for k in range(12)], sources=[0, 1, 2, 3, 5, 6, 7, 9, 11])
+    assert found[6] == [2, 3, 9, 11]
+    assert found[4] == [0, 2, 6, 9]  # itself no source, from sources alone
 
 
 def test_a_pause_changes_no_distance():
