@@ -66,12 +66,14 @@ class TrueLight:
 
 
 def find_true_light(scene: Path) -> TrueLight | None:
-    """The light of the phantom in a folder; None where it is no phantom."""
+    """The light of the phantom in a folder; None where it is no phantom, or has a light that no such law describes."""
     file = scene / "truth" / "light.json"
     if not file.is_file():
         return None
     try:
         record: dict[str, Any] = read_json(file, "the light of a phantom")
+        if record.keys() & {"lamps", "s_curve", "color_matrix"}:
+            return None
         lamp = record["lamp"]
         with (file.parent / "gain.csv").open(newline="", encoding="utf-8") as rows:
             gains = {

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -26,11 +27,12 @@ from coliags_plugin.phantom.interreflection import IndirectLight, indirect_light
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.living import WallMotion, frame_times, wall_motion
+from coliags_plugin.phantom.measured import displaced, estimated_depth, pose_errors
 from coliags_plugin.phantom.motion import poses_during
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
-from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
-from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
+from coliags_plugin.phantom.response import develop, exposure_for, exposures, meter_weights, white_balances
+from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import RotationView, camera_path, turn_away
@@ -61,29 +63,47 @@ class PreparedPhantom:
     rotation_views: list[RotationView]  # test views with rotated cameras
     indirect: list[IndirectLight | None]  # for the sequence and then the rotation views
     gains: Float[np.ndarray, "T 3"]  # red, green, blue gain of every frame of the sequence
+    rotation_gains: Float[np.ndarray, "V 3"]  # of the rotation views
     motion: WallMotion | None  # of the wall; None if it is rigid
+
+    @property
+    def is_training(self) -> Bool[np.ndarray, "T"]:
+        """Which frames of the sequence are not held out."""
+        return np.array([not self.layout.is_test(index) for index in range(len(self.poses))])
 
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
         """Poses of the frames that are not held out."""
-        return [pose for index, pose in enumerate(self.poses) if not self.layout.is_test(index)]
+        return list(self.poses[self.is_training])
+
+    @property
+    def given_poses(self) -> Float[np.ndarray, "N 4 4"]:
+        """Poses that methods are given, with the errors of a tracker: the sequence's and then the rotation views'."""
+        poses = np.stack([*self.poses, *(view.camera_to_world for view in self.rotation_views)])
+        if not any(self.settings.pose_noise):
+            return poses
+        drift = pose_errors(self.settings, np.zeros(len(self.poses), bool))
+        errors = [pose_errors(self.settings, self.is_training), drift[[view.frame for view in self.rotation_views]]]
+        return displaced(poses, np.concatenate(errors))
+
+    def given_depth(self, z_depth: Float[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "H W"]:
+        """The depth of image ``number`` that methods are given, from the true one: training frames' has errors."""
+        if not self.settings.depth_noise or number >= len(self.poses) or self.layout.is_test(number):
+            return z_depth
+        return estimated_depth(z_depth, self.settings, number)
 
     def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
-        """Render image ``number``: the sequence's frames come first, then the rotation views.
-
-        A rotation view has the exposure of the frame at its position, as if the camera turned faster than the exposure
-        adapts.
-        """
+        """Render image ``number``: the sequence's frames come first, then the rotation views."""
         frames, settings, sensor = len(self.poses), self.settings, self.sensor
         during: list[Float[np.ndarray, "4 4"]] = []
         if number < frames:
-            frame, pose = number, self.poses[number]
+            frame, pose, gain = number, self.poses[number], self.gains[number]
             if settings.shutter:
                 least = sensor.samples.shape[1]
                 during = poses_during(self.poses, number, settings.shutter, sensor.focal_length, least)
         else:
             view = self.rotation_views[number - frames]
-            frame, pose = view.frame, view.camera_to_world
+            frame, pose, gain = view.frame, view.camera_to_world, self.rotation_gains[number - frames]
         world = world_at(self.world, self.motion, settings, frame)
         exposure = expose(world, sensor, pose, self.indirect[number], during)
         if settings.washes:
@@ -94,7 +114,7 @@ class PreparedPhantom:
         if settings.softness:
             exposure = replace(exposure, radiance=sensor.softened(exposure.radiance, settings.softness))
         noise = stream(settings.seed, Purpose.SENSOR, number)
-        return exposure, develop(exposure.radiance, self.gains[frame], settings, noise)
+        return exposure, develop(exposure.radiance, gain, settings, noise, sensor)
 
     def wall(
         self, exposure: Exposure, pose: Float[np.ndarray, "4 4"], pixels: Int[np.ndarray, "N"]
@@ -145,9 +165,9 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     mucosa = paint_mucosa(anatomy, surface, settings)
     report("colon", 2, 4)
     tracer = Tracer(surface)
-    lamp = CameraLight.of(settings)
+    lamps = CameraLight.all_of(settings)
     vignetting = value_or_default(settings.vignetting, settings.light_preset.vignetting)
-    world = World(surface, mucosa, tracer, lamp, vignetting)
+    world = World(surface, mucosa, tracer, lamps, vignetting)
     motion = wall_motion(anatomy, surface, settings)
     poses = camera_path(anatomy.centre_line, settings, tracer, motion)
     views = turn_away(poses, settings, layout.is_test) if layout.has_rotation else []
@@ -156,22 +176,32 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     if settings.interreflection > 0.0:
         generator = stream(settings.seed, Purpose.INTERREFLECTION)
         albedo = vertex_albedo(surface, mucosa)
-        indirect[:] = indirect_lights(surface, albedo, tracer, lamp, everywhere, settings.interreflection, generator)
+        indirect[:] = indirect_lights(surface, albedo, tracer, lamps, everywhere, settings.interreflection, generator)
     report("colon", 3, 4)
     lens, mask = layout.lens(*image_size(settings, layout))
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
+    weights = meter_weights(thin.mask, settings)
     ideal = []
     for frame, (pose, light) in enumerate(zip(poses, indirect[: len(poses)], strict=True)):
         now = world_at(world, motion, settings, frame)
         if motion is not None:
             _check_clear(now, pose, frame)
-        ideal.append(exposure_for(meter(now, thin, pose, light), settings.target_grey, settings.gamma))
+        ideal.append(exposure_for(meter(now, thin, pose, light), settings, weights))
         if settings.moves:
             report("exposure", frame + 1, len(poses))
-    gains = exposures(ideal, settings)[:, None] * white_balances(settings)
+    balances = white_balances(settings)
+    gains = exposures(ideal, settings)[:, None] * balances
+    turned = [view.frame for view in views]
+    rotation_gains = gains[turned]
+    if settings.rotation_exposure == "metered":
+        settled = []
+        for view, light in zip(views, indirect[len(poses) :], strict=True):
+            now = world_at(world, motion, settings, view.frame)
+            settled.append(exposure_for(meter(now, thin, view.camera_to_world, light), settings, weights))
+        rotation_gains = exposures(ideal, settings, settled)[:, None] * balances[turned]
     report("colon", 4, 4)
-    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains, motion)
+    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains, rotation_gains, motion)
 
 
 def _check_clear(world: World, pose: Float[np.ndarray, "4 4"], frame: int) -> None:
@@ -209,6 +239,7 @@ def generate(
 def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
     layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
     rotated = np.array([view.camera_to_world for view in phantom.rotation_views])
+    training = phantom.is_training
     total = frames + len(rotated)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
@@ -221,7 +252,8 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         part: Part = "video" if number < frames else "rotation"
         index = number if part == "video" else number - frames
         pose = phantom.poses[index] if part == "video" else rotated[index]
-        taken = PhantomFrame(part, index, image(color), image(exposure.z_depth), image(exposure.normals))
+        z_depth = phantom.given_depth(image(exposure.z_depth), number)
+        taken = PhantomFrame(part, index, image(color), z_depth, image(exposure.normals))
         layout.write_frame(folder, taken)
         if phantom.motion is not None:
             fits.append(_to_rest(phantom, exposure, pose))
@@ -229,7 +261,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
             write_image(folder / "truth" / "not_wall" / f"{index:04d}.png", image(exposure.cover))
         if part == "video":
             observed[exposure.triangles] = True
-        if part == "video" and not layout.is_test(index):
+        if part == "video" and training[index]:
             trained_on[exposure.triangles] = True
             if layout.has_points:
                 drawn.append(_draw_points(phantom, index, exposure, color))
@@ -237,13 +269,14 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
             seen = image(_seen_mask(phantom, exposure, pose))
             write_image(layout.seen_mask(folder, part, index), seen)
         report("frames", number + 1, total)
-    layout.write_sequence(folder, "video", phantom.poses, lens)
+    given = phantom.given_poses
+    layout.write_sequence(folder, "video", given[:frames], lens)
     if len(rotated):
-        layout.write_sequence(folder, "rotation", rotated, lens)
+        layout.write_sequence(folder, "rotation", given[frames:], lens)
     if layout.has_points:
         positions, colors = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         points = WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
-        layout.write_points(folder, points, phantom.poses, lens)
+        layout.write_points(folder, points, given[:frames], lens)
     if layout.has_coverage_mesh:
         _write_coverage_mesh(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     report("truth", 0, 1)
@@ -304,11 +337,12 @@ def _write_truth(
     np.save(folder / "camera_to_world.npy", phantom.poses)
     _write_gains(folder / "gain.csv", phantom.gains)
     if phantom.rotation_views:
-        _write_gains(folder / "rotation_gain.csv", phantom.gains[[view.frame for view in phantom.rotation_views]])
-    light = {
+        _write_gains(folder / "rotation_gain.csv", phantom.rotation_gains)
+    lamps = [lamp.describe() for lamp in phantom.world.lamps]
+    light: dict[str, Any] = {
         "law": "pixel = noise + shoulder(gain * cos(theta)^vignetting * (albedo * (E n.l + E_indirect) + gloss E))"
         "^(1/gamma), E = beam(psi) (unit_distance_mm / d)^2, psi and d at the lamp",
-        "lamp": phantom.world.lamp.describe(),
+        **({"lamp": lamps[0]} if len(lamps) == 1 else {"lamps": lamps}),
         "vignetting": settings.vignetting,
         "interreflection": settings.interreflection,
         "gamma": settings.gamma,
@@ -319,6 +353,10 @@ def _write_truth(
             {"frame": view.frame, "turn_degrees": round(view.turn, 6)} for view in phantom.rotation_views
         ],
     }
+    if settings.s_curve:
+        light["s_curve"] = settings.s_curve
+    if settings.color_matrix != SAME_COLORS:
+        light["color_matrix"] = settings.color_matrix
     write_json(folder / "light.json", light)
 
 

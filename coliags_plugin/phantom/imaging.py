@@ -76,12 +76,12 @@ class Sensor:
 
 @dataclass(frozen=True)
 class World:
-    """Scene description: wall, material, lamp and lens, without the camera pose."""
+    """Scene description: wall, material, lamps and lens, without the camera pose."""
 
     surface: ColonSurface
     mucosa: Mucosa
     tracer: Tracer
-    lamp: CameraLight
+    lamps: tuple[CameraLight, ...]
     vignetting: float
     bodies: tuple[Body, ...] = ()  # over the wall, farther ones first
 
@@ -155,7 +155,7 @@ def _seen(
     cover = np.zeros(len(directions), np.uint8)
     z_depth = hits.z_depth.copy()
     for body in world.bodies:
-        drawn = body.draw(world.lamp, world.vignetting, camera_to_world, directions, z_depth, light)
+        drawn = body.draw(world.lamps, world.vignetting, camera_to_world, directions, z_depth, light)
         cover[drawn] = body.cover
     return light, cover
 
@@ -178,8 +178,8 @@ def shade(
 ) -> Float[np.ndarray, "N 3"]:
     """Radiance reflected from ray hits, all valid, towards the camera.
 
-    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``. Directions are in camera axes
-    with z = 1; ``spacing`` is the distance between neighbouring samples at z-depth 1.
+    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``, summed over lamps. Directions
+    are in camera axes with z = 1; ``spacing`` is the distance between neighbouring samples at z-depth 1.
     """
     length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
     cos_theta = 1.0 / length
@@ -200,17 +200,18 @@ def shade(
     # Light diffuses about half a millimetre inside tissue, which smooths half of the finest relief's shading.
     tissue = _unit(normals - 0.5 * tipped)
 
-    strength, to_lamp = world.lamp.irradiance(points, camera_to_world)
-    if world.lamp.casts_shadows:
-        lamp = camera_to_world[:3, 3] + camera_to_world[:3, :3] @ np.asarray(world.lamp.offset)
-        strength *= world.tracer.visible(points, lamp)
-    diffuse = strength * np.maximum(np.einsum("nc,nc->n", tissue, to_lamp), 0.0)
+    diffuse, gloss = np.zeros_like(slant), np.zeros_like(slant)
+    for lamp in world.lamps:
+        strength, to_lamp = lamp.irradiance(points, camera_to_world)
+        if lamp.casts_shadows:
+            strength *= world.tracer.visible(points, lamp.position(camera_to_world))
+        diffuse += strength * lamp.diffuse(tissue, to_lamp, to_eye)
+        # The mucus film does not reflect where the wall faces away from the light.
+        lit = np.einsum("nc,nc->n", normals, to_lamp) > 0.0
+        gloss += lit * (strength * material.wetness * lamp.gloss(film, to_lamp, to_eye, material.slope_variance))
     received = diffuse[:, None]
     if indirect is not None:
         received = received + indirect.at(row, column)
-    gloss = strength * material.wetness * world.lamp.gloss(film, to_lamp, to_eye, material.slope_variance)
-    # The mucus film does not reflect where the wall faces away from the light.
-    gloss *= np.einsum("nc,nc->n", normals, to_lamp) > 0.0
     light = material.albedo * received + gloss[:, None]
     return np.asarray(light * (cos_theta**world.vignetting)[:, None], dtype=np.float32)
 

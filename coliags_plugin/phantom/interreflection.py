@@ -134,7 +134,7 @@ def indirect_lights(
     surface: ColonSurface,
     vertex_albedo: Float[np.ndarray, "V 3"],
     tracer: Tracer,
-    lamp: CameraLight,
+    lamps: Sequence[CameraLight],
     cameras_to_world: Sequence[Float[np.ndarray, "4 4"]],
     share: float,
     generator: np.random.Generator,
@@ -143,16 +143,16 @@ def indirect_lights(
     patches = make_patches(surface, vertex_albedo, generator)
     factors = form_factors(patches, tracer)
     flat_points, flat_normals = patches.points.reshape(-1, 3), patches.normals.reshape(-1, 3)
-    direct = np.empty((len(patches.areas), len(cameras_to_world)))
+    direct = np.zeros((len(patches.areas), len(cameras_to_world)))
     for index, camera_to_world in enumerate(cameras_to_world):
-        strength, to_lamp = lamp.irradiance(flat_points, camera_to_world)
-        received = strength * np.maximum(np.einsum("nc,nc->n", flat_normals, to_lamp), 0.0)
-        # Visibility is from the lens even if the lamp is behind it: see light.py on rings of light guides.
-        offset = np.asarray(lamp.offset) if lamp.casts_shadows else np.zeros(3)
-        source = camera_to_world[:3, 3] + camera_to_world[:3, :3] @ offset
-        lit = np.flatnonzero(received > 0.0)
-        received[lit] *= tracer.visible(flat_points[lit], source)
-        direct[:, index] = received.reshape(-1, _SAMPLES).mean(axis=1)
+        for lamp in lamps:
+            strength, to_lamp = lamp.irradiance(flat_points, camera_to_world)
+            received = strength * np.maximum(np.einsum("nc,nc->n", flat_normals, to_lamp), 0.0)
+            # Visibility is from the lens even if the lamp is behind it: see light.py on rings of light guides.
+            source = lamp.position(camera_to_world) if lamp.casts_shadows else camera_to_world[:3, 3]
+            lit = np.flatnonzero(received > 0.0)
+            received[lit] *= tracer.visible(flat_points[lit], source)
+            direct[:, index] += received.reshape(-1, _SAMPLES).mean(axis=1)
     solved = share * solve(patches, factors, direct)
     rows, columns = patches.shape
     return [

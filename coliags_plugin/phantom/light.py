@@ -10,7 +10,7 @@ which lights all that the lens sees. A lamp beside the lens casts shadows.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ UNIT_DISTANCE = 20.0
 
 @dataclass(frozen=True)
 class CameraLight:
-    """A spotlight fixed to the camera, and the mucosa's specular reflection; see :class:`PhantomSettings`."""
+    """A spotlight fixed to the camera, and how the mucosa reflects it; see :class:`PhantomSettings`."""
 
     offset: tuple[float, float, float]  # camera axes, mm
     axis: tuple[float, float, float]  # unit direction of the beam, camera axes
@@ -34,20 +34,29 @@ class CameraLight:
     specular: float
     roughness: float
     f0: float
+    diffuse_roughness: float = 0.0  # degrees
+    share: float = 1.0  # of the light of all lamps
 
     @classmethod
-    def of(cls, settings: PhantomSettings) -> CameraLight:
-        """Lamp from settings; it is tilted downwards in the image."""
+    def all_of(cls, settings: PhantomSettings) -> tuple[CameraLight, ...]:
+        """Lamps from settings; they are tilted downwards in the image, and their shares sum to 1."""
         preset = settings.light_preset
         tilt = np.radians(value_or_default(settings.tilt, preset.tilt))
-        return cls(
-            offset=value_or_default(settings.light_offset, preset.light_offset),
+        offsets = settings.lamps or (value_or_default(settings.light_offset, preset.light_offset),)
+        shares = settings.lamp_shares or (1.0,) * len(offsets)
+        one = cls(
+            offset=offsets[0],
             axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
             spread_law=value_or_default(settings.spread_law, preset.spread_law),
             spread=value_or_default(settings.spread, preset.spread),
             specular=settings.specular,
             roughness=settings.roughness,
             f0=settings.f0,
+            diffuse_roughness=settings.diffuse_roughness,
+        )
+        return tuple(
+            replace(one, offset=offset, share=share / sum(shares))
+            for offset, share in zip(offsets, shares, strict=True)
         )
 
     @property
@@ -59,20 +68,42 @@ class CameraLight:
         """Intensity at an angle psi from the beam's axis by its cosine, 1 on the axis."""
         return beam(cosine, self.spread_law, self.spread)
 
+    def position(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
+        """Where it is in the world, mm."""
+        return np.asarray(camera_to_world[:3, 3] + camera_to_world[:3, :3] @ np.asarray(self.offset))
+
     def irradiance(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
         """Irradiance of surfaces perpendicular to the light, and unit directions to the lamp; world, mm.
 
-        The irradiance is ``beam(cos psi) (20 / d)^2``.
+        The irradiance is ``share beam(cos psi) (20 / d)^2``.
         """
-        rotation, center = camera_to_world[:3, :3], camera_to_world[:3, 3]
-        lamp = (center + rotation @ np.asarray(self.offset)).astype(points.dtype)
-        axis = (rotation @ np.asarray(self.axis)).astype(points.dtype)
+        lamp = self.position(camera_to_world).astype(points.dtype)
+        axis = (camera_to_world[:3, :3] @ np.asarray(self.axis)).astype(points.dtype)
         to_lamp = lamp - points
         square = np.einsum("nc,nc->n", to_lamp, to_lamp)
         to_lamp /= np.sqrt(square)[:, None]
-        return self.beam(-np.einsum("nc,c->n", to_lamp, axis)) * (UNIT_DISTANCE**2 / square), to_lamp
+        return self.beam(-np.einsum("nc,c->n", to_lamp, axis)) * (self.share * UNIT_DISTANCE**2 / square), to_lamp
+
+    def diffuse(
+        self, normals: Float[np.ndarray, "N 3"], to_lamp: Float[np.ndarray, "N 3"], to_eye: Float[np.ndarray, "N 3"]
+    ) -> Float[np.ndarray, "N"]:
+        """Pi times the diffuse reflection of a white wall times n.l: radiance per unit of :meth:`irradiance`.
+
+        Lambert's law, n.l, or the qualitative model of Oren and Nayar (1994) of V-shaped facets whose slope angles have
+        the standard deviation ``diffuse_roughness``, which reflect more to where the light comes from.
+        """
+        light = np.maximum(np.einsum("nc,nc->n", normals, to_lamp), 0.0)
+        if self.diffuse_roughness == 0.0:
+            return np.asarray(light)
+        variance = np.radians(self.diffuse_roughness) ** 2
+        eye = np.maximum(np.einsum("nc,nc->n", normals, to_eye), 0.0)
+        # sin theta_i sin theta_r cos(phi_i - phi_r), and sin alpha tan beta / (sin theta_i sin theta_r).
+        around = np.maximum(np.einsum("nc,nc->n", to_lamp, to_eye) - light * eye, 0.0)
+        steeper = around / np.maximum(np.maximum(light, eye), 1e-3)
+        flat, retro = 1.0 - 0.5 * variance / (variance + 0.33), 0.45 * variance / (variance + 0.09)
+        return np.asarray(light * (flat + retro * steeper), dtype=light.dtype)
 
     def gloss(
         self,
@@ -101,5 +132,7 @@ class CameraLight:
         return np.asarray(self.specular * fresnel * lobe * 0.5 * light / np.maximum(masking, 1e-6))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters as plain values, for the truth folder."""
-        return {**asdict(self), "unit_distance_mm": UNIT_DISTANCE}
+        """Parameters as plain values, for the truth folder; without those that earlier versions did not have."""
+        later = {"diffuse_roughness": 0.0, "share": 1.0}
+        record = {name: value for name, value in asdict(self).items() if value != later.get(name)}
+        return {**record, "unit_distance_mm": UNIT_DISTANCE}

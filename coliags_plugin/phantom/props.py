@@ -65,7 +65,7 @@ class Body:
 
     def draw(
         self,
-        lamp: CameraLight,
+        lamps: tuple[CameraLight, ...],
         vignetting: float,
         camera_to_world: Float[np.ndarray, "4 4"],
         directions: Float[np.ndarray, "N 3"],
@@ -87,19 +87,22 @@ class Body:
         facing = np.einsum("nc,nc->n", normals, to_eye)
         normals *= np.sign(facing)[:, None]
         facing = np.abs(facing)
-        strength, to_lamp = lamp.irradiance(points, pose)
-        strength *= length**-vignetting
-        diffuse = (strength * np.maximum(np.einsum("nc,nc->n", normals, to_lamp), 0.0))[:, None]
         flat = np.zeros(len(facing), np.float32)
         f0, roughness = {Cover.FLUID: (0.02, 0.2), Cover.BUBBLE: (0.04, 0.15), Cover.TOOL: (0.35, 0.45)}[self.cover]
-        surface = replace(lamp, f0=f0, roughness=roughness, specular=1.0)
-        gloss = (strength * surface.gloss(normals, to_lamp, to_eye, flat))[:, None]
+        received, diffuse, gloss = (np.zeros((len(facing), 1), np.float32) for _ in range(3))
+        for lamp in lamps:
+            strength, to_lamp = lamp.irradiance(points, pose)
+            strength *= length**-vignetting
+            received += strength[:, None]
+            diffuse += (strength * np.maximum(np.einsum("nc,nc->n", normals, to_lamp), 0.0))[:, None]
+            surface = replace(lamp, f0=f0, roughness=roughness, specular=1.0)
+            gloss += (strength * surface.gloss(normals, to_lamp, to_eye, flat))[:, None]
         if self.cover is Cover.TOOL:
             light[nearer] = _TOOL_ALBEDO * diffuse + gloss
         elif self.cover is Cover.BUBBLE:
             # A film that hides little from the front and much at its rim, where it also scatters.
             rim = (1.0 - facing[:, None]) ** 2
-            light[nearer] = light[nearer] * (1.0 - 0.65 * rim) + 0.3 * rim * strength[:, None] + gloss
+            light[nearer] = light[nearer] * (1.0 - 0.65 * rim) + 0.3 * rim * received + gloss
         else:
             depth = np.minimum(z_depth[nearer] - hits.z_depth, 100.0) * length
             clear = np.exp(-_FLUID_ABSORPTION * depth[:, None])

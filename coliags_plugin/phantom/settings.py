@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
+    AfterValidator,
     Field,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -46,10 +47,38 @@ _LATER = (
     "fold_spacing",
     "texture",
 )
+#: The same, also with a preset, which sets none of them.
+_LATER_IN_PRESETS = (
+    "lamps",
+    "lamp_shares",
+    "diffuse_roughness",
+    "s_curve",
+    "color_matrix",
+    "metering",
+    "gain_steps",
+    "sharpening",
+    "sharpening_radius",
+    "compression",
+    "pose_noise",
+    "depth_noise",
+)
+#: A colour matrix that changes nothing.
+SAME_COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 _T = TypeVar("_T")
 
 GainMode = Literal["auto", "fixed"]
+
+
+def _near_lens(offset: tuple[float, float, float]) -> tuple[float, float, float]:
+    # The camera keeps 6 mm from the wall, so a lamp within 5 mm of it never enters the wall.
+    if not math.hypot(*offset) <= 5.0:
+        raise ValueError(f"the lamp is {math.hypot(*offset):.3g} mm from the lens; it must be within 5 mm")
+    return offset
+
+
+_Triple = tuple[float, float, float]
+_Offset = Annotated[_Triple, AfterValidator(_near_lens)]
 
 
 @dataclass(frozen=True)
@@ -172,10 +201,19 @@ class PhantomSettings(Settings):
     gain: GainMode | None = Field(
         None, description="auto: exposure follows the image with a lag. fixed: one exposure for the whole sequence."
     )
-    light_offset: tuple[float, float, float] | None = Field(
+    light_offset: _Offset | None = Field(
         None,
         description="Lamp in camera axes (x right, y down, z forward), mm, at most 5 mm from the lens. A fitted real "
         "endoscope: (-0.06, -1.14, -3.61).",
+    )
+    lamps: tuple[_Offset, ...] = Field(
+        (),
+        max_length=8,
+        description="Lamps in place of the one at light_offset, in its unit and limits; each has the beam, shadows and "
+        "glints of its own.",
+    )
+    lamp_shares: tuple[float, ...] = Field(
+        (), description="Relative light of each of the lamps, 0 to 1 after division by their sum; none: equal."
     )
     spread_law: SpreadLaw | None = Field(
         None, description="exponential: exp(-spread (1 - cos psi)), Modrzejewski 2020. cosine: cos^spread psi."
@@ -191,6 +229,12 @@ class PhantomSettings(Settings):
         1.0, ge=0.0, le=1.0, description="Scale of indirect light; 1 is the solved radiosity, 0 none."
     )
     specular: float = Field(1.0, ge=0.0, le=1.0, description="Scale of the mucus film's Fresnel reflection.")
+    diffuse_roughness: float = Field(
+        0.0,
+        ge=0.0,
+        le=60.0,
+        description="Standard deviation of the slopes of a diffuse wall, degrees (Oren-Nayar); 0 is Lambert's.",
+    )
     roughness: float = Field(
         0.3, ge=0.15, le=0.7, description="GGX roughness of the mucus film, whose alpha is its square."
     )
@@ -206,6 +250,19 @@ class PhantomSettings(Settings):
         le=0.8,
         description="Mean of the encoded image that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
     )
+    metering: Literal["mean", "centre", "peak"] = Field(
+        "mean",
+        description="What the exposure goes by. mean: target_grey in all of the image. centre: the same, mostly in its "
+        "middle. peak: all but the brightest 2 % of the image stays below grey level 230.",
+    )
+    gain_steps: float = Field(
+        0.0, ge=0.0, le=2.0, description="Steps in which the automatic gain moves, EV (factors of 2); 0: smoothly."
+    )
+    rotation_exposure: Literal["metered", "frame"] = Field(
+        "metered",
+        description="Exposure of rotation views. metered: what automatic exposure settles at. frame: that of the frame "
+        "at their position, as if the camera turned faster than its exposure.",
+    )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
     )
@@ -216,8 +273,36 @@ class PhantomSettings(Settings):
         None, ge=0.0, le=0.2, description="Standard deviation of the slow drift of log red/green and blue/green gain."
     )
     gamma: float = Field(2.2, ge=1.0, le=3.0, description="Camera response: pixel = linear^(1/gamma).")
+    s_curve: float = Field(
+        0.0, ge=0.0, le=0.9, description="Share of a smoothstep in the tone curve, after gamma: contrast; 0 is none."
+    )
+    color_matrix: tuple[_Triple, _Triple, _Triple] = Field(
+        SAME_COLORS,
+        description="Red, green and blue of the camera, in rows, from those of the light; rows sum to 1, off-diagonals "
+        "are -0.3 to 0.3.",
+    )
+    sharpening: float = Field(
+        0.0, ge=0.0, le=3.0, description="Amount of the video processor's unsharp mask; 0 is none."
+    )
+    sharpening_radius: float = Field(1.0, ge=0.3, le=5.0, description="Standard deviation of its Gaussian, pixels.")
+    compression: int | None = Field(
+        None, ge=1, le=100, description="Quality of a JPEG through which images go before they are stored; None: none."
+    )
     noise: float = Field(
         1.5, ge=0.0, le=8.0, description="Standard deviation of shot and read noise at mid grey, grey levels of 255."
+    )
+
+    pose_noise: tuple[float, float] = Field(
+        (0.0, 0.0),
+        description="Standard deviation of a slow drift of given poses, in each axis, mm and degrees, 0 to 5 each; "
+        "training frames jitter by a fifth of it besides.",
+    )
+    depth_noise: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.5,
+        description="Relative standard deviation of the given depth of training frames, smooth over the image; depth "
+        "also bleeds over edges. 0: exact.",
     )
 
     polyps: int = Field(4, ge=0, le=20, description="Sessile polyps, 3 to 10 mm wide.")
@@ -268,13 +353,29 @@ class PhantomSettings(Settings):
             raise ValueError(f"unknown layout; known are {', '.join(phantom_layouts)}")
         return name
 
-    @field_validator("light_offset")
+    @field_validator("lamp_shares")
     @classmethod
-    def _lamp_near_lens(cls, offset: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        # The camera keeps 6 mm from the wall, so a lamp within 5 mm of it never enters the wall.
-        if offset is not None and not math.hypot(*offset) <= 5.0:
-            raise ValueError(f"the lamp is {math.hypot(*offset):.3g} mm from the lens; it must be within 5 mm")
-        return offset
+    def _shares_are_light(cls, shares: tuple[float, ...]) -> tuple[float, ...]:
+        if shares and not (min(shares) >= 0.0 and 0.0 < sum(shares) < math.inf):
+            raise ValueError(f"shares {shares}; must be 0 or more, and one of them more")
+        return shares
+
+    @field_validator("color_matrix")
+    @classmethod
+    def _grey_stays_grey(cls, matrix: tuple[_Triple, _Triple, _Triple]) -> tuple[_Triple, _Triple, _Triple]:
+        for number, row in enumerate(matrix):
+            if not abs(sum(row) - 1.0) <= 1e-6:
+                raise ValueError(f"row {row} sums to {sum(row):.6g}; must be 1, so that grey stays grey")
+            if not all(abs(value) <= 0.3 for column, value in enumerate(row) if column != number):
+                raise ValueError(f"row {row} has an off-diagonal beyond 0.3")
+        return matrix
+
+    @field_validator("pose_noise")
+    @classmethod
+    def _noise_is_small(cls, noise: tuple[float, float]) -> tuple[float, float]:
+        if not all(0.0 <= value <= 5.0 for value in noise):
+            raise ValueError(f"noise {noise} (mm, degrees) has a value outside 0 to 5")
+        return noise
 
     @field_validator("albedo")
     @classmethod
@@ -293,14 +394,22 @@ class PhantomSettings(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _a_share_for_each_lamp(self) -> Self:
+        if self.lamp_shares and len(self.lamp_shares) != len(self.lamps):
+            raise ValueError(f"{len(self.lamp_shares)} lamp_shares of {len(self.lamps)} lamps; must be one of each")
+        return self
+
     @model_serializer(mode="wrap")
     def _records_of_earlier_versions(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # A phantom without pauses is recorded as it was before there were any: it is the same phantom.
         record: dict[str, Any] = serialize(self)
         fields = type(self).model_fields
-        later = () if self.preset else _LATER
+        later = _LATER_IN_PRESETS if self.preset else (*_LATER, *_LATER_IN_PRESETS)
         left_out = {key for key in later if getattr(self, key) == fields[key].default}
         left_out.update(() if self.pauses else _OF_PAUSES)
+        # Before there was a choice, views had the exposure of their frame, although that is no longer the default.
+        left_out.update(("rotation_exposure",) if not self.rotation_views or self.rotation_exposure == "frame" else ())
         return {key: record[key] for key in record if key not in left_out}
 
     @property

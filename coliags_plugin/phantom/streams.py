@@ -9,6 +9,9 @@ import scipy.fft
 import scipy.ndimage
 from jaxtyping import Float
 
+#: Correlation length of drifts, frames.
+_DRIFT_LENGTH = 20.0
+
 
 class Purpose(IntEnum):
     """Purpose of a stream. Renumbering would change the phantom of a seed."""
@@ -24,11 +27,24 @@ class Purpose(IntEnum):
     POINTS = 8
     WALL_MOTION = 9
     PROPS = 10
+    POSE_NOISE = 11
+    DEPTH_NOISE = 12
 
 
 def stream(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:
     """The independent generator of a purpose and, through ``key``, for instance of a frame."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), *key)))
+
+
+def slow_drift(
+    generator: np.random.Generator, frames: int, columns: int, deviation: float | Float[np.ndarray, "K"]
+) -> Float[np.ndarray, "T K"]:
+    """Independent smooth processes of a standard deviation over frames."""
+    margin = 4 * int(_DRIFT_LENGTH)
+    drift = generator.standard_normal((frames + 2 * margin, columns))
+    drift = scipy.ndimage.gaussian_filter1d(drift, _DRIFT_LENGTH, axis=0)[margin : margin + frames]
+    # Scaled by the filter's known gain, not by the sample's deviation, since a short sequence covers only part of it.
+    return np.asarray(drift * (np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * deviation))
 
 
 class SolidNoise:

@@ -142,3 +142,6 @@ def test_what_cannot_be_shown_is_refused(trained, capsys, tmp_path):
     (tmp_path / "truth" / "light.json").write_text("{}")
     with pytest.raises(InputError, match=r"light\.json"):
         find_true_light(tmp_path)
+    # Several lamps, or a response that is no power law, are not what the page can show.
+    (tmp_path / "truth" / "light.json").write_text(json.dumps({**LIGHT, "s_curve": 0.3}))
+    assert find_true_light(tmp_path) is None

@@ -144,8 +144,12 @@ def test_gain_and_light_are_told(phantom):
     assert light["lamp"]["offset"] == [0.0, 0.0, -3.6] and light["gain"] == "auto"
     rotated = list(csv.DictReader((phantom / "truth/rotation_gain.csv").open()))
     for view, row in zip(light["rotation_views"], rotated, strict=True):
-        # Turned faster than the exposure follows: the gain of the frame it turned away from.
-        assert row["gain_g"] == rows[view["frame"]]["gain_g"]
+        # Exposed for what it sees, with the white balance of its frame.
+        frame = rows[view["frame"]]
+        assert row["gain_g"] != frame["gain_g"]
+        for side in ("gain_r", "gain_b"):
+            ratios = [float(gains[side]) / float(gains["gain_g"]) for gains in (row, frame)]
+            assert ratios[0] == pytest.approx(ratios[1], rel=1e-6)
 
 
 def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypatch):
