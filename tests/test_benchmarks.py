@@ -14,6 +14,7 @@ import pytest
 import torch
 import tyro
 
+from coliags_plugin.comparison.named_files import load_ablation
 from coliags_plugin.core.images import write_image
 from tests.pipeline.procedures import SUBMAPS, join, similarity, write_procedure
 from tests.scenes import write_wall
@@ -62,6 +63,35 @@ def test_joins_of_a_procedure_are_judged_by_its_truth(run, monkeypatch, tmp_path
     assert "| frames | 100 |" in table and "| of these posed, % | 98.28 |" in table and "| others posed | 0 |" in table
     assert "| ATE, mm | 0.01 (median of 6), 0.00 to 0.02 |" in table and "| poses of another phantom | 0 |" in table
     assert f"| joins of segments | {'1 right, 0 wrong' if is_right else '0 right, 1 wrong'}, 0 not judged |" in table
+
+
+def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
+    results = import_module("results")
+    methods = load_ablation("rivals")
+    few = [one for one in methods if one.name in ("coliags", "3dgs-depth")]
+    monkeypatch.setattr(results, "load_ablation", lambda name: few if name == "rivals" else few[:1])
+    tried = {
+        "anchors": [["field.voxel_pixels=9"], ["field.voxel_pixels=6"]],
+        "points": [["datamanager.points_count=100"], ["datamanager.points_count=200", "strategy.every=1"]],
+    }
+    monkeypatch.setattr(results, "TRIALS", tried)
+    monkeypatch.setattr(results, "LADDER", (2, 4))
+    for name in ("SEVERAL_SEEDS", "TO_PLATEAU"):
+        monkeypatch.setattr(results, name, 1)
+    scene, out = write_wall(tmp_path / "wall", frames=16), tmp_path / "out"
+    options = (out, "--tuning", scene, "--test", scene, "--steps", 4, "--jobs", 1)
+    run("results", "tune", *options)
+    chosen = json.loads((out / "tuned.json").read_text())
+    assert list(chosen) == ["coliags", "3dgs-depth"]
+    for name, changes in (("coliags", tried["anchors"]), ("3dgs-depth", tried["points"])):
+        psnr = [values[0] for values in chosen[name]["trials"].values()]
+        assert len(psnr) == 2 and chosen[name]["changes"] == changes[psnr.index(max(psnr))]
+    assert list(chosen["coliags"]["plateau"]) == ["2", "4"] and "plateau" not in chosen["3dgs-depth"]
+    run("results", "measure", *options)
+    plan = json.loads((out / "equal-time" / "plan.json").read_text())
+    assert {cell["protocol"] for cell in plan["cells"]} == {"paper", "expected-depth", "median-depth"}
+    assert {cell["seed"] for cell in plan["cells"] if cell["method"] == "coliags"} == {0, 1, 2}
+    assert "coliags" in (run("results", "write", *options) and (out / "plateau.md").read_text())
 
 
 def test_the_training_step_by_stages(run):

@@ -1,0 +1,200 @@
+"""The tables of docs/results.md from nothing: choices on tuning phantoms, then one measurement on the test phantoms.
+
+python benchmarks/results.py tune OUT
+python benchmarks/results.py measure OUT
+python benchmarks/results.py write OUT
+
+``tune`` tries changes of every method of the ablation ``rivals`` on held-out frames of the benchmark
+``phantoms-tuning``, as many of each, and then run lengths; what is chosen is ``OUT/tuned.json``. ``measure`` trains on
+``phantoms-12`` with these choices: in equal processor time, to each method's plateau, and the rows of the paper's
+ablation. ``write`` makes the reports. Whatever is killed, the same command goes on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from machine import markdown_table
+
+import coliags_plugin
+from coliags_plugin.comparison.named_files import Variant, load_ablation
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.record import Result
+
+#: Trials of each method, as many of one kind of field as of the other: anchors in finer voxels, and with twice the
+#: births; other fields from more points, and without resets of opacities, which short runs hardly recover from.
+TRIALS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "anchors": (
+        *((f"field.voxel_pixels={pixels}",) for pixels in (4.0, 3.0, 2.0)),
+        ("field.voxel_pixels=3.0", "strategy.pixels_per_birth=250"),
+    ),
+    "points": (
+        *((f"datamanager.points_count={count}",) for count in (50_000, 100_000, 200_000)),
+        ("datamanager.points_count=100000", "strategy.reset_every=1000000"),
+    ),
+}
+#: Test frames of the tuning phantoms: every eighth from the fifth on, which are no test frames of ``every-8th``.
+VALIDATION = "inner-8th"
+#: Methods trained with several seeds, and to their plateau: the first of the ablation.
+SEVERAL_SEEDS, SEEDS, TO_PLATEAU = 4, 3, 8
+#: Run lengths on the way to a plateau, and by how much twice as many steps must raise PSNR for the way to go on, dB.
+LADDER, RISE = (1000, 2000, 4000, 8000), 0.1
+
+
+@dataclass(frozen=True)
+class _Command:
+    out: tyro.conf.Positional[Path]
+    """Folder of all runs and results."""
+    tuning: str = "phantoms-tuning"
+    """Benchmark or scenes on which choices are made."""
+    test: str = "phantoms-12"
+    """Benchmark or scenes that are measured."""
+    steps: int = 1500
+    """Steps of the trials; the processor time of ``coliags`` for as many is what every method gets."""
+    jobs: int | None = None
+    """Runs at a time."""
+
+    def compare(self, name: str, variants: Sequence[Variant], scenes: str, **options: Any) -> list[Result]:
+        """Train and evaluate variants in a folder of their own; all must succeed."""
+        done = coliags_plugin.compare(variants, scenes, self.out / name, jobs=self.jobs, **options)
+        print(done.table(), flush=True)
+        if done.failures:
+            raise InputError(
+                f"{len(done.failures)} runs of {name} failed", "every run to succeed", "see the reasons above"
+            )
+        return list(done.results)
+
+    @property
+    def tuned(self) -> Path:
+        """File of the choices."""
+        return self.out / "tuned.json"
+
+
+@dataclass(frozen=True)
+class Tune(_Command):
+    """Command that chooses changes and run lengths of every method on validation frames of the tuning phantoms."""
+
+    def run(self) -> None:
+        """Try, choose and write the choices."""
+        methods = load_ablation("rivals")
+        trials = {method.name: _trials(method) for method in methods}
+        every = [one for own in trials.values() for one in own]
+        results = self.compare("trials", every, self.tuning, splits=[VALIDATION], steps=self.steps)
+        psnr, seconds = _means(results, "psnr"), _seconds(results)
+        best = {name: max(own, key=lambda one: psnr[one.name]) for name, own in trials.items()}
+        budget = seconds[best[methods[0].name].name]
+        chosen = {
+            name: {
+                "changes": TRIALS[_kind(one)][trials[name].index(one)],
+                "trials": {each.name: [psnr[each.name], seconds[each.name]] for each in trials[name]},
+                "equal_time_steps": max(100, round(self.steps * budget / seconds[one.name], -2)),
+            }
+            for name, one in best.items()
+        }
+        for method in methods[:TO_PLATEAU]:
+            chosen[method.name]["plateau"] = self._climbed(replace(best[method.name], name=method.name))
+        self.tuned.write_text(json.dumps(chosen, indent=2) + "\n", encoding="utf-8")
+        keys = ("changes", "equal_time_steps", "plateau")
+        print(markdown_table([{"method": name} | {key: one.get(key) for key in keys} for name, one in chosen.items()]))
+
+    def _climbed(self, variant: Variant) -> dict[str, float]:
+        """PSNR by run length, doubled until it no longer rises; the last is that of the plateau."""
+        reached: dict[str, float] = {}
+        for steps in LADDER:
+            results = self.compare(f"ladder-{steps}", [variant], self.tuning, splits=[VALIDATION], steps=steps)
+            before, reached[str(steps)] = [*reached.values()], _means(results, "psnr")[variant.name]
+            if before and reached[str(steps)] < before[-1] + RISE:
+                break
+        return reached
+
+
+@dataclass(frozen=True)
+class Measure(_Command):
+    """Command that trains and evaluates on the test phantoms as was chosen."""
+
+    def run(self) -> None:
+        """Measure in equal time, at the plateaus, and the rows of the paper's ablation."""
+        if not self.tuned.is_file():
+            raise InputError(f"{self.tuned} is not there", "the choices", "run the command `tune` first")
+        chosen = json.loads(self.tuned.read_text(encoding="utf-8"))
+        methods = load_ablation("rivals")
+        equal = [_with(method, chosen, chosen[method.name]["equal_time_steps"]) for method in methods]
+        self.compare("equal-time", equal, self.test)
+        self.compare("equal-time", equal[:SEVERAL_SEEDS], self.test, seeds=SEEDS)
+        for protocol in ("expected-depth", "median-depth"):
+            self.compare("equal-time", equal, self.test, protocol=protocol)
+        long = [_with(method, chosen, int([*chosen[method.name]["plateau"]][-1])) for method in methods[:TO_PLATEAU]]
+        self.compare("plateau", long, self.test)
+        first = chosen[methods[0].name]
+        rows = [_with(row, {row.name: first}, first["equal_time_steps"]) for row in load_ablation("paper-rows")]
+        self.compare("paper-rows", rows, self.test)
+
+
+@dataclass(frozen=True)
+class Write(_Command):
+    """Command that writes reports of what was measured."""
+
+    def run(self) -> None:
+        """Write every comparison's report as a page, Markdown and CSV."""
+        for name in ("equal-time", "plateau", "paper-rows"):
+            written = coliags_plugin.report(
+                self.out / name, self.out / f"{name}.html", formats=["html", "markdown", "csv"]
+            )
+            print(*written, sep="\n")
+
+
+def _kind(method: Variant) -> str:
+    """Key of the method's trials."""
+    return "anchors" if load_method(method.method, method.overrides).config.field.name == "anchors" else "points"
+
+
+def _trials(method: Variant) -> list[Variant]:
+    """A method with each change that is tried, under names of their own."""
+    return [
+        replace(method, name=f"{method.name}.{number}", overrides=(*method.overrides, *changes))
+        for number, changes in enumerate(TRIALS[_kind(method)])
+    ]
+
+
+def _with(method: Variant, chosen: Mapping[str, Any], steps: int) -> Variant:
+    """A method with the changes that were chosen, for so many steps."""
+    changes = chosen[method.name]["changes"]
+    return replace(method, overrides=(*method.overrides, *changes, f"schedule.steps={steps}"))
+
+
+def _means(results: Sequence[Result], metric: str) -> dict[str, float]:
+    """Mean over scenes of a metric, by method."""
+    values: dict[str, list[float]] = {}
+    for result in results:
+        mean = result.mean(metric)
+        if mean is None:
+            raise InputError(f"{result.title} has no {metric}", "a value for every run")
+        values.setdefault(result.method, []).append(mean)
+    return {name: float(np.mean(own)) for name, own in values.items()}
+
+
+def _seconds(results: Sequence[Result]) -> dict[str, float]:
+    """Mean over scenes of the processor time of training, by method, s."""
+    values: dict[str, list[float]] = {}
+    for result in results:
+        values.setdefault(result.method, []).append(float(result.cost.processor_seconds or np.nan))
+    return {name: float(np.mean(own)) for name, own in values.items()}
+
+
+Options = Tune | Measure | Write
+
+
+def main(options: Options) -> None:
+    """Run the chosen command."""
+    options.run()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
