@@ -78,11 +78,11 @@ class ExpectedDepthProtocol(PaperProtocol):
 
     name: ClassVar[str] = "expected-depth"
     description: ClassVar[str] = (
-        "The depth metrics of the protocol paper, of depth_expected (sum w z / sum w); and PSNR."
+        "The depth metrics of the protocol paper, of depth_expected (sum w z / sum w); and PSNR, SSIM."
     )
     depth: ClassVar[str] = "depth_expected"
     wants: ClassVar[frozenset[str]] = frozenset({depth})
-    metrics: ClassVar[MetricTable] = MappingProxyType({name: (name, {}) for name in ("psnr", *_DEPTH_METRICS)})
+    metrics: ClassVar[MetricTable] = MappingProxyType({name: (name, {}) for name in ("psnr", "ssim", *_DEPTH_METRICS)})
 
 
 class MedianDepthProtocol(ExpectedDepthProtocol):
@@ -90,7 +90,7 @@ class MedianDepthProtocol(ExpectedDepthProtocol):
 
     name: ClassVar[str] = "median-depth"
     description: ClassVar[str] = (
-        "The depth metrics of the protocol paper, of depth_median (z where the transmittance falls to 1/2); and PSNR."
+        "The depth metrics of the protocol paper, of depth_median (z where the transmittance falls to 1/2); and PSNR, SSIM."
     )
     depth: ClassVar[str] = "depth_median"
     wants: ClassVar[frozenset[str]] = frozenset({depth})
