@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from coliags_plugin.results.hashing import code_files
+
 PACKAGE = Path(__file__).parents[1] / "coliags_plugin"
 ROOT = PACKAGE.name
 #: Packages and top-level modules, from the bottom up. One of a layer imports lower layers and itself, never a sibling.
@@ -108,6 +110,20 @@ def test_heavy_libraries_are_imported_late():
         allowed = {name for name in ("numba", "triton") if f"{name}_kernels" in path.parts}
         early += [f"{name} imports {library}" for library in loaded & (LAZY - allowed)]
     assert early == []
+
+
+def test_the_key_of_the_code_covers_all_that_the_engine_imports():
+    """But presentation, and of the results what does not compute them."""
+    found = set()
+    todo = [name for name in components() if package_of(name) == "engine"]
+    while todo:
+        name = todo.pop()
+        if name in SOURCES and name != ROOT and name not in found:
+            found.add(name)
+            todo += imports(SOURCES[name]) | targets(SOURCES[name])
+    left_out = {name for name in found if SOURCES[name] not in code_files().values()}
+    assert {package_of(name) for name in left_out} <= {"_version", "outputs", "phantom", "reporting", "results"}
+    assert "coliags_plugin.results.profiles" not in left_out and "coliags_plugin.metrics.depth" not in left_out
 
 
 def test_habits():

@@ -77,7 +77,10 @@ class ComparisonArguments:
         folder = ComparisonFolder(self.output)
         if self.dry_run:
             planned = dry_run(request, folder, options)
-            cells = [{"cell": each.cell.title, "state": each.state, "bytes": each.size} for each in planned.cells]
+            cells = [
+                {"cell": each.cell.title, "state": each.state, "bytes": each.size, "changed": each.changed}
+                for each in planned.cells
+            ]
             facts = {"cells": cells, "bytes": planned.size, "free_bytes": planned.free}
             print_summary(str(planned.table()), facts, as_json=self.json)
             return

@@ -48,6 +48,7 @@ class CellForecast:
     state: str  # done, resume, new, same (as an earlier cell), or scene to make
     step: int = 0  # where training starts
     size: float = 0.0  # disk that it takes, bytes
+    changed: str = ""  # why it is done anew: what has changed since it was done, for instance ``code``
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,13 @@ class DryRun:
                 "state": each.state,
                 "steps": f"{each.step} of {each.cell.steps}" if each.step else str(each.cell.steps),
                 "disk": file_size(each.size) if each.size else None,
+                "changed": each.changed or None,
             }
             for each in self.cells
         ]
         columns = [Column("cell"), Column("state", words=True), Column("steps"), Column("disk")]
+        if any(each.changed for each in self.cells):
+            columns.append(Column("changed", "done before, but changed", words=True))
         return DisplayTable(str(self), columns, rows)
 
     def check_disk(self) -> None:
@@ -104,7 +108,8 @@ def forecast(
             forecasts.append(CellForecast(cell, "scene to make", size=sizes.of(cell)))
         else:
             step = folder.run(cell).step
-            forecasts.append(CellForecast(cell, "resume" if step else "new", step, sizes.of(cell)))
+            state = "resume" if step else "new"
+            forecasts.append(CellForecast(cell, state, step, sizes.of(cell), finished.changes(cell)))
         keys.add(key)
     phantoms = len({each.cell.scene.name for each in forecasts if each.state == "scene to make"})
     ordered = sorted((each.size for each in forecasts), reverse=True)

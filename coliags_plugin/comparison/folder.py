@@ -28,6 +28,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.results.hashing import code_key, training_config
 from coliags_plugin.results.reading import NewerResultError, read_result, write_result
 from coliags_plugin.results.record import Result
 
@@ -128,7 +129,7 @@ class ComparisonFolder:
         ]
         if changed:
             log.warning(
-                "%d cells are not those of the former plan, as their method, scene or the package has changed: %s",
+                "%d cells are not those of the former plan, as their method, scene or the code has changed: %s",
                 len(changed),
                 ", ".join(cell.title for cell in changed[:3]) + (", ..." if len(changed) > 3 else ""),
             )
@@ -215,6 +216,23 @@ class FinishedCells:
         if own is not None and own.key == cell.keys.result:
             return own
         return self._by_key.get(cell.keys.result)
+
+    def changes(self, cell: ComparisonCell) -> str:
+        """What has changed since a cell was done, for instance ``code, data``; empty where it never was."""
+        if cell.keys is None:
+            return ""
+        place = self._folder.result(cell).parent
+        seed = f"s{cell.seed}-"
+        former = [one for path, one in self._by_path.items() if path.parent == place and path.name.startswith(seed)]
+        former = [one for one in former if one.protocol.name == cell.protocol]
+        if not former:
+            return ""
+        changed = {
+            "code": all(one.software.get("code") != code_key() for one in former),
+            "method": all(training_config(one.config) != training_config(cell.config.model_dump()) for one in former),
+            "data": all(one.scene.fingerprint != cell.keys.fingerprint for one in former),
+        }
+        return ", ".join(name for name, differs in changed.items() if differs) or "protocol, or how it was run"
 
     def add(self, cell: ComparisonCell, result: Result) -> None:
         """Count a cell as done, and write its results file where that is not there.

@@ -10,7 +10,6 @@ from itertools import product
 from pathlib import PurePosixPath
 from typing import Any
 
-from coliags_plugin._version import __version__
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan_file import file_name
 from coliags_plugin.comparison.scenes import SceneSource
@@ -18,7 +17,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.engine.data_formats import data_manager, load_method_for
-from coliags_plugin.results.hashing import result_key, training_key
+from coliags_plugin.results.hashing import code_key, result_key, training_key
 
 #: Digits of a key in names of files.
 _SHORT = 8
@@ -146,8 +145,8 @@ def _seeds(
         if fingerprint is not None:
             keys = CellKeys(
                 fingerprint,
-                training_key(plain, fingerprint, seed, __version__),
-                result_key(plain, fingerprint, seed, __version__, request.protocol, protocol_version),
+                training_key(plain, fingerprint, seed, code_key()),
+                result_key(plain, fingerprint, seed, code_key(), request.protocol, protocol_version),
             )
         yield ComparisonCell(variant, scene, label, seed, request.protocol, overrides, config, keys)
 

@@ -15,6 +15,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers.choice import ChosenRenderer
+from coliags_plugin.results.hashing import code_key
 
 
 def run_provenance(
@@ -49,9 +50,10 @@ def run_provenance(
 
 
 def software() -> JsonObject:
-    """Versions, and the git state where the package runs from a checkout."""
+    """Versions, the key of the code, and the git state where the package runs from a checkout."""
     return {
         "package_version": __version__,
+        "code": code_key(),
         "git": _git_state(),
         "python": platform.python_version(),
         "torch": torch.__version__,

@@ -20,6 +20,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
 from coliags_plugin.core.json_files import JsonObject, parse_json, read_json
 from coliags_plugin.core.locks import locked
+from coliags_plugin.results.hashing import code_key
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
 if TYPE_CHECKING:
@@ -217,6 +218,16 @@ class RunFolder:
                 now.steps,
                 now.steps,
             )
+
+    def record_code(self, step: int) -> None:
+        """Write into the provenance by which code the run goes on from a step, if that is not the code before."""
+        provenance = self.provenance()
+        changes = provenance.get("code_changes", [])
+        before = changes[-1]["code"] if changes else provenance.get("code")
+        if before != code_key():
+            changes = [*changes, {"at_step": step, "code": code_key()}]
+            write_json(self.provenance_file, {**provenance, "code_changes": changes})
+            logger.warning("the code has changed since %s was begun; its result will have a key of its own", self.path)
 
     @contextmanager
     def log_writer(self) -> Iterator[Callable[[Mapping[str, Any]], None]]:

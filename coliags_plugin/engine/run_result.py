@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin._version import __version__
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import OPAQUE_ALPHA
@@ -22,7 +21,7 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth
-from coliags_plugin.results.hashing import ArraysHash, metrics_sha256, plain_config, result_key
+from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, plain_config, result_key
 from coliags_plugin.results.profiles import ErrorProfiles
 from coliags_plugin.results.record import (
     REFINED_METRICS,
@@ -152,7 +151,7 @@ def run_result(
             config,
             str(trained.scene.provenance.get("fingerprint", "")),
             trained.seed,
-            __version__,
+            code_key(),
             protocol.name,
             protocol.version,
             deviations,
@@ -240,16 +239,17 @@ def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
 
 
 def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> JsonObject:
-    """How a run differs from one that goes through as configured, with this version; empty where it does not."""
+    """How a run differs from one that goes through as configured, with this code; empty where it does not."""
     lengths = ("steps", "written_for")
     jumps = [
         change
         for change in provenance.get("schedule_changes", [])
         if any(change["from"][name] != change["to"][name] for name in lengths)
     ]
-    version = provenance.get("package_version", __version__)
+    trained_with = provenance.get("code", provenance.get("package_version", code_key()))
     return {
         **({} if step == configured else {"step": step}),
         **({"schedule_changes": jumps} if jumps else {}),
-        **({} if version == __version__ else {"trained_with": version}),
+        **({} if trained_with == code_key() else {"trained_with": trained_with}),
+        **({"code_changes": provenance["code_changes"]} if "code_changes" in provenance else {}),
     }

@@ -100,6 +100,8 @@ class Trainer:
         saved = checkpoints.take_newest(self.run.checkpoints, self.method.name, self.device)
         cost = None if saved is None else self._restore(saved)
         self.run.record_schedule(self.method.config, self.step, self.strategy.plan())
+        if self.step < self.steps:
+            self.run.record_code(self.step)
         rows = self._cut_log()
         if cost is None and saved is not None:  # of a version that measured seconds alone
             cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)

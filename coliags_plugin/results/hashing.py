@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,11 @@ from coliags_plugin.results.record import SetRecord
 _IGNORED = ("description", "protocol")
 #: Likewise of its data manager, what it allows to be read, and of its schedule.
 _IGNORED_WITHIN = {"datamanager": ("outside_files",), "schedule": ("log_every", "checkpoint_every")}
+#: Code that determines training and evaluation: all packages that the engine imports but presentation, and profiles.
+_CODE = (
+    *("core", "config", "lighting", "contracts", "geometry", "datamanagers", "fields", "renderers", "modules"),
+    *("strategies", "losses", "metrics", "engine", "results/profiles.py"),
+)
 
 
 class ArraysHash:
@@ -67,26 +74,43 @@ def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     return relevant
 
 
-def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package_version: str) -> str:
+def code_files() -> dict[str, Path]:
+    """Source files that determine training and evaluation, by their places within the package, sorted."""
+    package = Path(__file__).parents[1]
+    roots = [package / name for name in _CODE]
+    files = [file for root in roots for file in ([root] if root.is_file() else root.rglob("*.py"))]
+    return dict(sorted((file.relative_to(package).as_posix(), file) for file in files))
+
+
+@cache
+def code_key() -> str:
+    """Key of the package's code that determines training and evaluation, 16 hexadecimal digits.
+
+    It changes with any letter of these files. Components from elsewhere and libraries are not in it.
+    """
+    return _digest([[name, file.read_text(encoding="utf-8")] for name, file in code_files().items()])
+
+
+def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, code: str) -> str:
     """Key of a trained model by its resolved config, 16 hexadecimal digits; without how often is logged and saved."""
-    return _digest([training_config(config), fingerprint, seed, package_version])
+    return _digest([training_config(config), fingerprint, seed, code])
 
 
 def result_key(
     config: Mapping[str, Any],
     fingerprint: str,
     seed: int,
-    package_version: str,
+    code: str,
     protocol: str,
     protocol_version: int,
     deviations: Mapping[str, Any] | None = None,
 ) -> str:
     """Key of a result, 16 hexadecimal digits.
 
-    Deviations are how the run differs from one that goes through as configured: taken to another step, with another
-    schedule on the way, or trained by another version.
+    ``code`` is that of :func:`code_key`. Deviations are how the run differs from one that goes through as configured:
+    taken to another step, with another schedule on the way, or trained by other code.
     """
-    parts: list[Any] = [training_key(config, fingerprint, seed, package_version), protocol, protocol_version]
+    parts: list[Any] = [training_key(config, fingerprint, seed, code), protocol, protocol_version]
     if deviations:
         parts.append(plain_config(deviations))
     return _digest(parts)

@@ -10,8 +10,13 @@ from collections import namedtuple
 
 import pytest
 
+from coliags_plugin.comparison import folder as comparison_folder
+from coliags_plugin.comparison import plan
+from coliags_plugin.comparison.compare import make_request
+from coliags_plugin.comparison.dry_run import RunSizes, forecast
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.plan import make_cells
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.trainer import Trainer
@@ -64,6 +69,22 @@ def test_a_comparison_leaves_runs_results_and_a_plan(compared):
         assert len(list((compared / cell["run"] / "checkpoints").iterdir())) == 1
     assert not (compared / "failures").exists()
     assert str(compared) not in (compared / "plan.json").read_text()
+
+
+def test_a_forecast_says_what_has_changed_since_a_cell_was_done(wall, folder, monkeypatch):
+    comparison = ComparisonFolder(folder)
+
+    def states(overrides=TINY, scene=wall):
+        cells = make_cells(make_request(["coliags"], [scene], steps=3, overrides=overrides))
+        ahead = forecast(cells, comparison, comparison.finished(), RunSizes(comparison), 1)
+        return [(each.state, each.changed) for each in ahead.cells]
+
+    assert states() == [("done", "")]
+    assert states((*TINY, "field.features=4")) == [("new", "method")]
+    assert states(scene=write_wall(folder.parent / "wall", frames=10)) == [("new", "data")]
+    for module in (plan, comparison_folder):
+        monkeypatch.setattr(module, "code_key", lambda: "0123456789abcdef")
+    assert states() == [("new", "code")]
 
 
 def test_what_is_done_is_not_run_again(wall, folder):

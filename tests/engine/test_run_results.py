@@ -19,7 +19,7 @@ from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.results.hashing import result_key
+from coliags_plugin.results.hashing import code_key, result_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.results.summaries import means_summary
 from coliags_plugin.results.tables import per_frame_table
@@ -93,11 +93,11 @@ def result(whole):
 def test_it_says_what_the_run_was(result, whole, scene):
     config = load_method("coliags", [*SMALL, f"schedule.steps={STEPS}"]).config.model_dump()
     assert (result.method, result.seed, result.steps) == ("coliags", 0, STEPS)
-    assert result.key == result_key(config, "wall-9-True", 0, __version__, "paper", 1)
+    assert result.key == result_key(config, "wall-9-True", 0, code_key(), "paper", 1)
     assert result.config["schedule"]["steps"] == STEPS and result.config["field"]["voxel_size"] == 2.0
     assert result.scene.train == tuple(frame.name for frame in scene.train)
     assert (result.scene.name, result.scene.size) == ("wall", (32, 24))
-    assert result.software["package_version"] == __version__
+    assert (result.software["package_version"], result.software["code"]) == (__version__, code_key())
     assert result.provenance["training"]["renderer"] == "cpu"
     assert result.provenance["held_out_used"] == means_summary(result)["held_out_used"] == {"points": ["0000"]}
 
@@ -198,9 +198,16 @@ def test_runs_that_did_not_go_as_configured_have_keys_of_their_own(loaded, resul
     assert len(set(keys[:3])) == 3 and keys[3] == keys[1]
 
 
-def test_a_run_that_another_version_trained_has_a_key_of_its_own(whole, result):
-    older = replace(whole, provenance={**whole.provenance, "package_version": "0.0.1"})
-    assert read_result(evaluate(older, "paper") / RESULT_FILE).key != result.key
+def test_a_run_that_other_code_trained_has_a_key_of_its_own(whole, result):
+    """Other code all the way, or from the middle on; or an earlier version, which recorded none."""
+    earlier = {name: value for name, value in whole.provenance.items() if name != "code"}
+    others = [
+        {**whole.provenance, "code": "0123456789abcdef"},
+        {**whole.provenance, "code_changes": [{"at_step": 3, "code": "0123456789abcdef"}]},
+        {**earlier, "package_version": "0.0.1"},
+    ]
+    keys = [read_result(evaluate(replace(whole, provenance=own), "paper") / RESULT_FILE).key for own in others]
+    assert len({*keys, result.key}) == 4
 
 
 def test_it_says_what_the_run_cost(result, whole):

@@ -15,6 +15,7 @@ import torch
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,
     latest_checkpoint,
@@ -250,6 +251,20 @@ def test_a_changed_schedule_is_recorded(tmp_path):
     assert longer.run.provenance() == found
     with pytest.raises(InputError, match="has taken 6 steps already"):
         make_trainer(tmp_path / "run", steps=5).resume()
+
+
+def test_other_code_is_recorded_where_a_run_goes_on_with_it(tmp_path, monkeypatch, caplog):
+    train(tmp_path / "run", steps=4)
+    before = RunFolder(tmp_path / "run").provenance()
+    assert before["code"] == run_folder.code_key() and "code_changes" not in before
+    monkeypatch.setattr(run_folder, "code_key", lambda: "0123456789abcdef")
+    make_trainer(tmp_path / "run", steps=4).resume()  # there is nothing left to train
+    assert RunFolder(tmp_path / "run").provenance() == before
+    for _ in range(2):
+        make_trainer(tmp_path / "run", steps=6).resume()
+        changes = RunFolder(tmp_path / "run").provenance()["code_changes"]
+        assert changes == [{"at_step": 4, "code": "0123456789abcdef"}]
+    assert caplog.text.count("the code has changed since") == 1
 
 
 def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.results.hashing import ArraysHash, metrics_sha256, result_key
+from coliags_plugin.results import hashing
+from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
 from coliags_plugin.results.reading import read_result, write_result
 from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
 from coliags_plugin.results.summaries import means_summary
@@ -296,7 +297,7 @@ KEY = {
     "config": {"field": {"name": "anchors"}, "schedule": {"steps": 60}},
     "fingerprint": "f",
     "seed": 0,
-    "package_version": "1.0",
+    "code": "c",
     "protocol": "paper",
     "protocol_version": 1,
 }
@@ -308,7 +309,7 @@ KEY = {
         {"config": {"field": {"name": "anchors"}, "schedule": {"steps": 61}}},
         {"fingerprint": "g"},
         {"seed": 1},
-        {"package_version": "1.1"},
+        {"code": "d"},
         {"protocol": "authors-code"},
         {"protocol_version": 2},
         {"deviations": {"step": 30}},
@@ -316,6 +317,22 @@ KEY = {
 )
 def test_everything_that_determines_a_result_changes_its_key(changes):
     assert result_key(**{**KEY, **changes}) != result_key(**KEY)
+
+
+def test_the_key_of_the_code_changes_with_any_letter_of_its_files(tmp_path, monkeypatch):
+    key = code_key.__wrapped__
+    assert key() == key() == code_key()
+
+    def of(**files):
+        for name, content in files.items():
+            (tmp_path / name).write_bytes(content)
+        monkeypatch.setattr(hashing, "code_files", lambda: {name: tmp_path / name for name in files})
+        return key()
+
+    plain = of(one=b"x = 1\n", other=b"y = 2\n")
+    others = [of(one=b"x = 1\n", other=b"y = 3\n"), of(one=b"x = 1\ny = 2\n", other=b""), of(one=b"x = 1\n")]
+    assert len({plain, code_key(), *others}) == 5
+    assert of(one=b"x = 1\r\n", other=b"y = 2\r\n") == plain  # as git may check them out
 
 
 def test_what_does_not_determine_a_result_leaves_its_key():

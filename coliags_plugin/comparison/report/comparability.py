@@ -108,14 +108,12 @@ def cautions(study: Study) -> list[str]:
         *_missing_scenes(study),
         *_unpaired_seeds(study),
         *_later(study),
+        *_codes(study),
         *_steps(study),
         *_untrained_views(study),
         *_transparent(study),
         *_held_out_used(study),
     ]
-    for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
-        if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
-            texts.append(f"The runs come from different {what}.")
     sizes = dict.fromkeys(result.scene.size for result in results)
     if len(sizes) > 1:
         each = ", ".join(f"{width} x {height}" for width, height in sizes)
@@ -167,6 +165,37 @@ def _later(study: Study) -> list[str]:
         return []
     each = ", ".join(f"{method} ({counted(count, 'result')})" for method, count in later.items())
     return [f"Planned or changed after the first result, so that comparisons with them are exploratory: {each}."]
+
+
+def _codes(study: Study) -> list[str]:
+    """Which results come from which code, if not all are of one."""
+    by_code: dict[str, list[StudyRun]] = {}
+    for run in study.runs:
+        by_code.setdefault(code_of(run.result), []).append(run)
+    if len(by_code) < 2:
+        return []
+    texts = []
+    for code, runs in by_code.items():
+        counts = Counter(run.method for run in runs)
+        own = [
+            method if count == len(study.by_method[method]) else f"{method} ({count} of {len(study.by_method[method])})"
+            for method, count in counts.items()
+        ]
+        commits = dict.fromkeys(str(run.result.software["git"]) for run in runs if run.result.software.get("git"))
+        commit = f" (commit {', '.join(commits)})" if commits else ""
+        texts.append(f"{code}{commit}: {', '.join(own)}")
+    return [f"The results come from different code: {'; '.join(texts)}."]
+
+
+def code_of(result: Result) -> str:
+    """Key of the code that trained and evaluated; of earlier versions, which record none, the version."""
+    trained, evaluated = (
+        str(each.get("code") or f"version {each.get('package_version')}")
+        for each in (result.provenance.get("training", {}), result.software)
+    )
+    changes = result.provenance.get("training", {}).get("code_changes", [])
+    trained = ", then ".join(dict.fromkeys([trained, *(str(change["code"]) for change in changes)]))
+    return evaluated if trained in ("version None", evaluated) else f"{trained}, evaluated by {evaluated}"
 
 
 def _steps(study: Study) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from coliags_plugin.comparison.report.comparability import scene_provenance
+from coliags_plugin.comparison.report.comparability import code_of, scene_provenance
 from coliags_plugin.comparison.report.costs import training_device
 from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.reporting.model import Column, Folded, Section, Table, TableCell, leaves, record
@@ -65,6 +65,7 @@ def _row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
         "Run": run.stamp,
         "Device": training_device(result.cost),
         "Version": plain(result.software.get("package_version")),
+        "Code": code_of(result),
         "Key": result.key,
         "Values": result.metrics_sha256[:_DIGITS],
         "Predictions": predictions,

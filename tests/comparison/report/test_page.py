@@ -336,16 +336,37 @@ def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
 
 
 def test_cautions(study_of):
-    ours = result_of("coliags")
+    ours = result_of("coliags", software={"code": "c1"})
     other = result_of(
-        "3dgs", steps=80, software={"git": "def5678"}, data={"calibration": "fisheye"}, train=ours.scene.train
+        "3dgs",
+        steps=80,
+        software={"code": "c2", "git": "def5678"},
+        data={"calibration": "fisheye"},
+        train=ours.scene.train,
     )
     said = of(study_of, [ours, other]).cautions
     assert "The runs were trained for different numbers of steps: coliags 40, 3dgs 80." in said
-    assert "The runs come from different states of the source." in said
+    assert "The results come from different code: c1 (commit abc1234): coliags; c2 (commit def5678): 3dgs." in said
     assert "Runs of one scene record different data, see Provenance: calibration." in said
-    assert not any("versions of the package" in caution for caution in said)
-    assert of(study_of, [ours, result_of("3dgs")]).cautions == []
+    assert of(study_of, [ours, result_of("3dgs", software={"code": "c1", "git": "def5678"})]).cautions == []
+
+
+def test_results_of_different_code_are_told_apart(study_of):
+    """Trained and evaluated by other code, or resumed; of earlier versions, the version is all that is known."""
+
+    def result(scene, code, /, **training):
+        made = result_of("coliags", scene, software={"code": code, "git": None})
+        return made.model_copy(update={"provenance": {**made.provenance, "training": training}})
+
+    changes = [{"at_step": 3, "code": "c2"}]
+    results = [
+        result("p", "c1", code="c1"), result("q", "c2", code="c1"), result("r", "c2", code="c1", code_changes=changes),
+        result("s", None, package_version="0.1.0"),
+    ]  # fmt: skip
+    assert of(study_of, results).cautions == [
+        "The results come from different code: c1: coliags (1 of 4); c1, evaluated by c2: coliags (1 of 4); "
+        "c1, then c2, evaluated by c2: coliags (1 of 4); version 0.1.0: coliags (1 of 4)."
+    ]
 
 
 def test_what_was_made_from_held_out_images_is_said(study_of):
