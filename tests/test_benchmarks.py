@@ -94,7 +94,7 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
     assert plan["decided"]["reference"] == "coliags" and not any(
         cell["later"] for cell in plan["cells"] if cell["protocol"] == "paper"
     )
-    assert "coliags" in (run("results", "write", *options) and (out / "plateau.md").read_text())
+    assert "coliags" in (run("results", "write", *options) and (out / "plateau.csv").read_text())
 
 
 def test_the_training_step_by_stages(run):

@@ -90,7 +90,7 @@ class MedianDepthProtocol(ExpectedDepthProtocol):
 
     name: ClassVar[str] = "median-depth"
     description: ClassVar[str] = (
-        "The depth metrics of the protocol paper, of depth_median (z where the transmittance falls to 1/2); and PSNR, SSIM."
+        "The depth metrics of the protocol paper, of depth_median (z where transmittance falls to 1/2); and PSNR, SSIM."
     )
     depth: ClassVar[str] = "depth_median"
     wants: ClassVar[frozenset[str]] = frozenset({depth})
