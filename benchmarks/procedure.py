@@ -137,8 +137,11 @@ def _noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 #: Options of ``coliags reconstruct``: little training, and no surface of what is posed for less than a second.
 OPTIONS = ("--set", "frames.segment=400", "--set", "least_submap=30", "--diameter", "40", "--steps", "100")
-#: Names of files that hold times, or what ended a worker.
-_TIMED = ("reconstruction.json", "metrics.jsonl", "provenance.json", "result.json", "*.log", "*.html", ".*", "costs*")
+#: Names of files that hold times or places, or what ended a worker.
+_TIMED = (
+    *("reconstruction.json", "metrics.jsonl", "provenance.json", "result.json", "*.log", "*.html", ".*", "costs*"),
+    *("check.json", "state.json", "SHA256SUMS"),
+)
 
 
 @dataclass(frozen=True)
