@@ -20,18 +20,18 @@ from coliags_plugin.surface.coverage.visibility import Level, RayGrids, facing_c
 
 @dataclass(frozen=True)
 class CoverageScores:
-    """How well unseen surface was found; shares of area in [0, 1], None where there is no such surface."""
+    """How well unseen surface, the positive class, was found; shares of area in [0, 1], None of no such surface."""
 
     face_iou: float | None  # intersection over union of predicted and true unseen surface
     # Intersection over union of each true region with the predicted regions that overlap it, other true regions left
     # out; mean weighted by area.
     region_iou: float | None
     mean_region_iou: float | None  # the same, every region counting alike
-    recall: float | None  # share of the true regions of whose area at least half is predicted unseen
-    false_reassurance: float | None  # share of the unseen surface that is called seen
-    false_alarm: float | None  # share of the surface called unseen that was seen
-    unseen_among_called_seen: float | None  # share of the surface called seen that is unseen
-    called_unseen_among_seen: float | None  # share of the seen surface that is called unseen
+    region_recall: float | None  # share of the true regions of whose area at least half is predicted unseen
+    recall: float | None  # share of the unseen surface that is called unseen
+    precision: float | None  # share of the surface called unseen that is unseen
+    false_positive_rate: float | None  # share of the seen surface that is called unseen
+    false_omission_rate: float | None  # share of the surface called seen that is unseen
     true_regions: int  # their number, and that of the predicted ones
     predicted_regions: int
 
@@ -41,9 +41,10 @@ class CoverageScores:
         return {
             "face IoU": self.face_iou,
             "region IoU": self.region_iou,
+            "region recall": self.region_recall,
             "recall": self.recall,
-            "false reassurance": self.false_reassurance,
-            "false alarm": self.false_alarm,
+            "precision": self.precision,
+            "false positive rate": self.false_positive_rate,
         }
 
 
@@ -73,11 +74,11 @@ def score_unseen(
         face_iou=share(predicted & true, predicted | true),
         region_iou=float(np.average(ious, weights=[areas[region].sum() for region in truth])) if ious else None,
         mean_region_iou=float(np.mean(ious)) if ious else None,
-        recall=float(np.mean(caught)) if caught else None,
-        false_reassurance=share(~predicted, true),
-        false_alarm=share(~true, predicted),
-        unseen_among_called_seen=share(true, counted & ~predicted),
-        called_unseen_among_seen=share(predicted, counted & ~true),
+        region_recall=float(np.mean(caught)) if caught else None,
+        recall=share(predicted, true),
+        precision=share(true, predicted),
+        false_positive_rate=share(predicted, counted & ~true),
+        false_omission_rate=share(true, counted & ~predicted),
         true_regions=len(truth),
         predicted_regions=len(called),
     )
@@ -103,10 +104,11 @@ def _region_ious(
     return [float(value) for value in common / (whole + more)]
 
 
-#: Farthest that a triangle of the measured wall may be from the true one that it stands for, mm: the tolerance of
-#: the F-score of meshes.
+#: Farthest that a triangle of the measured wall may be from the true one that it stands for, mm, in place and normal
+#: together: the tolerance of the F-score of meshes, which is of place alone.
 _REACH = 1.0
-#: What the difference of two unit normals adds to their distance, mm: the front of a fold does not stand for its back.
+#: Weight of the difference of two unit normals in that distance, mm: the front of a fold does not stand for its back.
+#: At one place, normals may be 29 degrees apart.
 _NORMAL_WEIGHT = 2.0
 #: Relative error of the distance along a viewing ray up to which the ray confirms the surface that it truly hits.
 _SAME_DISTANCE = 0.25
@@ -118,7 +120,8 @@ _CELL, _SECTOR, _DRAWS = 10.0, 30.0, 10
 class CoverageEvaluation:
     """Scores on the true surface, within the true section."""
 
-    # Of the measured levels: true surface is called seen where the nearest reconstructed wall is, and lies within 1 mm.
+    # Of the measured levels: true surface is called seen where the nearest reconstructed wall is, and lies within 1 mm
+    # in place and normal: sqrt(distance^2 + (2 mm x difference of the unit normals)^2).
     surface: CoverageScores
     # Of the rule that a true triangle was seen where the measured wall is within 25 % of the distance along a viewing
     # ray that hits it.

@@ -54,11 +54,11 @@ def test_the_true_mesh_has_its_true_coverage(phantom, tmp_path):
     made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "made", settings)
     scores = made.evaluation.surface
     # Only triangles between the rays, seen by their centroids, differ.
-    assert scores.false_alarm == pytest.approx(0.0, abs=2e-3)
-    assert scores.face_iou > 0.9 and scores.region_iou > 0.9 and scores.recall == 1.0
+    assert scores.precision == pytest.approx(1.0, abs=2e-3)
+    assert scores.face_iou > 0.9 and scores.region_iou > 0.9 and scores.region_recall == 1.0
     rays = made.evaluation.rays
-    assert rays.face_iou > 0.995 and rays.false_reassurance == pytest.approx(0.0, abs=1e-6)
-    assert made.evaluation.all_unseen.false_reassurance == 0.0
+    assert rays.face_iou > 0.995 and rays.recall == pytest.approx(1.0, abs=1e-6)
+    assert made.evaluation.all_unseen.recall == 1.0
     assert made.evaluation.random.face_iou < scores.face_iou
 
 
@@ -74,7 +74,7 @@ def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     assert sum(found["shares"].values()) == pytest.approx(1.0)
     assert found["guessed_share"] > 0.05 and found["note"] == RESEARCH_USE
     # Nothing is called seen but what was reconstructed.
-    assert found["truth"]["surface"]["false_reassurance"] < 0.05
+    assert found["truth"]["surface"]["recall"] > 0.95
     rows = list(csv.DictReader((out / "regions.csv").open()))
     areas = [region["area"] for region in found["regions"]]
     assert [float(row["area_mm2"]) for row in rows] == pytest.approx(areas, abs=1e-3)
