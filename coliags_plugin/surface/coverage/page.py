@@ -213,8 +213,8 @@ def _against_truth(evaluation: CoverageEvaluation) -> list[Block]:
         "Recall: share of the unseen surface that is called unseen; region recall: of the regions, at least half of "
         "which is. Precision: share of the surface called unseen that is. False positive rate: share of the seen "
         "surface that is called unseen. Calling everything unseen has perfect recall, which says nothing alone. "
-        "Measured wall stands for true wall within 1 mm in place and normal together: at one place, for normals within 29 "
-        "degrees."
+        "Measured wall stands for true wall within 1 mm in place and normal together: at one place, for normals "
+        "within 29 degrees."
     )
     kinds = {
         "measured wall": evaluation.surface,
