@@ -13,6 +13,8 @@ from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Frames on either side of those that the response is fitted on, at least.
 _FEWEST = 3
+#: Least F statistic of how depth tells brightness, below which an instrument is weak (Staiger & Stock 1997).
+_STRONG = 10.0
 #: Least brightness, of encoded colours in [0, 1]; more than 0, which stands for none.
 _DARKEST = 1e-3
 
@@ -79,15 +81,37 @@ class Metering(nn.Module):
     def _log_brightness(self) -> Float[Tensor, "F"]:
         return self.brightness.cpu().double().log()
 
+    @cached_property
+    def _log_nearness(self) -> Float[Tensor, "F"] | None:
+        """Logarithm of the mean inverse depth of every training frame's data; None where a frame has none."""
+        means = []
+        for frame in self._scene.train:
+            sparse, depth = frame.sparse_depth, frame.depth
+            if depth is not None:
+                known = depth.cpu()[frame.valid.cpu()]
+            else:
+                known = torch.zeros(0) if sparse is None else sparse.depth.cpu()
+            known = known[known > 0.0].double()  # NaN is not
+            if not len(known):
+                return None
+            means.append(known.reciprocal().mean().log())
+        return torch.stack(means)
+
     def response(self, gains: Float[Tensor, "F"], before: int, after: int) -> float:
         """Change of the log gain per change of log brightness over the gap between two frames, from -1 to 0.
 
-        Least squares over the logarithms of the training frames' gains, each against what its neighbours at half the
-        gap on either side predict; 0 where the video is too short for that.
+        Over the training frames, each against what its neighbours at half the gap on either side predict. A fitted gain
+        and the brightness that it multiplies have errors, partly opposite ones, that least squares takes for a
+        response. The depth of the data, which they have no part in, is the instrument: covariance of the gain with log
+        inverse depth over that of the brightness. 0 where the video is too short, without depth, or depth tells too
+        little of the brightness.
         """
+        nearness = self._log_nearness
+        if nearness is None:
+            return 0.0
         times = torch.tensor(self._frames.times, dtype=torch.float64)
         gap = float(times[after] - times[before])
-        levels = torch.stack([gains, self._log_brightness])
+        levels = torch.stack([gains, self._log_brightness, nearness])
         most = (len(times) - _FEWEST) // 2
         if most < 1:
             return 0.0
@@ -95,5 +119,10 @@ class Metering(nn.Module):
         middle = slice(reach, len(times) - reach)
         first, last = times[: -2 * reach], times[2 * reach :]
         expected = torch.lerp(levels[:, : -2 * reach], levels[:, 2 * reach :], (times[middle] - first) / (last - first))
-        gain, brightness = levels[:, middle] - expected
-        return float((gain @ brightness / (brightness @ brightness).clamp_min(1e-12)).clamp(-1.0, 0.0))
+        gain, brightness, near = levels[:, middle] - expected
+        common = brightness @ near
+        explained = common**2 / ((brightness @ brightness) * (near @ near)).clamp_min(1e-24)
+        # Frames nearer to each other than the reach share neighbours.
+        if not len(near) / reach * explained >= _STRONG * (1.0 - explained):
+            return 0.0
+        return float((gain @ near / common).clamp(-1.0, 0.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -116,13 +117,20 @@ def rendering(level):
     return RenderOutput(torch.full((24, 32, 3), level), torch.ones(24, 32), None, {})
 
 
+def with_depths(scene, depths):
+    """The scene with one depth throughout each training frame."""
+    train = [replace(frame, depth=torch.full((24, 32), float(z))) for frame, z in zip(scene.train, depths, strict=True)]
+    return replace(scene, train=train)
+
+
 def exposed(frames=33, answer=-0.6, gap=1):
     """A module whose gains answer the brightness of training frames exactly, its scene, and that law's constant."""
     scene = wall_scene(frames)
     kept = range(0, len(scene.train), gap)
     scene = replace(scene, train=[scene.train[index] for index in kept])
-    module = make(scene=scene, untrained="metered")
     levels = torch.tensor([0.5 + 0.2 * math.sin(0.9 * index) for index in kept])
+    scene = with_depths(scene, 10.0 / levels)
+    module = make(scene=scene, untrained="metered")
     for frame, level in zip(scene.train, levels, strict=True):
         module.after_step(frame.view(trained=True), rendering(float(level)))
     brightness = levels.double().log()
@@ -139,6 +147,62 @@ def test_held_out_frames_are_exposed_as_training_frames_of_their_brightness(answ
         output = rendering(level)
         gain = float((module.shade(output, frame.view(trained=False)).rgb.detach() / output.rgb)[0, 0, 0])
         assert math.log(gain) == pytest.approx(answer * math.log(level) + constant, abs=1e-4)
+
+
+def fitted_response(answer, noise, kind, gap, seed):
+    """Responses by the module and by least squares to an exposure that answers brightness, fitted with noise.
+
+    ``noise``: standard deviation of log gain and log brightness; ``kind``: whether their errors are opposite, or each
+    has its own.
+    """
+    rng = np.random.default_rng(seed)
+    time, phase = np.arange(120), rng.uniform(0, 2 * np.pi, 2)
+    near = 0.3 * np.sin(0.5 * time + phase[0]) + 0.3 * np.sin(0.15 * time + phase[1])
+    brightness = 0.9 * near + rng.normal(0.0, 0.01, 120)
+    error = rng.normal(0.0, noise, 120)
+    gains = answer * brightness + error
+    rendered = brightness + (-error if kind == "opposite" else rng.normal(0.0, noise, 120))
+    scene = wall_scene(1)
+    frame = replace(scene.test_sets["test"][0], mask=None)
+    frames = [replace(frame, name=f"{index:04d}", index=index) for index in time]
+    module = make(
+        scene=with_depths(replace(scene, train=frames, test_sets={}), 20.0 * np.exp(-near)), untrained="metered"
+    )
+    module.metering.brightness.copy_(torch.from_numpy(np.exp(rendered - 2.0)))
+    reach = max(1, gap // 2)
+    residuals = [v[reach:-reach] - 0.5 * (v[: -2 * reach] + v[2 * reach :]) for v in (gains, rendered)]
+    naive = residuals[0] @ residuals[1] / (residuals[1] @ residuals[1])
+    return module.metering.response(torch.from_numpy(gains), 40, 40 + gap), naive
+
+
+@pytest.mark.parametrize("answer", [0.0, -0.3, -0.7, -1.0])
+@pytest.mark.parametrize(("gap", "tolerance"), [(2, 0.03), (20, 0.03)])
+@pytest.mark.parametrize("kind", ["opposite", "own"])
+def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer, gap, tolerance, kind):
+    for noise in (0.0, 0.01, 0.03):
+        found = np.mean([fitted_response(answer, noise, kind, gap, seed)[0] for seed in range(12)])
+        assert found == pytest.approx(answer, abs=tolerance if noise else 1e-5), noise
+
+
+def test_least_squares_takes_errors_for_a_response():
+    """So that the test above means something."""
+    opposite = [fitted_response(0.0, 0.03, "opposite", 2, seed)[1] for seed in range(12)]
+    own = [fitted_response(-1.0, 0.03, "own", 2, seed)[1] for seed in range(12)]
+    assert np.mean(opposite) < -0.3
+    assert np.mean(own) > -0.5
+
+
+def test_depth_that_tells_nothing_of_the_brightness_gives_no_response():
+    module, scene, _ = exposed()
+    rng = np.random.default_rng(0)
+    for depths in (np.full(len(scene.train), 20.0), rng.uniform(10.0, 30.0, len(scene.train))):
+        other = make(scene=with_depths(scene, depths), untrained="metered")
+        other.metering.brightness.copy_(module.metering.brightness)
+        assert other.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
+    bare = replace(scene, train=[replace(frame, depth=None) for frame in scene.train])
+    other = make(scene=bare, untrained="metered")
+    other.metering.brightness.copy_(module.metering.brightness)
+    assert other.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
 
 
 def test_metering_leaves_other_views_alone():
