@@ -19,6 +19,7 @@ from pydantic import (
 from typing_extensions import Self
 
 from coliags_plugin.config.registry import phantom_layouts
+from coliags_plugin.config.yaml_tree import tuples
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
 from coliags_plugin.lighting.beams import SpreadLaw
@@ -438,7 +439,7 @@ class PhantomSettings(Settings):
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
     """Validate plain options; an error names the first that is unknown, of the wrong type or out of range."""
     try:
-        return PhantomSettings(**options)
+        return PhantomSettings(**{name: tuples(value) for name, value in options.items()})
     except ValidationError as error:
         key, message, value = first_error(error)
         raise InputError(

@@ -424,6 +424,7 @@ def test_presets_fill_what_is_left_open():
     strong = PhantomSettings(light="strong").resolved()
     assert (strong.gain, strong.spread_law, strong.spread, strong.vignetting) == ("fixed", "cosine", 1.5, 2.5)
     assert strong.light_offset == (0.0, 0.0, 0.0)
+    assert phantom_settings({"lamps": [[3.0, 0.0, 0.0]]}).lamps == ((3.0, 0.0, 0.0),)
     mild = phantom_settings({"gain": "fixed", "layout": "c3vd-raw", "vignetting": 0.0}).resolved()
     assert (mild.gain, mild.vignetting, mild.light_offset) == ("fixed", 0.0, (0.0, 0.0, -3.6))
 
