@@ -29,7 +29,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.results.record import Result
 
 #: Trials of each method, as many of one kind of field as of the other: anchors in finer voxels, and with twice the
-#: births; other fields from more points, and without resets of opacities, which short runs hardly recover from.
+#: births; other fields from more points, and with half the gradient from which they densify.
 TRIALS: dict[str, tuple[tuple[str, ...], ...]] = {
     "anchors": (
         *((f"field.voxel_pixels={pixels}",) for pixels in (4.0, 3.0, 2.0)),
@@ -37,7 +37,7 @@ TRIALS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "points": (
         *((f"datamanager.points_count={count}",) for count in (50_000, 100_000, 200_000)),
-        ("datamanager.points_count=100000", "strategy.reset_every=1000000"),
+        ("datamanager.points_count=100000", "strategy.gradient_threshold=0.0001"),
     ),
 }
 #: Test frames of the tuning phantoms: every eighth from the fifth on, which are no test frames of ``every-8th``.

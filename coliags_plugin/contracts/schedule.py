@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: Steps between two events where a run is so short that its share would be less.
+_LEAST_INTERVAL = 4
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -25,8 +28,11 @@ class Schedule:
         return round(step * self.steps / self.written_for)
 
     def interval(self, steps: int) -> int:
-        """The steps of this run between events that the config places ``steps`` apart; at least 1."""
-        return max(1, self.at(steps))
+        """The steps of this run between events that the config places ``steps`` apart; at least 4 of a shortened one.
+
+        Fewer views say too little of what is to be done.
+        """
+        return max(min(steps, _LEAST_INTERVAL), self.at(steps))
 
     def events(self, after: int, until: int, every: int) -> range:
         """Steps of this run at which something happens: multiples of an interval, between two steps.

@@ -67,8 +67,8 @@ def test_statistics_keep_their_share_of_the_run(steps, first, last):
     [
         (30_000, "at 134 steps, from 1600 to 14900", range(1600, 14_901, 100)),
         (3000, "at 134 steps, from 160 to 1490", range(160, 1491, 10)),
-        (200, "at 89 steps, from 11 to 99", range(11, 100)),
-        (2, "neither grows nor prunes anchors: its 2 steps leave no multiple of 1 between steps 0 and 1", []),
+        (200, "at 22 steps, from 12 to 96", range(12, 100, 4)),
+        (2, "neither grows nor prunes anchors: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
     ],
 )
 def test_the_plan_is_what_happens(steps, plan, expected):
