@@ -438,8 +438,9 @@ class PhantomSettings(Settings):
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
     """Validate plain options; an error names the first that is unknown, of the wrong type or out of range."""
+    plain: dict[str, Any] = {name: tuples(value) for name, value in options.items()}
     try:
-        return PhantomSettings(**{name: tuples(value) for name, value in options.items()})
+        return PhantomSettings(**plain)
     except ValidationError as error:
         key, message, value = first_error(error)
         raise InputError(
