@@ -1,4 +1,4 @@
-"""How often 95 % intervals of a mean contain it where scenes are few, as a Markdown table.
+"""Coverage of 95 % confidence intervals of the mean of small samples: percentile bootstrap, BCa and t.
 
 python benchmarks/interval_coverage.py
 """
@@ -46,7 +46,7 @@ class Options:
 
 
 def coverage(draw: Draw, mean: float, scenes: int, options: Options) -> dict[str, float]:
-    """Share of samples whose interval contains the true mean."""
+    """Empirical coverage by method: the share of samples whose interval contains the true mean."""
     rng = np.random.default_rng(scenes)
     inside: dict[str, list[Float[np.ndarray, "trials"]]] = {}
     for begin in range(0, options.trials, CHUNK):

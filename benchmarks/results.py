@@ -1,4 +1,4 @@
-"""The tables of docs/results.md from nothing: choices on tuning phantoms, then one measurement on the test phantoms.
+"""Experiments of docs/results.md: hyperparameters chosen on tuning phantoms, then all tables on test phantoms.
 
 python benchmarks/results.py tune OUT
 python benchmarks/results.py measure OUT
@@ -12,8 +12,7 @@ ablation. ``write`` makes the reports. Whatever is killed, the same command goes
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,8 @@ import coliags_plugin
 from coliags_plugin.comparison.named_files import Variant, load_ablation
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.results.record import Result
 
 #: Trials of each method, as many of one kind of field as of the other: anchors in finer voxels, and with twice the
@@ -91,7 +92,8 @@ class Tune(_Command):
         trials = {method.name: _trials(method) for method in methods}
         every = [one for own in trials.values() for one in own]
         results = self.compare("trials", every, self.tuning, splits=[VALIDATION], steps=self.steps)
-        psnr, seconds = _means(results, "psnr"), _seconds(results)
+        psnr = _means(results, _psnr)
+        seconds = _means(results, lambda result: result.cost.processor_seconds)
         best = {name: max(own, key=lambda one: psnr[one.name]) for name, own in trials.items()}
         budget = seconds[best[methods[0].name].name]
         chosen = {
@@ -104,7 +106,7 @@ class Tune(_Command):
         }
         for method in methods[:TO_PLATEAU]:
             chosen[method.name]["plateau"] = self._climbed(replace(best[method.name], name=method.name))
-        self.tuned.write_text(json.dumps(chosen, indent=2) + "\n", encoding="utf-8")
+        write_json(self.tuned, chosen)
         keys = ("changes", "equal_time_steps", "plateau")
         print(markdown_table([{"method": name} | {key: one.get(key) for key in keys} for name, one in chosen.items()]))
 
@@ -113,7 +115,7 @@ class Tune(_Command):
         reached: dict[str, float] = {}
         for steps in LADDER:
             results = self.compare(f"ladder-{steps}", [variant], self.tuning, splits=[VALIDATION], steps=steps)
-            before, reached[str(steps)] = [*reached.values()], _means(results, "psnr")[variant.name]
+            before, reached[str(steps)] = [*reached.values()], _means(results, _psnr)[variant.name]
             if before and reached[str(steps)] < before[-1] + RISE:
                 break
         return reached
@@ -127,7 +129,7 @@ class Measure(_Command):
         """Measure in equal time, at the plateaus, and the rows of the paper's ablation."""
         if not self.tuned.is_file():
             raise InputError(f"{self.tuned} is not there", "the choices", "run the command `tune` first")
-        chosen = json.loads(self.tuned.read_text(encoding="utf-8"))
+        chosen = read_json(self.tuned, "the choices")
         methods = load_ablation("rivals")
         equal = [_with(method, chosen, chosen[method.name]["equal_time_steps"]) for method in methods]
         self.compare("equal-time", equal, self.test, reference=methods[0].name, primary=PRIMARY)
@@ -145,7 +147,7 @@ class Measure(_Command):
 
 @dataclass(frozen=True)
 class Write(_Command):
-    """Command that writes reports of what was measured."""
+    """Command that writes the reports of all comparisons on the test phantoms."""
 
     def run(self) -> None:
         """Write every comparison's report as a page, Markdown and CSV."""
@@ -175,22 +177,18 @@ def _with(method: Variant, chosen: Mapping[str, Any], steps: int) -> Variant:
     return replace(method, overrides=(*method.overrides, *changes, f"schedule.steps={steps}"))
 
 
-def _means(results: Sequence[Result], metric: str) -> dict[str, float]:
-    """Mean over scenes of a metric, by method."""
-    values: dict[str, list[float]] = {}
-    for result in results:
-        mean = result.mean(metric)
-        if mean is None:
-            raise InputError(f"{result.title} has no {metric}", "a value for every run")
-        values.setdefault(result.method, []).append(mean)
-    return {name: float(np.mean(own)) for name, own in values.items()}
+def _psnr(result: Result) -> float | None:
+    return result.mean("psnr")
 
 
-def _seconds(results: Sequence[Result]) -> dict[str, float]:
-    """Mean over scenes of the processor time of training, by method, s."""
+def _means(results: Sequence[Result], measure: Callable[[Result], float | None]) -> dict[str, float]:
+    """Mean of a measure over the scenes, by method; an error where a run lacks it."""
     values: dict[str, list[float]] = {}
     for result in results:
-        values.setdefault(result.method, []).append(float(result.cost.processor_seconds or np.nan))
+        value = measure(result)
+        if value is None:
+            raise InputError(f"{result.title} lacks a measure", "PSNR and processor time of every run")
+        values.setdefault(result.method, []).append(value)
     return {name: float(np.mean(own)) for name, own in values.items()}
 
 

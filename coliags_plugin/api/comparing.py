@@ -45,8 +45,8 @@ def compare(
         splits: Splits, each trained apart; empty: each scene's own.
         steps: Training steps of all runs; None: each method's own.
         settings: Changes of all method configs, see :func:`~coliags_plugin.api.training.train`.
-        reference: Method that reports compare the others with, decided before the first run; only of a new folder.
-        primary: Metrics decided likewise; in reports, p-values of others are exploratory and have no stars.
+        reference: Reference method of the tests in reports, fixed before the first run; only for a new folder.
+        primary: Metrics fixed likewise; in reports, p-values of others are exploratory and have no stars.
         jobs: Runs at a time; None: one per CPU, or per GPU.
         threads: CPU threads of each run; None: the CPUs divided by the runs at a time.
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.

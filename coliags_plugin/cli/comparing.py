@@ -33,7 +33,7 @@ class ComparisonArguments:
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
     """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
     reference: arguments.OptionalText = None
-    """Method that reports compare the others with, decided before the first run; only where the folder is new."""
+    """Reference method of the statistical tests in reports, fixed before the first run; only for a new folder."""
     primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
     """Metrics decided likewise; in reports, p-values of others are exploratory and have no stars."""
     jobs: arguments.OptionalInt = None

@@ -122,7 +122,8 @@ class ComparisonFolder:
 
         With results in the folder, new and changed cells are recorded as later. Only a new plan takes up a decision.
         """
-        before, is_new = self.plan(), read_plan(self.path) is None
+        former_plan = read_plan(self.path)
+        before = former_plan or ComparisonPlan()
         entries = {entry.identity: entry for entry in before.cells}
         changed = [
             cell for cell in cells if cell.identity in entries and entries[cell.identity].key != cell.known_keys.result
@@ -147,7 +148,7 @@ class ComparisonFolder:
                 phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__
             )
         decided = before.decided
-        if is_new and request.reference is not None:
+        if former_plan is None and request.reference is not None:
             today = datetime.now(timezone.utc).date().isoformat()
             decided = Decision(reference=request.reference, primary=tuple(request.primary), date=today)
         plan = ComparisonPlan(
@@ -205,7 +206,7 @@ class FinishedCells:
         self._by_key = {result.key: result for result in results.values()}
 
     def __len__(self) -> int:
-        """Number of results, of whatever cells."""
+        """Number of results in the folder."""
         return len(self._by_path)
 
     def of(self, cell: ComparisonCell) -> Result | None:
@@ -218,7 +219,7 @@ class FinishedCells:
         return self._by_key.get(cell.keys.result)
 
     def changes(self, cell: ComparisonCell) -> str:
-        """What has changed since a cell was done, for instance ``code, data``; empty where it never was."""
+        """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
         if cell.keys is None:
             return ""
         place = self._folder.result(cell).parent

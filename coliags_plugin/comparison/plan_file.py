@@ -31,7 +31,7 @@ class PlannedScene(_PlanPart):
 
 
 class Decision(_PlanPart):
-    """What was decided before the first run of a comparison."""
+    """Pre-registered analysis: reference method and primary metrics, fixed before the first run."""
 
     reference: str  # method that the others are compared with
     primary: tuple[str, ...] = Field(min_length=1)  # metrics whose p-values are not exploratory

@@ -171,7 +171,7 @@ def run_result(
             "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
             "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
             "scene": {name: value for name, value in data.provenance.items() if name not in _LEFT_OUT},
-            **{name: used for name in ("held_out_used",) if (used := trained.scene.provenance.get(name))},
+            **({"held_out_used": used} if (used := trained.scene.provenance.get("held_out_used")) else {}),
             **({"learned": learned} if (learned := trained.model.learned) else {}),
             **({} if truth is None else {"truth": _described(truth, trained.scene)}),
         },

@@ -159,7 +159,7 @@ def _unpaired_seeds(study: Study) -> list[str]:
 
 
 def _later(study: Study) -> list[str]:
-    """Results that a comparison whose reference and metrics were decided did not plan before its first one."""
+    """Caution about results that were planned after the first one of a pre-registered comparison."""
     later = Counter(run.method for run in study.runs if not run.planned)
     if study.decided is None or not later:
         return []

@@ -89,7 +89,7 @@ def cost_table(study: Study) -> Table:
 
 
 def _plans(study: Study) -> list[str]:
-    """What each method's strategy planned for its runs, as far as that was recorded."""
+    """Recorded plans of densification and pruning, one line for each method and plan."""
     return [
         f"{method}: {plan}"
         for method, own in study.by_method.items()

@@ -63,7 +63,7 @@ def _best_method(part: Part) -> str:
 
 
 def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
-    """The reference compared with every other method shown, by one metric; empty where it has no value."""
+    """Paired comparisons of the reference with every shown method by one metric; empty where it has no value."""
     study, values = part.study, part.values(column.key, hidden=True)
     if column.direction is None or not values[reference]:
         return []
@@ -198,7 +198,7 @@ def _family_text(study: Study) -> list[str]:
 
 
 def _decision_text(study: Study, reference: str) -> str:
-    """What was decided before the first result, and what follows for the p-values."""
+    """Sentences on the pre-registered reference and metrics, and on which p-values are exploratory."""
     decided = study.decided
     if decided is None:
         return (
