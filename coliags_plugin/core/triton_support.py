@@ -9,6 +9,9 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+#: The oldest release of triton that all kernels compile with; PyTorch 2.11 brings it.
+OLDEST = (3, 6)
+
 
 @cache
 def what_triton_lacks() -> str | None:
@@ -18,6 +21,10 @@ def what_triton_lacks() -> str | None:
     """
     if find_spec("triton") is None:
         return "triton is not installed; PyTorch for CUDA on Linux brings it"
+    import triton
+
+    if tuple(int(part) for part in triton.__version__.split(".")[:2]) < OLDEST:
+        return f"triton {triton.__version__} is older than 3.6, which PyTorch 2.11 brings"
     if os.environ.get("CC") is None and shutil.which("gcc") is None and shutil.which("clang") is None:
         return "triton finds no C compiler to call the driver by: install gcc, or name one in CC"
     scheme = sysconfig.get_default_scheme()

@@ -1,8 +1,10 @@
 """What is said where triton cannot launch kernels."""
 
 import shutil
+import sys
 import sysconfig
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,6 +14,7 @@ from coliags_plugin.core import triton_support
 @pytest.fixture
 def lacks(monkeypatch):
     monkeypatch.setattr(triton_support, "find_spec", lambda name: object())
+    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.10.0"))
     monkeypatch.delenv("CC", raising=False)
     return triton_support.what_triton_lacks.__wrapped__
 
@@ -19,6 +22,11 @@ def lacks(monkeypatch):
 def test_without_triton(lacks, monkeypatch):
     monkeypatch.setattr(triton_support, "find_spec", lambda name: None)
     assert "triton is not installed" in lacks()
+
+
+def test_with_a_triton_that_cannot_compile_the_kernels(lacks, monkeypatch):
+    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.5.1"))
+    assert "triton 3.5.1 is older than 3.6" in lacks()
 
 
 def test_without_a_compiler_or_the_headers_of_python(lacks, monkeypatch, tmp_path):

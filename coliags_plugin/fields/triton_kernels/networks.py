@@ -130,15 +130,16 @@ def _hidden(table, features, inputs, rows, seen, unit, NETWORK: tl.constexpr):
 @triton.jit
 def outputs(table, features, inputs, rows, seen, child, NETWORK: tl.constexpr):
     """The outputs of the children, one block [R, K] each."""
+    COUNT: tl.constexpr = NETWORK.outputs  # before triton 3.9, the field itself is no constexpr
     found = ()
-    for output in tl.static_range(NETWORK.outputs):
+    for output in tl.static_range(COUNT):
         bias = tl.load(table + _last_biases(child, output, NETWORK), child < NETWORK.children, 0.0)
         found += (tl.zeros([ROWS, child.shape[0]], tl.float32) + bias[None, :],)
     for first in range(0, NETWORK.units, UNITS):
         unit = first + tl.arange(0, UNITS)
         hidden = _hidden(table, features, inputs, rows, seen, unit, NETWORK)
         sums = ()
-        for output in tl.static_range(NETWORK.outputs):
+        for output in tl.static_range(COUNT):
             place, here = _last_weights(child, unit, output, NETWORK)
             weights = tl.trans(tl.load(table + place, here, 0.0))
             sums += (tl.dot(hidden, weights, found[output], input_precision=PRECISION),)
