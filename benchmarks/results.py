@@ -2,12 +2,14 @@
 
 python benchmarks/results.py tune OUT
 python benchmarks/results.py measure OUT
+python benchmarks/results.py plateau OUT
 python benchmarks/results.py write OUT
 
-``tune`` tries changes of every method of the ablation ``rivals`` on held-out frames of the benchmark
-``phantoms-tuning``, as many of each, and then run lengths; what is chosen is ``OUT/tuned.json``. ``measure`` trains on
-``phantoms-12`` with these choices: in equal processor time, to each method's plateau, and the rows of the paper's
-ablation. ``write`` makes the reports. Whatever is killed, the same command goes on.
+``tune`` tries changes of every method of the ablation ``rivals`` on held-out frames of two scenes of the benchmark
+``phantoms-tuning``, as many of each; what is chosen is ``OUT/tuned.json``. ``measure`` trains on ``phantoms-12`` with
+these choices in equal processor time, the rows of the paper's ablation, and with several seeds. ``plateau`` finds run
+lengths on the tuning scenes, and trains so long on ``phantoms-12``. ``write`` makes the reports. Whatever is killed,
+the same command goes on.
 """
 
 from __future__ import annotations
@@ -29,18 +31,21 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.results.record import Result
 
-#: Trials of each method, as many of one kind of field as of the other: anchors in finer voxels, and with twice the
-#: births; other fields from more points, and with half the gradient from which they densify.
+#: Trials of each method, as many of one kind of field as of the other: anchors in finer voxels, other fields from more
+#: points; and with few events of densification, one after three tenths of the run.
 TRIALS: dict[str, tuple[tuple[str, ...], ...]] = {
     "anchors": (
-        *((f"field.voxel_pixels={pixels}",) for pixels in (4.0, 3.0, 2.0)),
-        ("field.voxel_pixels=3.0", "strategy.pixels_per_birth=250"),
+        ("field.voxel_pixels=3.0",),
+        ("field.voxel_pixels=2.0",),
+        ("field.voxel_pixels=2.0", "strategy.every={few}"),
     ),
     "points": (
-        *((f"datamanager.points_count={count}",) for count in (50_000, 100_000, 200_000)),
-        ("datamanager.points_count=100000", "strategy.gradient_threshold=0.0001"),
+        ("datamanager.points_count=50000",),
+        ("datamanager.points_count=100000",),
+        ("datamanager.points_count=100000", "strategy.every={few}"),
     ),
 }
+FEW = 0.3
 #: Test frames of the tuning phantoms: every eighth from the fifth on, which are no test frames of ``every-8th``.
 VALIDATION = "inner-8th"
 #: The row of the paper's ablation that has all parts.
@@ -50,23 +55,23 @@ SEVERAL_SEEDS, SEEDS, TO_PLATEAU = 4, 3, 8
 #: What the first method of a table is compared with the others by; decided before anything is measured.
 PRIMARY = ("psnr", "depth_mse_inner")
 #: Run lengths on the way to a plateau, and by how much twice as many steps must raise PSNR for the way to go on, dB.
-LADDER, RISE = (1000, 2000, 4000, 8000), 0.1
+LADDER, RISE = (1000, 2000, 4000), 0.1
 
 
 @dataclass(frozen=True)
 class _Command:
     out: tyro.conf.Positional[Path]
     """Folder of all runs and results."""
-    tuning: str = "phantoms-tuning"
-    """Benchmark or scenes on which choices are made."""
-    test: str = "phantoms-12"
+    tuning: tuple[str, ...] = ("phantoms-tuning/strong-4229", "phantoms-tuning/guides-inspection-5063")
+    """Scenes on which choices are made."""
+    test: tuple[str, ...] = ("phantoms-12",)
     """Benchmark or scenes that are measured."""
-    steps: int = 1500
+    steps: int = 1000
     """Steps of the trials; the processor time of ``coliags`` for as many is what every method gets."""
     jobs: int | None = None
     """Runs at a time."""
 
-    def compare(self, name: str, variants: Sequence[Variant], scenes: str, **options: Any) -> list[Result]:
+    def compare(self, name: str, variants: Sequence[Variant], scenes: Sequence[str], **options: Any) -> list[Result]:
         """Train and evaluate variants in a folder of their own; all must succeed."""
         done = coliags_plugin.compare(variants, scenes, self.out / name, jobs=self.jobs, **options)
         print(done.table(), flush=True)
@@ -84,7 +89,7 @@ class _Command:
 
 @dataclass(frozen=True)
 class Tune(_Command):
-    """Command that chooses changes and run lengths of every method on validation frames of the tuning phantoms."""
+    """Command that chooses changes of every method on validation frames of the tuning phantoms."""
 
     def run(self) -> None:
         """Try, choose and write the choices."""
@@ -98,51 +103,66 @@ class Tune(_Command):
         budget = seconds[best[methods[0].name].name]
         chosen = {
             name: {
-                "changes": TRIALS[_kind(one)][trials[name].index(one)],
+                "changes": _changes(one)[trials[name].index(one)],
                 "trials": {each.name: [psnr[each.name], seconds[each.name]] for each in trials[name]},
                 "equal_time_steps": max(100, round(self.steps * budget / seconds[one.name], -2)),
             }
             for name, one in best.items()
         }
-        for method in methods[:TO_PLATEAU]:
-            chosen[method.name]["plateau"] = self._climbed(replace(best[method.name], name=method.name))
         write_json(self.tuned, chosen)
-        keys = ("changes", "equal_time_steps", "plateau")
-        print(markdown_table([{"method": name} | {key: one.get(key) for key in keys} for name, one in chosen.items()]))
+        keys = ("changes", "equal_time_steps")
+        print(markdown_table([{"method": name} | {key: one[key] for key in keys} for name, one in chosen.items()]))
 
-    def _climbed(self, variant: Variant) -> dict[str, float]:
-        """PSNR by run length, doubled until it no longer rises; the last is that of the plateau."""
-        reached: dict[str, float] = {}
-        for steps in LADDER:
-            results = self.compare(f"ladder-{steps}", [variant], self.tuning, splits=[VALIDATION], steps=steps)
-            before, reached[str(steps)] = [*reached.values()], _means(results, _psnr)[variant.name]
-            if before and reached[str(steps)] < before[-1] + RISE:
-                break
-        return reached
+
+class _WithChoices(_Command):
+    def chosen(self) -> dict[str, Any]:
+        """What was chosen of every method."""
+        if not self.tuned.is_file():
+            raise InputError(f"{self.tuned} is not there", "the choices", "run the command `tune` first")
+        return read_json(self.tuned, "the choices")
 
 
 @dataclass(frozen=True)
-class Measure(_Command):
+class Measure(_WithChoices):
     """Command that trains and evaluates on the test phantoms as was chosen."""
 
     def run(self) -> None:
-        """Measure in equal time, at the plateaus, and the rows of the paper's ablation."""
-        if not self.tuned.is_file():
-            raise InputError(f"{self.tuned} is not there", "the choices", "run the command `tune` first")
-        chosen = read_json(self.tuned, "the choices")
-        methods = load_ablation("rivals")
+        """Measure in equal time, the rows of the paper's ablation, and the first methods with several seeds."""
+        chosen, methods = self.chosen(), load_ablation("rivals")
         equal = [_with(method, chosen, chosen[method.name]["equal_time_steps"]) for method in methods]
         self.compare("equal-time", equal, self.test, reference=methods[0].name, primary=PRIMARY)
         for protocol in ("expected-depth", "median-depth"):
             self.compare("equal-time", equal, self.test, protocol=protocol)
-        # Apart: what is added to a comparison after its first result is exploratory.
-        several = equal[:SEVERAL_SEEDS]
-        self.compare("seeds", several, self.test, seeds=SEEDS, reference=methods[0].name, primary=PRIMARY)
-        long = [_with(method, chosen, int([*chosen[method.name]["plateau"]][-1])) for method in methods[:TO_PLATEAU]]
-        self.compare("plateau", long, self.test, reference=methods[0].name, primary=PRIMARY)
         first = chosen[methods[0].name]
         rows = [_with(row, {row.name: first}, first["equal_time_steps"]) for row in load_ablation("paper-rows")]
         self.compare("paper-rows", rows, self.test, reference=WHOLE, primary=PRIMARY)
+        # Apart: what is added to a comparison after its first result is exploratory.
+        several = equal[:SEVERAL_SEEDS]
+        self.compare("seeds", several, self.test, seeds=SEEDS, reference=methods[0].name, primary=PRIMARY)
+
+
+@dataclass(frozen=True)
+class Plateau(_WithChoices):
+    """Command that finds the run lengths of plateaus, and trains so long on the test phantoms."""
+
+    def run(self) -> None:
+        """Climb on the tuning scenes, and measure."""
+        chosen, methods = self.chosen(), load_ablation("rivals")[:TO_PLATEAU]
+        reached = {method.name: self._climbed(method, chosen) for method in methods}
+        write_json(self.out / "plateaus.json", reached)
+        long = [_with(method, chosen, int([*reached[method.name]][-1])) for method in methods]
+        self.compare("plateau", long, self.test, reference=methods[0].name, primary=PRIMARY)
+
+    def _climbed(self, method: Variant, chosen: Mapping[str, Any]) -> dict[str, float]:
+        """PSNR by run length, doubled until it no longer rises; the last is that of the plateau."""
+        reached: dict[str, float] = {}
+        for steps in LADDER:
+            tried = [_with(method, chosen, steps)]
+            results = self.compare(f"ladder-{steps}", tried, self.tuning, splits=[VALIDATION])
+            before, reached[str(steps)] = [*reached.values()], _means(results, _psnr)[method.name]
+            if before and reached[str(steps)] < before[-1] + RISE:
+                break
+        return reached
 
 
 @dataclass(frozen=True)
@@ -158,16 +178,19 @@ class Write(_Command):
             print(*written, sep="\n")
 
 
-def _kind(method: Variant) -> str:
-    """Key of the method's trials."""
-    return "anchors" if load_method(method.method, method.overrides).config.field.name == "anchors" else "points"
+def _changes(method: Variant) -> list[tuple[str, ...]]:
+    """The changes of a method that are tried."""
+    config = load_method(method.method, method.overrides).config
+    few = round(FEW * config.schedule.written_for)
+    kind = "anchors" if config.field.name == "anchors" else "points"
+    return [tuple(change.format(few=few) for change in changes) for changes in TRIALS[kind]]
 
 
 def _trials(method: Variant) -> list[Variant]:
     """A method with each change that is tried, under names of their own."""
     return [
         replace(method, name=f"{method.name}.{number}", overrides=(*method.overrides, *changes))
-        for number, changes in enumerate(TRIALS[_kind(method)])
+        for number, changes in enumerate(_changes(method))
     ]
 
 
@@ -192,7 +215,7 @@ def _means(results: Sequence[Result], measure: Callable[[Result], float | None])
     return {name: float(np.mean(own)) for name, own in values.items()}
 
 
-Options = Tune | Measure | Write
+Options = Tune | Measure | Plateau | Write
 
 
 def main(options: Options) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Steps between two events where a run is so short that its share would be less.
-_LEAST_INTERVAL = 4
+#: Steps between two events where a run is so short that its share would be less, and their largest share of the run.
+_LEAST_INTERVAL, _LARGEST_SHARE = 32, 0.2
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,13 @@ class Schedule:
         return round(step * self.steps / self.written_for)
 
     def interval(self, steps: int) -> int:
-        """The steps of this run between events that the config places ``steps`` apart; at least 4 of a shortened one.
+        """The steps of this run between events that the config places ``steps`` apart.
 
-        Fewer views say too little of what is to be done.
+        Of a shortened run they are at least 32, or a fifth of the run: fewer views say too little of what is to be done
+        (docs/configs.md).
         """
-        return max(min(steps, _LEAST_INTERVAL), self.at(steps))
+        least = min(steps, _LEAST_INTERVAL, int(self.steps * _LARGEST_SHARE))
+        return max(1, least, self.at(steps))
 
     def events(self, after: int, until: int, every: int) -> range:
         """Steps of this run at which something happens: multiples of an interval, between two steps.

@@ -162,6 +162,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Int[Tensor, "V"]:
         """Indices of anchors of which any child may overlap the image."""
+        camera = camera.to(self.anchors.device, self.anchors.dtype)
         if self._on_kernels:
             return visible_anchors(self._rows, camera)
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)

@@ -96,17 +96,17 @@ def test_opacities_are_reset_and_adam_forgets_them():
     [
         (30_000, "at 144 steps, from 600 to 14900, and resets opacities at 4, from 3000 to 12000",
          range(600, 14_901, 100)),
-        (3000, "at 144 steps, from 60 to 1490, and resets opacities at 4, from 300 to 1200", range(60, 1491, 10)),
-        (1999, "at 138 steps, from 35 to 994, and resets opacities at 4, from 200 to 800", range(35, 995, 7)),
-        (1990, "and resets opacities never", range(35, 995, 7)),
+        (3000, "at 45 steps, from 64 to 1472, and resets opacities at 4, from 300 to 1200", range(64, 1500, 32)),
+        (1999, "at 30 steps, from 64 to 992, and resets opacities at 4, from 200 to 800", range(64, 999, 32)),
+        (1990, "and resets opacities never", range(64, 995, 32)),
         (20, "at 2 steps, from 4 to 8, and resets opacities never", [4, 8]),
-        (2, "neither densifies nor prunes: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
+        (2, "neither densifies nor prunes: its 2 steps leave no multiple of 1 between steps 0 and 1", []),
     ],
 )  # fmt: skip
 def test_the_plan_is_what_happens(steps, plan, expected):
     strategy, (field, rows) = make_strategy(steps=steps), make()
     assert plan in strategy.plan()
-    tried = range(10, steps + 1, 10) if steps >= 3000 else range(1, steps + 1)
+    tried = range(10, steps + 1, 10) if steps > 3000 else range(1, steps + 1)
     events = [step for step in tried if after_backward(strategy, step, field, rows, make_output([0], [0.0]))]
     assert events == [*expected]
 

@@ -66,16 +66,17 @@ def test_statistics_keep_their_share_of_the_run(steps, first, last):
     ("steps", "plan", "expected"),
     [
         (30_000, "at 134 steps, from 1600 to 14900", range(1600, 14_901, 100)),
-        (3000, "at 134 steps, from 160 to 1490", range(160, 1491, 10)),
-        (200, "at 22 steps, from 12 to 96", range(12, 100, 4)),
-        (2, "neither grows nor prunes anchors: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
+        (3000, "at 42 steps, from 160 to 1472", range(160, 1500, 32)),
+        (200, "at 3 steps, from 32 to 96", [32, 64, 96]),
+        (20, "at 2 steps, from 4 to 8", [4, 8]),
+        (2, "neither grows nor prunes anchors: its 2 steps leave no multiple of 1 between steps 0 and 1", []),
     ],
 )
 def test_the_plan_is_what_happens(steps, plan, expected):
     strategy = make_strategy(steps=steps)
     assert plan in strategy.plan()
     field, rows = make()
-    tried = range(0, steps + 1, 10 if steps > 1000 else 1)
+    tried = range(0, steps + 1, 10 if steps > 3000 else 1)
     events = [s for s in tried if after_backward(strategy, s, field, rows, make_output([0], [0.0]))]
     assert events == [*expected]
 
