@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Steps between two events where a run is so short that its share would be less, and their largest share of the run.
-_LEAST_INTERVAL, _LARGEST_SHARE = 32, 0.2
+#: Steps between two events where a run is so short that its share would be less: in long runs and in the shortest ones.
+_LEAST_INTERVAL, _LEAST_OF_SHORTEST = 32, 4
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Schedule:
     def interval(self, steps: int) -> int:
         """The steps of this run between events that the config places ``steps`` apart.
 
-        Of a shortened run they are at least 32, or a fifth of the run: fewer views say too little of what is to be done
-        (docs/configs.md).
+        Of a shortened run they are at least 32, or a fifth of the run but 4: fewer views say too little of what is to be
+        done (docs/configs.md 5).
         """
-        least = min(steps, _LEAST_INTERVAL, int(self.steps * _LARGEST_SHARE))
-        return max(1, least, self.at(steps))
+        least = min(_LEAST_INTERVAL, max(self.steps // 5, _LEAST_OF_SHORTEST))
+        return max(min(steps, least), self.at(steps))
 
     def events(self, after: int, until: int, every: int) -> range:
         """Steps of this run at which something happens: multiples of an interval, between two steps.

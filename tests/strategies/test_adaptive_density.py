@@ -100,7 +100,7 @@ def test_opacities_are_reset_and_adam_forgets_them():
         (1999, "at 30 steps, from 64 to 992, and resets opacities at 4, from 200 to 800", range(64, 999, 32)),
         (1990, "and resets opacities never", range(64, 995, 32)),
         (20, "at 2 steps, from 4 to 8, and resets opacities never", [4, 8]),
-        (2, "neither densifies nor prunes: its 2 steps leave no multiple of 1 between steps 0 and 1", []),
+        (2, "neither densifies nor prunes: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
     ],
 )  # fmt: skip
 def test_the_plan_is_what_happens(steps, plan, expected):
