@@ -30,8 +30,8 @@ class Schedule:
     def interval(self, steps: int) -> int:
         """The steps of this run between events that the config places ``steps`` apart.
 
-        Of a shortened run they are at least 32, or a fifth of the run but 4: fewer views say too little of what is to be
-        done (docs/configs.md 5).
+        Of a shortened run they are at least 32, or a fifth of the run but 4: fewer views say too little of what is to
+        be done (docs/configs.md 5).
         """
         least = min(_LEAST_INTERVAL, max(self.steps // 5, _LEAST_OF_SHORTEST))
         return max(min(steps, least), self.at(steps))

@@ -29,8 +29,8 @@ from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
-#: Names within the folder.
-IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
+#: Names within the folder; the last is that of a list of frames that were removed, as the video has them.
+IMAGES, MASK, RECORD, REMOVED = "images", "mask.png", "frames.json", "removed.json"
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
 _FEWEST_STILL = 10
 
@@ -128,6 +128,16 @@ def read_blurred(folder: Path) -> set[str]:
     """Names of the written frames that are blurred; none where there is no record."""
     kept = json.loads((folder / RECORD).read_text())["kept"] if (folder / RECORD).is_file() else []
     return {frame["name"] for frame in kept if frame.get("blurred")}
+
+
+def check_stored(folder: Path) -> None:
+    """Refuse the folder of frames that were removed: InputError, which tells how to restore them."""
+    if (folder / REMOVED).is_file():
+        raise InputError(
+            f"the frames in {folder} were removed",
+            "frames",
+            "Decode them again with `coliags frames restore OUT VIDEO`",
+        )
 
 
 class FrameSurvey:
