@@ -329,7 +329,7 @@ def test_the_benchmarks_have_both_kinds_of_scenes(name, seeds, unassumed):
     assert [chosen.seed for chosen in scenes.values()] == seeds
     for key, chosen in scenes.items():
         assert key.endswith(f"-{chosen.seed}")
-        assert (chosen.width, chosen.height, chosen.frames, chosen.rotation_views) == (240, 192, 96, 12)
+        assert (chosen.width, chosen.height, chosen.frames, chosen.rotation_views) == (160, 128, 96, 12)
         assert chosen.rotation_exposure == "metered" and 1.8 <= chosen.gamma <= 2.6
     kinds = [departures(chosen) for chosen in scenes.values()]
     assert sum(bool(kind) for kind in kinds) == unassumed
