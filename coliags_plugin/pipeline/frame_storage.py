@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import link_or_copy, make_folder, write_json
@@ -27,13 +28,14 @@ from coliags_plugin.pipeline.stages import LOCK_FILE
 
 _MADE = "what `coliags reconstruct` wrote"
 
-
 T = TypeVar("T", bound=BaseModel)
+#: Of a file without its suffix, not of one in another folder.
+_Name = Annotated[str, Field(pattern=r"^[^/\\]+$")]
 
 
 class _Kept(BaseModel):
     frame: int  # number in the video
-    name: str
+    name: _Name
 
 
 class _FramesRecord(BaseModel):
@@ -46,8 +48,14 @@ class _Removed(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    checksums: dict[str, int]
-    posed: list[str]
+    checksums: dict[_Name, int]
+    posed: list[_Name]
+
+    @model_validator(mode="after")
+    def _posed_are_listed(self) -> Self:
+        if others := set(self.posed) - self.checksums.keys():
+            raise ValueError(f"{min(others)} is posed, and has no checksum")
+        return self
 
 
 @dataclass(frozen=True)
@@ -92,8 +100,11 @@ def remove_frames(out: Path, video: Path, progress: Progress | None = None) -> i
     made of them stays: poses, depth, runs, meshes and pages do without.
 
     Raises:
-        InputError: ``out`` has no frames; or a frame of the video is missing or another, which is named.
+        InputError: ``out`` has no frames, or is the video's own place; or a frame of the video is missing or another,
+            which is named.
     """
+    if out.resolve() in (video.resolve(), *video.resolve().parents):
+        raise InputError(f"{video} is within {out}", "the video, apart from what was made of it")
     freed = 0
     with _parts(out) as parts:
         for done, part in enumerate(parts, start=1):

@@ -87,7 +87,7 @@ def test_segments_of_a_procedure(video, tmp_path, capsys):
     assert not list(out.rglob("*.png"))
     assert restore_frames(out, video) == 5 + 5
     assert {file: file.read_bytes() for file in sorted(out.rglob("*.png"))} == before
-    assert "has no frames of a video" in refused(capsys, "frames", "remove", tmp_path, video)
+    assert "has no frames of a video" in refused(capsys, "frames", "restore", tmp_path, video)
 
 
 def test_what_needs_removed_frames_tells_how_to_restore_them(tmp_path):
@@ -95,6 +95,28 @@ def test_what_needs_removed_frames_tells_how_to_restore_them(tmp_path):
     write_json(out / "segment-001" / "frames" / "removed.json", {"checksums": {}, "posed": []})
     with pytest.raises(InputError, match=r"segment-001/frames were removed.*coliags frames restore"):
         export_atlas(out, tmp_path / "export")
-    (out / "segment-001" / "frames" / "removed.json").write_text("{")
-    with pytest.raises(InputError, match=r"removed\.json"):
-        restore_frames(out, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", r"removed\.json"),
+        ('{"checksums": {"../x": 1}, "posed": []}', "pattern"),
+        ('{"checksums": {"x": 1}, "posed": ["y"]}', "y is posed, and has no checksum"),
+    ],
+)
+def test_a_damaged_list_is_refused(tmp_path, text, message):
+    out = write_procedure(tmp_path / "out")
+    (out / "segment-000" / "frames" / "removed.json").write_text(text)
+    for command in (remove_frames, restore_frames):
+        with pytest.raises(InputError, match=message):
+            command(out, tmp_path / "film.avi")
+
+
+def test_frames_are_not_their_own_source(video, tmp_path):
+    before = write_part(video, tmp_path / "out")
+    (tmp_path / "link").symlink_to(tmp_path / "out" / "frames" / "images")
+    for source in (tmp_path / "out" / "frames" / "images", tmp_path / "link"):
+        with pytest.raises(InputError, match="apart from"):
+            remove_frames(tmp_path / "out", source)
+    assert all(file.read_bytes() == data for file, data in before.items())
