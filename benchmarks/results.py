@@ -116,7 +116,7 @@ class Tune(_Command):
 
 class _WithChoices(_Command):
     def chosen(self) -> dict[str, Any]:
-        """What was chosen of every method."""
+        """Hyperparameters and run length chosen for each method, from ``tuned.json``."""
         if not self.tuned.is_file():
             raise InputError(f"{self.tuned} is not there", "the choices", "run the command `tune` first")
         return read_json(self.tuned, "the choices")
@@ -205,7 +205,7 @@ def _psnr(result: Result) -> float | None:
 
 
 def _means(results: Sequence[Result], measure: Callable[[Result], float | None]) -> dict[str, float]:
-    """Mean of a measure over the scenes, by method; an error where a run lacks it."""
+    """Mean over the scenes of a value of each result, by method; InputError where a result lacks it."""
     values: dict[str, list[float]] = {}
     for result in results:
         value = measure(result)

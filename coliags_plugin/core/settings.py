@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -10,6 +11,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from typing_extensions import TypeVar
 
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.json_files import read_json
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -75,6 +77,15 @@ def validated(kind: type[Model], values: Mapping[str, object], what: str) -> Mod
     except ValidationError as error:
         key, message, value = first_error(error)
         raise InputError(f"{what} '{key}' = {value!r}: {message}") from error
+
+
+def read_validated(kind: type[Model], file: Path, expected: str) -> Model:
+    """Read a JSON file as a model, strictly; InputError names the file and the key that is wrong."""
+    try:
+        return kind.model_validate(read_json(file, expected), strict=True)
+    except ValidationError as error:
+        key, message, _ = first_error(error)
+        raise InputError(f"{file}: {key or 'the file'}: {message}", expected) from error
 
 
 def first_error(error: ValidationError) -> tuple[str, str, object]:

@@ -24,7 +24,7 @@ def what_triton_lacks() -> str | None:
     import triton
 
     if tuple(int(part) for part in triton.__version__.split(".")[:2]) < OLDEST:
-        return f"triton {triton.__version__} is older than 3.6, which PyTorch 2.11 brings"
+        return f"triton {triton.__version__} is older than {'.'.join(map(str, OLDEST))}, which PyTorch 2.11 brings"
     if os.environ.get("CC") is None and shutil.which("gcc") is None and shutil.which("clang") is None:
         return "triton finds no C compiler to call the driver by: install gcc, or name one in CC"
     scheme = sysconfig.get_default_scheme()

@@ -7,40 +7,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import link_or_copy, make_folder, write_json
 from coliags_plugin.core.images import read_rgb, write_image
-from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.settings import read_validated
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
-from coliags_plugin.pipeline.frames import IMAGES, RECORD, REMOVED
+from coliags_plugin.pipeline.frames import IMAGES, MADE, RECORD, REMOVED, FrameName, FramesRecord
 from coliags_plugin.pipeline.procedure.record import Procedure
 from coliags_plugin.pipeline.stages import LOCK_FILE
-
-_MADE = "what `coliags reconstruct` wrote"
-
-T = TypeVar("T", bound=BaseModel)
-#: Of a file without its suffix, not of one in another folder.
-_Name = Annotated[str, Field(pattern=r"^[^/\\]+$")]
-
-
-class _Kept(BaseModel):
-    frame: int  # number in the video
-    name: _Name
-
-
-class _FramesRecord(BaseModel):
-    kept: list[_Kept]
-    deinterlaced: bool = False
 
 
 class _Removed(BaseModel):
@@ -48,8 +30,8 @@ class _Removed(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    checksums: dict[_Name, int]
-    posed: list[_Name]
+    checksums: dict[FrameName, int]
+    posed: list[FrameName]
 
     @model_validator(mode="after")
     def _posed_are_listed(self) -> Self:
@@ -77,15 +59,15 @@ class _Part:
 
     @property
     def removed(self) -> Path:
-        """List of what was removed."""
+        """File that lists the removed frames with their checksums."""
         return self.folder / "frames" / REMOVED
 
     def decoded(self, video: Path) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Names and pixels of the frames, as the video has them."""
-        record = _read(_FramesRecord, self.folder / "frames" / RECORD)
-        names = {one.frame: one.name for one in record.kept}
-        if not names:
+        record = FramesRecord.read(self.folder / "frames")
+        if record is None or not record.kept:
             return
+        names = {one.frame: one.name for one in record.kept}
         first = min(names)
         source = frame_source(video, Span(first, max(names), self.seek, record.deinterlaced))
         for number, (_, image) in enumerate(source, start=first):
@@ -110,7 +92,7 @@ def remove_frames(out: Path, video: Path, progress: Progress | None = None) -> i
         for done, part in enumerate(parts, start=1):
             if not part.removed.is_file():
                 _list_removed(part, video)
-            removed = _read(_Removed, part.removed)
+            removed = read_validated(_Removed, part.removed, MADE)
             files = [part.images / f"{name}.png" for name in removed.checksums]
             sizes = [file.stat().st_size for file in files if file.is_file()]
             for file in (*(part.posed / f"{name}.png" for name in removed.posed), *files):
@@ -139,7 +121,7 @@ def restore_frames(out: Path, video: Path, progress: Progress | None = None) -> 
 
 @contextmanager
 def _parts(out: Path) -> Iterator[list[_Part]]:
-    """The parts of a folder that have frames, which nobody else changes meanwhile."""
+    """Lock a reconstruction or procedure, and give those of its segments that have frames."""
     procedure = Procedure.read(out)
     folders = [out] if procedure is None else [out / segment.name for segment in procedure.segments]
     parts = [_Part(folder, procedure is None or procedure.seek) for folder in folders]
@@ -168,7 +150,7 @@ def _list_removed(part: _Part, video: Path) -> None:
 
 
 def _restore(part: _Part, video: Path) -> int:
-    removed = _read(_Removed, part.removed)
+    removed = read_validated(_Removed, part.removed, MADE)
     for name, image in part.decoded(video):
         if _checksum(image) != removed.checksums.get(name):
             raise InputError(f"{video} has another frame {name} than was removed", "the video it was decoded from")
@@ -185,11 +167,3 @@ def _restore(part: _Part, video: Path) -> int:
 
 def _checksum(image: UInt8[np.ndarray, "H W 3"]) -> int:
     return zlib.crc32(image.tobytes())
-
-
-def _read(model: type[T], file: Path) -> T:
-    try:
-        return model.model_validate(read_json(file, _MADE))
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{file}: {key or 'the file'}: {message}", _MADE) from error

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
+from pydantic import BaseModel, ConfigDict, Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.settings import read_validated
 from coliags_plugin.pipeline.frame_selection import (
     RESTING,
     THINNED,
@@ -31,8 +33,43 @@ from coliags_plugin.reconstruction.structure.texture import sharpness
 
 #: Names within the folder; the last is that of a list of frames that were removed, as the video has them.
 IMAGES, MASK, RECORD, REMOVED = "images", "mask.png", "frames.json", "removed.json"
+MADE = "what `coliags reconstruct` wrote"
+#: Name of a frame's file without its suffix, within its folder.
+FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
 _FEWEST_STILL = 10
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class KeptFrame(_Part):
+    """A frame of use."""
+
+    frame: int  # number in the video
+    name: FrameName
+    blurred: bool = False  # of use for poses alone
+
+
+class DroppedFrame(_Part):
+    """A frame that is not used."""
+
+    frame: int
+    why: str
+
+
+class FramesRecord(_Part):
+    """Content of ``frames.json``, as far as it is read again."""
+
+    kept: list[KeptFrame]
+    dropped: list[DroppedFrame] = []
+    deinterlaced: bool = False
+
+    @classmethod
+    def read(cls, folder: Path) -> FramesRecord | None:
+        """The record of a folder of frames; None where there is none. InputError if it is damaged."""
+        return read_validated(cls, folder / RECORD, MADE) if (folder / RECORD).is_file() else None
 
 
 def write_frames(
@@ -126,8 +163,8 @@ def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
 
 def read_blurred(folder: Path) -> set[str]:
     """Names of the written frames that are blurred; none where there is no record."""
-    kept = json.loads((folder / RECORD).read_text())["kept"] if (folder / RECORD).is_file() else []
-    return {frame["name"] for frame in kept if frame.get("blurred")}
+    record = FramesRecord.read(folder)
+    return set() if record is None else {frame.name for frame in record.kept if frame.blurred}
 
 
 def check_stored(folder: Path) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.units import Unit, read_unit
 
 #: Name of the file, in the scene's folder.
@@ -57,11 +55,7 @@ def read_atlas(scene: Path) -> AtlasRecord | None:
     file = scene / ATLAS_FILE
     if not file.is_file():
         return None
-    try:
-        return AtlasRecord.model_validate(read_json(file, _EXPECTED), strict=True)
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{file}: {key or 'the file'}: {message}", _EXPECTED) from error
+    return read_validated(AtlasRecord, file, _EXPECTED)
 
 
 def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:

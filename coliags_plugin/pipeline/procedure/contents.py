@@ -10,16 +10,12 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.settings import first_error
 from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
 from coliags_plugin.datamanagers.units import Unit
-from coliags_plugin.pipeline.frames import IMAGES
-from coliags_plugin.pipeline.frames import RECORD as FRAMES_FILE
+from coliags_plugin.pipeline.frames import IMAGES, MADE, FramesRecord
 from coliags_plugin.pipeline.page import SubmapResults, results_of
 from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE, ModelKey, Procedure
 from coliags_plugin.pipeline.procedure.segments import Segment
@@ -28,27 +24,7 @@ from coliags_plugin.pipeline.stages import Record
 
 #: Arrays of the survey that are shown.
 SURVEYED = ("sharpness", "followed", "motion")
-_EXPECTED = "what `coliags reconstruct` wrote"
 _FRAME_NAME = re.compile(r"frame_(\d+)")
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-class _Kept(_Part):
-    frame: int
-    name: str
-
-
-class _Dropped(_Part):
-    frame: int
-    why: str
-
-
-class _FramesRecord(_Part):
-    kept: list[_Kept]
-    dropped: list[_Dropped] = []
 
 
 T = TypeVar("T")
@@ -161,7 +137,7 @@ def read_procedure(out: Path) -> ProcedureContents:
     survey: dict[str, np.ndarray] = {}
     try:
         if (out / SURVEY_FILE).is_file():
-            survey = read_arrays(out / SURVEY_FILE, _EXPECTED, optional=SURVEYED)
+            survey = read_arrays(out / SURVEY_FILE, MADE, optional=SURVEYED)
             if any(values.shape != (record.frames,) or values.dtype.kind != "f" for values in survey.values()):
                 shapes = ", ".join(f"{name} {values.dtype} {[*values.shape]}" for name, values in survey.items())
                 raise InputError(f"{out / SURVEY_FILE} has {shapes}", f"a number for each of {record.frames} frames")
@@ -170,14 +146,6 @@ def read_procedure(out: Path) -> ProcedureContents:
         problems.append(_told(error, out))
     submaps = sorted((submap for one in segments for submap in one.submaps), key=lambda submap: submap.first)
     return ProcedureContents(out, record, segments, submaps, survey, problems)
-
-
-def _read_frames(file: Path) -> _FramesRecord:
-    try:
-        return _FramesRecord.model_validate(read_json(file, _EXPECTED), strict=True)
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{file}: {key or 'the file'}: {message}", _EXPECTED) from error
 
 
 def _read_segment(out: Path, span: Segment, procedure: Procedure) -> SegmentContents:
@@ -191,8 +159,7 @@ def _read_segment(out: Path, span: Segment, procedure: Procedure) -> SegmentCont
             return None
 
     record = attempt(lambda: Record.of(folder)) or Record(folder)
-    frames_file = folder / "frames" / FRAMES_FILE
-    frames = attempt(lambda: _read_frames(frames_file)) if frames_file.is_file() else None
+    frames = attempt(lambda: FramesRecord.read(folder / "frames"))
     kept = {one.frame: one.name for one in (frames.kept if frames else ()) if span.first <= one.frame <= span.last}
     why = {one.frame: one.why for one in (frames.dropped if frames else ())}
     atlas = attempt(lambda: read_atlas(folder / "poses"))
