@@ -6,10 +6,11 @@ python benchmarks/results.py plateau OUT
 python benchmarks/results.py write OUT
 
 ``tune`` tries changes of every method of the ablation ``rivals`` on held-out frames of two scenes of the benchmark
-``phantoms-tuning``, as many of each; what is chosen is ``OUT/tuned.json``. ``measure`` trains on ``phantoms-12`` with
-these choices in equal processor time, the rows of the paper's ablation, and with several seeds. ``plateau`` finds run
-lengths on the tuning scenes, and trains so long on ``phantoms-12``. ``write`` makes the reports. Whatever is killed,
-the same command goes on.
+``phantoms-tuning``, as many of each: for as many steps, which tells their processor time, and then for as much of it,
+by which they are chosen, in ``OUT/tuned.json``. ``measure`` trains on ``phantoms-12`` with these choices in equal
+processor time, the rows of the paper's ablation, and with several seeds. ``plateau`` finds run lengths on the tuning
+scenes, and trains so long on ``phantoms-12``. ``write`` makes the reports. Whatever is killed, the same command goes
+on.
 """
 
 from __future__ import annotations
@@ -97,20 +98,24 @@ class Tune(_Command):
         trials = {method.name: _trials(method) for method in methods}
         every = [one for own in trials.values() for one in own]
         results = self.compare("trials", every, self.tuning, splits=[VALIDATION], steps=self.steps)
-        psnr = _means(results, _psnr)
-        seconds = _means(results, lambda result: result.cost.processor_seconds)
-        best = {name: max(own, key=lambda one: psnr[one.name]) for name, own in trials.items()}
-        budget = seconds[best[methods[0].name].name]
+        first, seconds = trials[methods[0].name], _means(results, lambda result: result.cost.processor_seconds)
+        budget = seconds[_best(first, _means(results, _psnr)).name]
+        # In as many steps, methods that grow have the time of several others.
+        steps = {name: max(100, 100 * round(self.steps * budget / own / 100)) for name, own in seconds.items()}
+        timed = [_for_steps(one, steps[one.name]) for one in every]
+        psnr = _means(self.compare("trials-in-time", timed, self.tuning, splits=[VALIDATION]), _psnr)
         chosen = {
-            name: {
-                "changes": _changes(one)[trials[name].index(one)],
-                "trials": {each.name: [psnr[each.name], seconds[each.name]] for each in trials[name]},
-                "equal_time_steps": max(100, round(self.steps * budget / seconds[one.name], -2)),
+            method.name: {
+                "changes": _changes(method)[own.index(best)],
+                "steps": steps[best.name],
+                "trials": {one.name: [steps[one.name], psnr[one.name]] for one in own},
             }
-            for name, one in best.items()
+            for method in methods
+            for own in [trials[method.name]]
+            for best in [_best(own, psnr)]
         }
         write_json(self.tuned, chosen)
-        keys = ("changes", "equal_time_steps")
+        keys = ("changes", "steps")
         print(markdown_table([{"method": name} | {key: one[key] for key in keys} for name, one in chosen.items()]))
 
 
@@ -129,12 +134,12 @@ class Measure(_WithChoices):
     def run(self) -> None:
         """Measure in equal time, the rows of the paper's ablation, and the first methods with several seeds."""
         chosen, methods = self.chosen(), load_ablation("rivals")
-        equal = [_with(method, chosen, chosen[method.name]["equal_time_steps"]) for method in methods]
+        equal = [_with(method, chosen, chosen[method.name]["steps"]) for method in methods]
         self.compare("equal-time", equal, self.test, reference=methods[0].name, primary=PRIMARY)
         for protocol in ("expected-depth", "median-depth"):
             self.compare("equal-time", equal, self.test, protocol=protocol)
         first = chosen[methods[0].name]
-        rows = [_with(row, {row.name: first}, first["equal_time_steps"]) for row in load_ablation("paper-rows")]
+        rows = [_with(row, {row.name: first}, first["steps"]) for row in load_ablation("paper-rows")]
         self.compare("paper-rows", rows, self.test, reference=WHOLE, primary=PRIMARY)
         # Apart: what is added to a comparison after its first result is exploratory.
         several = equal[:SEVERAL_SEEDS]
@@ -194,10 +199,20 @@ def _trials(method: Variant) -> list[Variant]:
     ]
 
 
+def _best(trials: Sequence[Variant], psnr: Mapping[str, float]) -> Variant:
+    """The trial of the highest PSNR."""
+    return max(trials, key=lambda one: psnr[one.name])
+
+
+def _for_steps(method: Variant, steps: int) -> Variant:
+    """A method for so many steps."""
+    return replace(method, overrides=(*method.overrides, f"schedule.steps={steps}"))
+
+
 def _with(method: Variant, chosen: Mapping[str, Any], steps: int) -> Variant:
     """A method with the changes that were chosen, for so many steps."""
-    changes = chosen[method.name]["changes"]
-    return replace(method, overrides=(*method.overrides, *changes, f"schedule.steps={steps}"))
+    changed = replace(method, overrides=(*method.overrides, *chosen[method.name]["changes"]))
+    return _for_steps(changed, steps)
 
 
 def _psnr(result: Result) -> float | None:
