@@ -88,9 +88,10 @@ class SmoothGainSettings(LossSettings):
 
 
 class SmoothGainLoss(Loss[SmoothGainSettings]):
-    """Mean squared change of slope of the log gain over time, per frame of the video (docs/methods.md 4.7).
+    """Mean squared curvature of the log gain over time, in frames of the video (docs/methods.md 4.7).
 
-    Slopes are those between training frames that follow each other; 0 with fewer than three.
+    That is the squared change of slope over the distance in which it changes; slopes are those between training frames
+    that follow each other. 0 with fewer than three.
     """
 
     Settings: ClassVar[type[LossSettings]] = SmoothGainSettings
@@ -117,8 +118,8 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
         if len(log_gains) < 3:
             return log_gains.sum() * 0.0
         gaps = constant(tuple(module.times), log_gains).diff().clamp_min(1.0)[:, None]
-        slopes = log_gains.diff(dim=0) / gaps
-        return slopes.diff(dim=0).square().mean()
+        bends = (log_gains.diff(dim=0) / gaps).diff(dim=0).square()
+        return (2.0 * bends / (gaps[1:] + gaps[:-1])).mean()
 
 
 def depth_normals(

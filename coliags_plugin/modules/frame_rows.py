@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float
+from scipy.interpolate import Akima1DInterpolator
 from torch import Tensor
 
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -64,6 +65,17 @@ class FrameRows:
             return values[row]
         before, after, share = self.neighbours(view)
         return (1.0 - share) * values[before] + share * values[after]
+
+    def smoothed(self, values: Float[Tensor, "F C"], view: View) -> Float[Tensor, "C"]:
+        """Look up a training frame's values, or interpolate smoothly between those around another view in time.
+
+        By Akima's cubic splines, whose slopes are those of the nearest frames, without gradient; like
+        :meth:`interpolated` beyond the ends and for views beside the video.
+        """
+        if self.row(view) is not None or self.neighbours(view)[2] == 0.0:
+            return self.interpolated(values, view)
+        known = values.detach()[self._rows_by_time].cpu().double().numpy()
+        return torch.from_numpy(Akima1DInterpolator(self._sorted_times, known)(view.time)).to(values)
 
     def require(self, name: str, asking: str) -> int:
         """The row of a training frame that settings name."""

@@ -84,7 +84,7 @@ class FrameGain(GainModule[FrameGainSettings]):
             return "views without training have the mean gain of the training frames"
         corrected = "" if self.metering is None else " and corrected for their brightness, as automatic exposure does"
         return (
-            f"views without training have a gain interpolated between the training frames before and after them"
+            f"views without training have a gain interpolated in time between the training frames around them"
             f"{corrected}; views beside the video that of the nearest training camera"
         )
 
@@ -113,7 +113,7 @@ class FrameGain(GainModule[FrameGainSettings]):
         log_gains = self.log_gains()
         if view is None or (self.frames.row(view) is None and self.settings.untrained == "mean"):
             return log_gains.mean(0).exp()
-        return self.frames.interpolated(log_gains, view).exp()
+        return self.frames.smoothed(log_gains, view).exp()
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""
@@ -130,7 +130,7 @@ class FrameGain(GainModule[FrameGainSettings]):
         """Factor on the gain of a held-out frame of the video; 1 for all other views."""
         if self.metering is None or view is None or self.frames.row(view) is not None or self.frames.is_beside(view):
             return 1.0
-        return math.exp(self.metering.correction(self.log_gains(), rgb, *self.frames.neighbours(view)))
+        return math.exp(self.metering.correction(self.log_gains(), rgb, view))
 
     @property
     def learned(self) -> JsonObject:

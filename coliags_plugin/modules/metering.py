@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Frames on either side of those that the response is fitted on, at least.
@@ -61,19 +61,17 @@ class Metering(nn.Module):
             colors = rgb.reshape(-1, 3).index_select(0, common[1].to(rgb.device))
         return colors.mean().clamp_min(_DARKEST)
 
-    def correction(
-        self, log_gains: Float[Tensor, "F C"], rgb: Float[Tensor, "H W 3"], before: int, after: int, share: float
-    ) -> float:
+    def correction(self, log_gains: Float[Tensor, "F C"], rgb: Float[Tensor, "H W 3"], view: View) -> float:
         """Correction of the log gain of a held-out view, to add to the one interpolated in time.
 
-        A view, before its gain, that is brighter than interpolation at a share between the frames before and after
-        would make it has a smaller gain, by as much as training frames had that lie as far from others. 0 until every
-        training frame has been rendered in training.
+        A view, before its gain, that is brighter than interpolation in time would make it has a smaller gain, by as
+        much as training frames had that lie as far from others. 0 until every training frame has been rendered in
+        training.
         """
         if not self.brightness.all():
             return 0.0
-        brightness = self._log_brightness
-        expected = torch.lerp(brightness[before], brightness[after], share)
+        before, after, _ = self._frames.neighbours(view)
+        expected = self._frames.smoothed(self._log_brightness[:, None], view)[0]
         gains = log_gains.detach().cpu().double().mean(1)
         return self.response(gains, before, after) * float(self._measure(rgb).cpu().double().log() - expected)
 

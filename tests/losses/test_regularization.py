@@ -215,7 +215,7 @@ def of_gains(values, frames=9, **options):
     return loss(terms.step(None, model=model))
 
 
-def test_steady_changes_cost_nothing_and_others_their_squared_change_of_slope():
+def test_steady_changes_cost_nothing_and_others_their_squared_curvature():
     steady = 0.05 * torch.arange(1.0, 8.0)[:, None]
     assert of_gains(steady).item() == pytest.approx(0.0, abs=1e-12)
     bent = steady + torch.tensor([0, 0, 0, 0.1, 0, 0, 0])[:, None]  # changes of slope .1, -.2, .1 of five
@@ -227,6 +227,9 @@ def test_slopes_are_per_frame_of_the_video():
     """Frame 8 of ten is held out: a straight line over the gap costs nothing."""
     times = torch.tensor([float(frame.index) for frame in wall_scene(11).train])
     assert of_gains(0.1 * times[:, None], frames=11).item() == pytest.approx(0.0, abs=1e-10)
+    # A bend at frame 7, one frame behind the last and two before the next, is one of seven.
+    bent = 0.1 * (times - 7.0).relu()[:, None]
+    assert of_gains(bent, frames=11).item() == pytest.approx(0.01 / 1.5 / 7, rel=1e-5)
 
 
 def test_few_frames_have_no_slope_to_change():

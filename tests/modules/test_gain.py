@@ -37,12 +37,24 @@ def test_gains_of_other_views():
     trained = module.gain(View("0003", 3.0, True)).log().item()
     assert trained == pytest.approx((module.log_gain[2] - zero).item())
     between = module.gain(View("0002b", 2.25, False)).log().item()
-    assert between == pytest.approx((0.75 * 0.3 + 0.25 * -0.2) - zero.item())
+    # Akima (1970): slopes at 2 and 3 are (.7 * .2 + .7 * -.5) / 1.4 and (.2 * -.5 + .7 * .2) / .9.
+    assert between == pytest.approx(0.84375 * 0.3 + 0.140625 * -0.15 + 0.15625 * -0.2 - 0.046875 * 0.04 / 0.9)
     assert module.gain(View("0000", 0.0, False)).log().item() == pytest.approx(0.1 - zero.item())
     assert module.gain(View("0008", 8.0, False)).log().item() == pytest.approx(-0.1 - zero.item())
     assert module.gain(None).item() == pytest.approx(1.0)
     # A held-out view is never taken for the training frame of that name.
-    assert module.gain(View("0003", 3.5, False)).log().item() == pytest.approx(-0.1 - zero.item())
+    assert module.gain(View("0003", 3.5, False)).item() != pytest.approx(math.exp(trained), rel=0.05)
+
+
+def test_gains_turn_within_a_held_out_stretch_where_slopes_say_so():
+    scene = wall_scene(41).without({f"{index:04d}" for index in range(14, 27)})
+    times = torch.tensor([float(frame.index) for frame in scene.train])
+    middle, last = View("held out", 20.0, False), scene.train[11]
+    steady = make(0.03 * times, scene)
+    assert steady.gain(middle).log().item() == pytest.approx(0.03 * (20.0 - float(times.mean())), abs=1e-6)
+    # Falling before the stretch, rising after it; a straight line would stay at the height of its ends.
+    turning = make(0.002 * (times - 20.0) ** 2, scene)
+    assert turning.gain(middle).log().item() < turning.gain(last.view(trained=True)).log().item() - 0.05
 
 
 def test_options():
