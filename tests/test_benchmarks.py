@@ -194,3 +194,12 @@ def test_a_part_for_a_gpu_that_fails_is_recorded_and_the_others_run(tmp_path):
     assert status == 0 and set(parts.values()) == {"ok"} and list(parts)[-1] == "report"
     status, parts, _ = gpu_script(tmp_path / "late", "--minutes", "0")
     assert status == 0 and set(parts.values()) == {"no time left"}
+
+
+def test_interpolations_of_gains_are_exact_where_they_must_be(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    errors = import_module("held_out_gains").errors
+    times = np.arange(40.0) + (np.arange(40) >= 20)  # a frame is missing
+    assert errors(times, 0.1 * times, 5) == pytest.approx({"linear": 0.0, "Akima": 0.0, "cubic": 0.0}, abs=1e-12)
+    bent = errors(times, times**2, 5)
+    assert bent["cubic"] == pytest.approx(0.0, abs=1e-9) and bent["linear"] > bent["Akima"] > 0.1
