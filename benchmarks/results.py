@@ -108,7 +108,7 @@ class Tune(_Command):
             method.name: {
                 "changes": _changes(method)[own.index(best)],
                 "steps": steps[best.name],
-                "trials": {one.name: [steps[one.name], psnr[one.name]] for one in own},
+                "trials": {one.name: [psnr[one.name], steps[one.name]] for one in own},
             }
             for method in methods
             for own in [trials[method.name]]
