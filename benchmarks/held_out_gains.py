@@ -34,7 +34,7 @@ class Options:
     """Compare interpolations of gains."""
 
     run: tyro.conf.Positional[Path]
-    """Run whose method has gains per frame."""
+    """Folder of a trained run of a method with the module ``gain``, such as coliags-plus."""
     lengths: tuple[int, ...] = (1, 3, 7, 14, 21)
     """Training frames that are left out at a time."""
 

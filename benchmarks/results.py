@@ -104,16 +104,15 @@ class Tune(_Command):
         steps = {name: max(100, 100 * round(self.steps * budget / own / 100)) for name, own in seconds.items()}
         timed = [_for_steps(one, steps[one.name]) for one in every]
         psnr = _means(self.compare("trials-in-time", timed, self.tuning, splits=[VALIDATION]), _psnr)
-        chosen = {
-            method.name: {
+        chosen = {}
+        for method in methods:
+            own = trials[method.name]
+            best = _best(own, psnr)
+            chosen[method.name] = {
                 "changes": _changes(method)[own.index(best)],
                 "steps": steps[best.name],
                 "trials": {one.name: [psnr[one.name], steps[one.name]] for one in own},
             }
-            for method in methods
-            for own in [trials[method.name]]
-            for best in [_best(own, psnr)]
-        }
         write_json(self.tuned, chosen)
         keys = ("changes", "steps")
         print(markdown_table([{"method": name} | {key: one[key] for key in keys} for name, one in chosen.items()]))
@@ -220,7 +219,7 @@ def _psnr(result: Result) -> float | None:
 
 
 def _means(results: Sequence[Result], measure: Callable[[Result], float | None]) -> dict[str, float]:
-    """Mean over the scenes of a value of each result, by method; InputError where a result lacks it."""
+    """Average of a metric or cost over all scenes, for each method; InputError where a result lacks it."""
     values: dict[str, list[float]] = {}
     for result in results:
         value = measure(result)

@@ -68,7 +68,7 @@ class FramesRecord(_Part):
 
     @classmethod
     def read(cls, folder: Path) -> FramesRecord | None:
-        """The record of a folder of frames; None where there is none. InputError if it is damaged."""
+        """Read ``frames.json`` in a folder of frames; None where it is missing, InputError where it is damaged."""
         return read_validated(cls, folder / RECORD, MADE) if (folder / RECORD).is_file() else None
 
 
