@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 PYTHONS ?= 3.10 3.11 3.12 3.13
 DEMO ?= demo
 DEMO_STEPS ?= 300
+RESULTS ?= results
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-thorough test-slow lint docs notebooks matrix install install-dev system clean
+.PHONY: demo test test-thorough test-slow lint docs results notebooks matrix install install-dev system clean
 
 demo: install
 	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
@@ -44,6 +45,14 @@ lint: install-dev
 docs: install-dev $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
 	@echo "built build/site/index.html"
+
+# What docs/results.md has of phantoms-12, from nothing: trials, runs, tables and archive. Some twenty core hours.
+results: install-dev
+	for part in tune measure plateau write; do \
+	  OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py $$part $(RESULTS) || exit 1; \
+	done
+	$(BIN)/python docs/tools/results.py measurement $(addprefix $(RESULTS)/,equal-time paper-rows seeds plateau)
+	$(BIN)/python docs/tools/results_page.py
 
 # The outputs stored in docs/notebooks.
 notebooks: install-dev

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import tyro
 from jaxtyping import Float
 from machine import markdown_table
-from scipy.interpolate import Akima1DInterpolator, CubicSpline, interp1d
+from scipy.interpolate import Akima1DInterpolator, CubicSpline, make_interp_spline
 
 from coliags_plugin import load_run
 
 Values = Float[np.ndarray, "N"]
 
 INTERPOLATIONS: dict[str, Callable[[Values, Values], Callable[[Values], Values]]] = {
-    "linear": interp1d,
+    "linear": partial(make_interp_spline, k=1),
     "Akima": Akima1DInterpolator,
     "cubic": CubicSpline,
 }

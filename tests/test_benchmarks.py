@@ -97,6 +97,8 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
     assert plan["decided"]["reference"] == "coliags" and not any(
         cell["later"] for cell in plan["cells"] if cell["protocol"] == "paper"
     )
+    trained = sorted(path.name[:2] for path in (out / "seeds" / "runs").glob("*/*/s*"))
+    assert trained == ["s1", "s2"], "seed 0 is that of the comparison in equal time"
     assert "coliags" in (run("results", "write", *options) and (out / "plateau.csv").read_text())
 
 

@@ -101,8 +101,11 @@ class FrameGain(GainModule[FrameGainSettings]):
         """Logarithm of every training frame's gain, relative to the reference, within its bounds."""
         logs = self.fitted + self.rate * self.log_gain
         zero = logs.mean(0) if self._reference is None else logs[self._reference]
+        return self._bounded(logs - zero)
+
+    def _bounded(self, log_gains: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
         limit = math.log(self.settings.max_gain)
-        return (logs - zero).clamp(-limit, limit)
+        return log_gains.clamp(-limit, limit)
 
     def gains(self) -> Float[Tensor, "F C"]:
         """The gain of every training frame, in their order."""
@@ -113,7 +116,7 @@ class FrameGain(GainModule[FrameGainSettings]):
         log_gains = self.log_gains()
         if view is None or (self.frames.row(view) is None and self.settings.untrained == "mean"):
             return log_gains.mean(0).exp()
-        return self.frames.smoothed(log_gains, view).exp()
+        return self._bounded(self.frames.smoothed(log_gains, view)).exp()
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""

@@ -1,8 +1,9 @@
 """Packs finished comparisons as docs/results keeps them: a table of means for each, and all their cells in one archive.
 
-    python docs/tools/results.py COMPARISON ...
+    python docs/tools/results.py ARCHIVE COMPARISON ...
 
-takes folders of ``coliags compare``. The same folders give the same bytes. Cells without a result are left out.
+takes the archive's name, without its ending, and folders of ``coliags compare``. The same folders give the same bytes.
+Cells without a result are left out.
 """
 
 from __future__ import annotations
@@ -20,23 +21,23 @@ from coliags_plugin.results.reading import find_results
 from coliags_plugin.results.record import Result
 
 FOLDER = Path(__file__).parents[1] / "results"
-ARCHIVE = FOLDER / "comparisons.tar.xz"
 #: Columns of a table in front of the metrics, and behind them.
 RUN = ("scene", "method", "split", "seed", "set", "frames")
 COST = ("gaussians", "processor_seconds", "peak_memory_mib", "key")
 
 
-def main(comparisons: Sequence[Path]) -> None:
+def main(name: str, comparisons: Sequence[Path]) -> None:
     """Write a table for each comparison, and the archive of all."""
-    archive = io.BytesIO()
-    with tarfile.open(fileobj=archive, mode="w", format=tarfile.PAX_FORMAT) as tar:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar:
         for folder in sorted(comparisons, key=lambda path: path.name):
             (FOLDER / f"{folder.name}.csv").write_text(table(find_results([folder / "results"])), encoding="utf-8")
-            for name, content in files(folder):
-                member = tarfile.TarInfo(f"{folder.name}/{name}")
+            for file, content in files(folder):
+                member = tarfile.TarInfo(f"{folder.name}/{file}")
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
-    ARCHIVE.write_bytes(lzma.compress(archive.getvalue(), preset=9 | lzma.PRESET_EXTREME))
+    content = lzma.compress(packed.getvalue(), preset=9 | lzma.PRESET_EXTREME)
+    (FOLDER / f"{name}.tar.xz").write_bytes(content)
 
 
 def table(results: Sequence[Result]) -> str:
@@ -65,4 +66,4 @@ def files(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(sys.argv[1], [Path(argument) for argument in sys.argv[2:]])
