@@ -90,7 +90,8 @@ def colour_table(of: Comparison, methods: Sequence[str]) -> str:
                 f"{np.median(psnr[name]):.2f}",
                 f"{ssim[name].mean():.3f}",
                 f"{lpips[name].mean():.3f}",
-                *lead_cells(leads.get(name), "{:+.2f}"),
+                lead_cell(leads.get(name)),
+                *test_cells(leads.get(name)),
             ]
             for name in methods
         ],
@@ -114,7 +115,7 @@ def depth_table(of: Comparison, kinds: Mapping[str, Comparison], methods: Sequen
                 *(number(each[name].mean()) for each in others.values()),
                 number(whole[name].mean()),
                 number(median[name].mean()),
-                *lead_cells(leads.get(name), "{}")[1:],
+                *test_cells(leads.get(name)),
             ]
             for name in methods
         ],
@@ -170,15 +171,20 @@ def seeds_table(of: Comparison) -> str:
     return table(["method", "PSNR of seeds 0 / 1 / 2, dB", "deviation over seeds, within a scene"], rows)
 
 
-def lead_cells(row: RivalComparison | None, form: str) -> list[str]:
-    """Lead with its interval, number of scenes that are better, and adjusted p; empty for the reference itself."""
+def lead_cell(row: RivalComparison | None) -> str:
+    """Mean lead with its interval; empty for the reference itself."""
     if row is None or row.lead is None:
-        return ["", "", ""]
-    if row.tests is None:
-        return [form.format(row.lead), f"{row.better_on} of {len(row.scenes)}", ""]
-    low, high = (form.format(end) for end in row.tests.interval)
-    better = f"{row.better_on} of {len(row.scenes)}"
-    return [f"{form.format(row.lead)} ({low} to {high})", better, f"{row.tests.wilcoxon_holm:.2g}"]
+        return ""
+    interval = "" if row.tests is None else " ({:+.2f} to {:+.2f})".format(*row.tests.interval)
+    return f"{row.lead:+.2f}{interval}"
+
+
+def test_cells(row: RivalComparison | None) -> list[str]:
+    """Number of scenes on which the reference is better, and the adjusted p; empty for the reference itself."""
+    if row is None:
+        return ["", ""]
+    p = "" if row.tests is None else f"{row.tests.wilcoxon_holm:.2g}"
+    return [f"{row.better_on} of {len(row.scenes)}", p]
 
 
 def number(value: float) -> str:
