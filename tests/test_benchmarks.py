@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -100,6 +101,14 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
     trained = sorted(path.name[:2] for path in (out / "seeds" / "runs").glob("*/*/s*"))
     assert trained == ["s1", "s2"], "seed 0 is that of the comparison in equal time"
     assert "coliags" in (run("results", "write", *options) and (out / "plateau.csv").read_text())
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "tools"))
+    page = import_module("results_page")
+    monkeypatch.setattr(page, "WHOLE", "coliags")
+    made = dict(page.tables(out))
+    after = page.filled("".join(f"<!-- table {name} -->\nold<!-- end -->" for name in made), made)
+    assert all(table in after for table in made.values()) and "old<" not in after
+    for kind in ("colour", "depth"):
+        assert re.search(r"^\| `3dgs-depth` \|.* \| [01] of 1 \|  \|$", made[f"with-depth-{kind}"], re.MULTILINE)
 
 
 def test_the_training_step_by_stages(run):

@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,10 @@ SHOWN = ("coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs-distanc
 HIGHER = ("psnr", "ssim")
 
 
+#: Columns of a table: texts by method, by the columns' titles.
+Columns = dict[str, Mapping[str, str]]
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Results of one comparison under one protocol."""
@@ -49,174 +54,150 @@ class Comparison:
         return list(dict.fromkeys(result.method for result in self.results))
 
     def values(self, metric: str, test_set: str = "test") -> dict[str, dict[str, dict[int, float]]]:
-        """A metric by method, scene and seed."""
+        """A metric by method, scene and seed; without those of scenes that lack it."""
         found: dict[str, dict[str, dict[int, float]]] = {name: {} for name in self.methods}
         for result in self.results:
-            value = result.mean(metric, test_set)
+            value = result.sets[test_set].mean(metric) if test_set in result.sets else None
             if value is not None:
                 found[result.method].setdefault(result.scene.name, {})[result.seed] = value
         return found
 
-    def over_scenes(self, metric: str, test_set: str = "test") -> dict[str, np.ndarray]:
-        """A metric's means over seeds, for every scene, by method."""
-        return {
-            name: np.array([*scene_means(by_seed).values()]) for name, by_seed in self.values(metric, test_set).items()
-        }
+    def column(
+        self, metric: str, form: str, average: Callable[[Any], Any] = np.mean, test_set: str = "test"
+    ) -> dict[str, str]:
+        """Mean or median of a metric over the scenes, by method; empty texts where there is none."""
+        scenes = {name: [*scene_means(own).values()] for name, own in self.values(metric, test_set).items()}
+        return {name: text(average(own), form) if own else "" for name, own in scenes.items()}
+
+    def cost(self, form: str, of: Callable[[Result], float | None]) -> dict[str, str]:
+        """Mean of a cost over the runs, by method."""
+        costs = {name: [of(result) for result in self.results if result.method == name] for name in self.methods}
+        known = {name: [cost for cost in own if cost is not None] for name, own in costs.items()}
+        return {name: text(np.mean(own), form) if own else "" for name, own in known.items()}
 
     def leads(self, metric: str) -> dict[str, RivalComparison]:
         """Leads of the reference, by rival."""
-        compared = compare_with_rivals(self.values(metric), self.reference, metric.startswith(HIGHER))
+        compared = compare_with_rivals(self.values(metric), self.reference, metric in HIGHER)
         return {row.rival: row for row in compared}
 
-    def costs(self, of: Callable[[Result], float | None]) -> dict[str, float]:
-        """Mean of a cost over the runs, by method."""
-        return {
-            name: float(np.mean([of(result) or np.nan for result in self.results if result.method == name]))
-            for name in self.methods
-        }
 
-
-def colour_table(of: Comparison, methods: Sequence[str]) -> str:
+def colour_columns(of: Comparison) -> Columns:
     """PSNR, SSIM and LPIPS, and the leads in PSNR."""
-    psnr, leads = of.over_scenes("psnr"), of.leads("psnr")
-    ssim, lpips = of.over_scenes("ssim"), of.over_scenes("lpips_squeeze")
-    head = ["method", "PSNR, dB", "median", "SSIM", "LPIPS", f"lead of `{of.reference}`, dB", "better on", "p, Holm"]
-    return table(
-        head,
-        [
-            [
-                f"`{name}`",
-                f"{psnr[name].mean():.2f} +- {psnr[name].std(ddof=1):.2f}",
-                f"{np.median(psnr[name]):.2f}",
-                f"{ssim[name].mean():.3f}",
-                f"{lpips[name].mean():.3f}",
-                lead_cell(leads.get(name)),
-                *test_cells(leads.get(name)),
-            ]
-            for name in methods
-        ],
-    )
+    leads = of.leads("psnr")
+    return {
+        "PSNR, dB": of.column("psnr", ".2f"),
+        "median": of.column("psnr", ".2f", np.median),
+        "SSIM": of.column("ssim", ".3f"),
+        "LPIPS": of.column("lpips_squeeze", ".3f"),
+        f"lead of `{of.reference}`, dB": {name: lead_text(row) for name, row in leads.items()},
+        **test_columns(leads),
+    }
 
 
-def depth_table(of: Comparison, kinds: Mapping[str, Comparison], methods: Sequence[str]) -> str:
+def depth_columns(of: Comparison, kinds: Mapping[str, Comparison]) -> Columns:
     """Errors of depth, as accumulated, and of the other kinds of rendered depth."""
-    inner, leads = of.over_scenes("depth_mse_inner"), of.leads("depth_mse_inner")
-    whole, median = of.over_scenes("depth_mse"), of.over_scenes("depth_median_error")
-    others = {kind: each.over_scenes("depth_mse_inner") for kind, each in kinds.items()}
-    head = ["method", "inner MSE", "median", *(f"inner, {kind}" for kind in kinds), "MSE", "median error, mm"]
-    head += ["better on", "p, Holm"]
-    return table(
-        head,
-        [
-            [
-                f"`{name}`",
-                number(inner[name].mean()),
-                number(np.median(inner[name])),
-                *(number(each[name].mean()) for each in others.values()),
-                number(whole[name].mean()),
-                number(median[name].mean()),
-                *test_cells(leads.get(name)),
-            ]
-            for name in methods
-        ],
-    )
+    return {
+        "inner MSE": of.column("depth_mse_inner", ""),
+        "median": of.column("depth_mse_inner", "", np.median),
+        **{f"inner, {kind}": each.column("depth_mse_inner", "") for kind, each in kinds.items()},
+        "MSE": of.column("depth_mse", ""),
+        "median error, mm": of.column("depth_median_error", ""),
+        **test_columns(of.leads("depth_mse_inner")),
+    }
 
 
-def turned_table(of: Comparison, methods: Sequence[str]) -> str:
-    """PSNR of turned views over seen pixels, as rendered and with one fitted factor for each image."""
-    raw, fitted = (of.over_scenes(f"psnr{kind}_seen", "rotation") for kind in ("", "_gain_fitted"))
-    held_out = of.over_scenes("psnr_gain_fitted")
-    return table(
-        ["method", "turned views, dB", "with a fitted gain", "held-out frames with a fitted gain"],
-        [[f"`{name}`", *(f"{each[name].mean():.2f}" for each in (raw, fitted, held_out))] for name in methods],
-    )
+def turned_columns(of: Comparison) -> Columns:
+    """PSNR as rendered and with one fitted factor for each image, of turned views over seen pixels."""
+    return {
+        "turned views, dB": of.column("psnr_seen", ".2f", test_set="rotation"),
+        "with a fitted gain": of.column("psnr_gain_fitted_seen", ".2f", test_set="rotation"),
+        "held-out frames with a fitted gain": of.column("psnr_gain_fitted", ".2f"),
+    }
 
 
-def cost_table(of: Comparison, methods: Sequence[str]) -> str:
+def cost_columns(of: Comparison) -> Columns:
     """What the runs cost, and what they densified."""
-    steps, seconds = of.costs(lambda result: result.steps), of.costs(lambda result: result.cost.processor_seconds)
-    drawn, memory = of.costs(lambda result: result.cost.gaussians), of.costs(lambda result: result.cost.peak_memory_mib)
     plans = {result.method: result.provenance.get("training", {}).get("plan") or "none" for result in of.results}
-    return table(
-        ["method", "steps", "processor time, s", "Gaussians in a view", "peak memory, MiB", "plan of growth"],
-        [
-            [
-                f"`{name}`",
-                f"{steps[name]:.0f}",
-                f"{seconds[name]:.0f}",
-                f"{drawn[name] / 1000:.0f},000",
-                f"{memory[name]:.0f}",
-                plans[name],
-            ]
-            for name in methods
-        ],
-    )
+    return {
+        "steps": of.cost(",.0f", lambda result: result.steps),
+        "processor time, s": of.cost(".0f", lambda result: result.cost.processor_seconds),
+        "Gaussians in a view": of.cost(",.0f", lambda result: result.cost.gaussians),
+        "peak memory, MiB": of.cost(",.0f", lambda result: result.cost.peak_memory_mib),
+        "growth": plans,
+    }
 
 
-def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: Callable[[float], str]) -> str:
+def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) -> str:
     """A metric of every scene."""
     values = {name: scene_means(own) for name, own in of.values(metric).items()}
     scenes = dict.fromkeys(result.scene.name for result in of.results)
-    rows = [[f"`{scene}`", *(form(values[name].get(scene, np.nan)) for name in methods)] for scene in scenes]
-    return table(["scene", *(f"`{name}`" for name in methods)], rows)
+    columns: Columns = {
+        f"`{name}`": {scene: text(value, form) for scene, value in values[name].items()} for name in methods
+    }
+    return table(columns, [*scenes], "scene")
 
 
-def seeds_table(of: Comparison) -> str:
-    """Means of each seed, and the spread over seeds within scenes beside that over scenes."""
-    rows = []
+def seed_columns(of: Comparison) -> Columns:
+    """Mean PSNR of each seed, and the deviation over seeds within a scene."""
+    means, deviations = {}, {}
     for name, by_scene in of.values("psnr").items():
         grid = np.array([[*seeds.values()] for seeds in by_scene.values()])
-        within = np.sqrt(grid.var(axis=1, ddof=1).mean())
-        rows.append([f"`{name}`", " / ".join(f"{mean:.2f}" for mean in grid.mean(axis=0)), f"{within:.2f}"])
-    return table(["method", "PSNR of seeds 0 / 1 / 2, dB", "deviation over seeds, within a scene"], rows)
+        means[name] = " / ".join(text(mean, ".2f") for mean in grid.mean(axis=0))
+        deviations[name] = text(np.sqrt(grid.var(axis=1, ddof=1).mean()), ".2f")
+    return {"PSNR of seeds 0 / 1 / 2, dB": means, "deviation over seeds, within a scene": deviations}
 
 
-def lead_cell(row: RivalComparison | None) -> str:
-    """Mean lead with its interval; empty for the reference itself."""
-    if row is None or row.lead is None:
+def test_columns(leads: Mapping[str, RivalComparison]) -> Columns:
+    """Number of scenes on which the reference is better, and the adjusted p."""
+    return {
+        "better on": {name: f"{row.better_on} of {len(row.scenes)}" for name, row in leads.items()},
+        "p, Holm": {name: text(row.tests.wilcoxon_holm, ".2g") for name, row in leads.items() if row.tests},
+    }
+
+
+def lead_text(row: RivalComparison) -> str:
+    """Mean lead with its interval."""
+    if row.lead is None:
         return ""
     interval = "" if row.tests is None else " ({:+.2f} to {:+.2f})".format(*row.tests.interval)
     return f"{row.lead:+.2f}{interval}"
 
 
-def test_cells(row: RivalComparison | None) -> list[str]:
-    """Number of scenes on which the reference is better, and the adjusted p; empty for the reference itself."""
-    if row is None:
-        return ["", ""]
-    p = "" if row.tests is None else f"{row.tests.wilcoxon_holm:.2g}"
-    return [f"{row.better_on} of {len(row.scenes)}", p]
+def text(value: float, form: str) -> str:
+    """A number in a format; without one, two significant digits and no exponent."""
+    return f"{value:{form}}" if form else f"{float(f'{value:.2g}'):f}".rstrip("0").rstrip(".")
 
 
-def number(value: float) -> str:
-    """Two significant digits without an exponent."""
-    return f"{float(f'{value:.2g}'):f}".rstrip("0").rstrip(".")
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join([f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]]) + "\n"
+def table(columns: Columns, rows: Sequence[str], kind: str = "method") -> str:
+    """A Markdown table of some rows; where a column says nothing of a row, its cell is empty."""
+    lines = [[kind, *columns], ["---"] * (1 + len(columns))]
+    lines += [[f"`{row}`", *(column.get(row, "") for column in columns.values())] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 def tables(folder: Path) -> Iterator[tuple[str, str]]:
     """All tables of the measurement in a folder, by name."""
-    kinds = {kind: comparison(folder, "equal-time", f"{kind}-depth") for kind in ("expected", "median")}
     equal = comparison(folder, "equal-time")
+    kinds = {kind: comparison(folder, "equal-time", f"{kind}-depth") for kind in ("expected", "median")}
+    colour, depth = colour_columns(equal), depth_columns(equal, kinds)
     with_depth = [name for name in equal.methods if name not in NO_DEPTH]
-    for name, methods in (("with-depth", with_depth), ("without-depth", NO_DEPTH)):
-        yield f"{name}-colour", colour_table(equal, methods)
-        yield f"{name}-depth", depth_table(equal, kinds, methods)
-    yield "turned", turned_table(equal, equal.methods)
-    yield "cost", cost_table(equal, equal.methods)
+    without = [name for name in equal.methods if name in NO_DEPTH]
+    for name, methods in (("with-depth", with_depth), ("without-depth", without)):
+        yield f"{name}-colour", table(colour, methods)
+        yield f"{name}-depth", table(depth, methods)
+    yield "turned", table(turned_columns(equal), equal.methods)
+    yield "cost", table(cost_columns(equal), equal.methods)
     shown = [name for name in with_depth if name in SHOWN]
-    yield "scenes-psnr", scene_table(equal, "psnr", shown, "{:.2f}".format)
-    yield "scenes-depth", scene_table(equal, "depth_mse_inner", shown, number)
+    yield "scenes-psnr", scene_table(equal, "psnr", shown, ".2f")
+    yield "scenes-depth", scene_table(equal, "depth_mse_inner", shown, "")
     plateau = comparison(folder, "plateau")
-    yield "plateau-colour", colour_table(plateau, plateau.methods)
-    yield "plateau-cost", cost_table(plateau, plateau.methods)
+    yield "plateau-colour", table(colour_columns(plateau), plateau.methods)
+    yield "plateau-cost", table(cost_columns(plateau), plateau.methods)
     rows = comparison(folder, "paper-rows", reference=WHOLE)
-    yield "rows-colour", colour_table(rows, rows.methods)
-    yield "rows-depth", depth_table(rows, {}, rows.methods)
-    yield "seeds", seeds_table(comparison(folder, "seeds"))
+    yield "rows-colour", table(colour_columns(rows), rows.methods)
+    yield "rows-depth", table(depth_columns(rows, {}), rows.methods)
+    seeds = comparison(folder, "seeds")
+    yield "seeds", table(seed_columns(seeds), seeds.methods)
 
 
 def comparison(folder: Path, name: str, protocol: str = "paper", reference: str = REFERENCE) -> Comparison:
