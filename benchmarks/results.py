@@ -143,8 +143,8 @@ class Measure(_WithChoices):
         self.compare("paper-rows", rows, self.test, reference=WHOLE, primary=PRIMARY)
         # Apart, and exploratory: primary is seed 0, which is not trained again.
         several = equal[:SEVERAL_SEEDS]
-        for file in (self.out / "equal-time" / "results").glob("*/*/s0-*.json"):
-            if file.parent.name in {method.name for method in several}:
+        for method in several:
+            for file in (self.out / "equal-time" / "results").glob(f"*/{method.name}/s0-*.json"):
                 copy = self.out / "seeds" / file.relative_to(self.out / "equal-time")
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, copy)

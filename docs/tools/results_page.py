@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from coliags_plugin.reporting.markdown import markdown_table
+from coliags_plugin.reporting.model import simple_table
 from coliags_plugin.results.comparisons import RivalComparison, compare_with_rivals, scene_means
 from coliags_plugin.results.reading import read_result
 from coliags_plugin.results.record import Result
@@ -29,14 +31,8 @@ ARCHIVE = PAGE.parent / "results" / "measurement.tar.xz"
 TABLE = re.compile(r"(?<=<!-- table )([\w-]+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 #: The method that all others are compared with, and the row of the paper's ablation that has all parts.
 REFERENCE, WHOLE = "coliags", "depth-imve-imia"
-#: Methods without depth supervision.
-NO_DEPTH = ("coliags-no-depth", "scaffold-gs", "3dgs", "2dgs", "gaussian-pancakes-no-depth", "pr-endo-no-depth")
 #: Methods whose every scene is shown.
 SHOWN = ("coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs-distance-gain", "3dgs-depth-gain", "pr-endo")
-#: Metrics of which more is better.
-HIGHER = ("psnr", "ssim")
-
-
 #: Columns of a table: texts by method, by the columns' titles.
 Columns = dict[str, Mapping[str, str]]
 
@@ -53,6 +49,11 @@ class Comparison:
         """Names, in the order of the plan."""
         return list(dict.fromkeys(result.method for result in self.results))
 
+    @property
+    def with_depth(self) -> list[str]:
+        """Names of the methods with depth supervision."""
+        return list(dict.fromkeys(result.method for result in self.results if "depth" in result.config["losses"]))
+
     def values(self, metric: str, test_set: str = "test") -> dict[str, dict[str, dict[int, float]]]:
         """A metric by method, scene and seed; without those of scenes that lack it."""
         found: dict[str, dict[str, dict[int, float]]] = {name: {} for name in self.methods}
@@ -65,19 +66,20 @@ class Comparison:
     def column(
         self, metric: str, form: str, average: Callable[[Any], Any] = np.mean, test_set: str = "test"
     ) -> dict[str, str]:
-        """Mean or median of a metric over the scenes, by method; empty texts where there is none."""
+        """Mean or median of a metric over all scenes, formatted, for each method that has it."""
         scenes = {name: [*scene_means(own).values()] for name, own in self.values(metric, test_set).items()}
-        return {name: text(average(own), form) if own else "" for name, own in scenes.items()}
+        return {name: text(average(own), form) for name, own in scenes.items() if own}
 
     def cost(self, form: str, of: Callable[[Result], float | None]) -> dict[str, str]:
-        """Mean of a cost over the runs, by method."""
+        """Mean of a cost over all runs, formatted, for each method that has it."""
         costs = {name: [of(result) for result in self.results if result.method == name] for name in self.methods}
         known = {name: [cost for cost in own if cost is not None] for name, own in costs.items()}
-        return {name: text(np.mean(own), form) if own else "" for name, own in known.items()}
+        return {name: text(np.mean(own), form) for name, own in known.items() if own}
 
     def leads(self, metric: str) -> dict[str, RivalComparison]:
         """Leads of the reference, by rival."""
-        compared = compare_with_rivals(self.values(metric), self.reference, metric in HIGHER)
+        higher_is_better = self.results[0].metrics[metric].direction == "higher"
+        compared = compare_with_rivals(self.values(metric), self.reference, higher_is_better)
         return {row.rival: row for row in compared}
 
 
@@ -89,8 +91,8 @@ def colour_columns(of: Comparison) -> Columns:
         "median": of.column("psnr", ".2f", np.median),
         "SSIM": of.column("ssim", ".3f"),
         "LPIPS": of.column("lpips_squeeze", ".3f"),
-        f"lead of `{of.reference}`, dB": {name: lead_text(row) for name, row in leads.items()},
-        **test_columns(leads),
+        f"lead of {of.reference}, dB": {name: lead_text(row) for name, row in leads.items()},
+        **significance_columns(leads),
     }
 
 
@@ -102,7 +104,7 @@ def depth_columns(of: Comparison, kinds: Mapping[str, Comparison]) -> Columns:
         **{f"inner, {kind}": each.column("depth_mse_inner", "") for kind, each in kinds.items()},
         "MSE": of.column("depth_mse", ""),
         "median error, mm": of.column("depth_median_error", ""),
-        **test_columns(of.leads("depth_mse_inner")),
+        **significance_columns(of.leads("depth_mse_inner")),
     }
 
 
@@ -116,7 +118,7 @@ def turned_columns(of: Comparison) -> Columns:
 
 
 def cost_columns(of: Comparison) -> Columns:
-    """What the runs cost, and what they densified."""
+    """Steps, processor time, Gaussians, peak memory and planned densification."""
     plans = {result.method: result.provenance.get("training", {}).get("plan") or "none" for result in of.results}
     return {
         "steps": of.cost(",.0f", lambda result: result.steps),
@@ -131,9 +133,7 @@ def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) 
     """A metric of every scene."""
     values = {name: scene_means(own) for name, own in of.values(metric).items()}
     scenes = dict.fromkeys(result.scene.name for result in of.results)
-    columns: Columns = {
-        f"`{name}`": {scene: text(value, form) for scene, value in values[name].items()} for name in methods
-    }
+    columns: Columns = {name: {scene: text(value, form) for scene, value in values[name].items()} for name in methods}
     return table(columns, [*scenes], "scene")
 
 
@@ -147,7 +147,7 @@ def seed_columns(of: Comparison) -> Columns:
     return {"PSNR of seeds 0 / 1 / 2, dB": means, "deviation over seeds, within a scene": deviations}
 
 
-def test_columns(leads: Mapping[str, RivalComparison]) -> Columns:
+def significance_columns(leads: Mapping[str, RivalComparison]) -> Columns:
     """Number of scenes on which the reference is better, and the adjusted p."""
     return {
         "better on": {name: f"{row.better_on} of {len(row.scenes)}" for name, row in leads.items()},
@@ -169,10 +169,9 @@ def text(value: float, form: str) -> str:
 
 
 def table(columns: Columns, rows: Sequence[str], kind: str = "method") -> str:
-    """A Markdown table of some rows; where a column says nothing of a row, its cell is empty."""
-    lines = [[kind, *columns], ["---"] * (1 + len(columns))]
-    lines += [[f"`{row}`", *(column.get(row, "") for column in columns.values())] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    """Format columns as a Markdown table with these rows."""
+    cells = [[row, *(column.get(row) for column in columns.values())] for row in rows]
+    return markdown_table(simple_table([kind, *columns], cells)) + "\n"
 
 
 def tables(folder: Path) -> Iterator[tuple[str, str]]:
@@ -180,14 +179,13 @@ def tables(folder: Path) -> Iterator[tuple[str, str]]:
     equal = comparison(folder, "equal-time")
     kinds = {kind: comparison(folder, "equal-time", f"{kind}-depth") for kind in ("expected", "median")}
     colour, depth = colour_columns(equal), depth_columns(equal, kinds)
-    with_depth = [name for name in equal.methods if name not in NO_DEPTH]
-    without = [name for name in equal.methods if name in NO_DEPTH]
-    for name, methods in (("with-depth", with_depth), ("without-depth", without)):
+    without = [name for name in equal.methods if name not in equal.with_depth]
+    for name, methods in (("with-depth", equal.with_depth), ("without-depth", without)):
         yield f"{name}-colour", table(colour, methods)
         yield f"{name}-depth", table(depth, methods)
     yield "turned", table(turned_columns(equal), equal.methods)
     yield "cost", table(cost_columns(equal), equal.methods)
-    shown = [name for name in with_depth if name in SHOWN]
+    shown = [name for name in equal.methods if name in SHOWN]
     yield "scenes-psnr", scene_table(equal, "psnr", shown, ".2f")
     yield "scenes-depth", scene_table(equal, "depth_mse_inner", shown, "")
     plateau = comparison(folder, "plateau")
