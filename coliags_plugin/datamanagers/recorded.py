@@ -171,14 +171,14 @@ class RecordedDataManager(DataManager):
         if settings.initial_points == "file":
             file = path / settings.points_file
             points = read_points(file, settings.points_count, generator)
-            return points, self._described_points(file, points)
+            return points, self._described_points(file, points, path)
         if settings.initial_points == "none":
             return PointCloud(torch.zeros(0, 3)), {"source": "none", "count": 0}
         has_depth = any(shot.depth is not None for shot in recording.shots)
         own = recording.own_points
         if has_depth and (settings.initial_points == "depth" or own is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
-            return points, self._described_points("depth of the training frames", points)
+            return points, self._described_points("depth of the training frames", points, path)
         if own is None or recording.points_source is None:
             missing = POINTS_FILE if recording.points_source is None else recording.points_source.name
             from_file = "--set datamanager.initial_points=file --set datamanager.points_file=FILE"
@@ -189,12 +189,15 @@ class RecordedDataManager(DataManager):
                 f"{missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(own(), settings.points_count, generator, recording.points_source)
-        return points, self._described_points(recording.points_source, points)
+        return points, self._described_points(recording.points_source, points, path)
 
-    def _described_points(self, source: Path | str, points: PointCloud) -> dict[str, Any]:
+    def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> dict[str, Any]:
         facts: dict[str, Any] = {"source": str(source), "count": len(points), "seed": self.settings.seed}
-        if isinstance(source, Path) and source.is_file():
-            facts["sha256"] = file_sha256(source)
+        if isinstance(source, Path):
+            if source.is_relative_to(scene):  # results are shared, and no one's folders with them
+                facts["source"] = source.relative_to(scene).as_posix()
+            if source.is_file():
+                facts["sha256"] = file_sha256(source)
         return facts
 
 

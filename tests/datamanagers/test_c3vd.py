@@ -237,7 +237,7 @@ class TestWithoutDepth:
         assert all(frame.depth is None for frame in scene.train)
         torch.testing.assert_close(scene.points.positions, points.positions)
         assert torch.equal(scene.points.colors, points.colors)
-        assert scene.provenance["points"]["source"].endswith("points3D.ply")
+        assert scene.provenance["points"]["source"] == "points3D.ply"
         assert scene.provenance["invalid_depth_share"] is None
 
     def test_points_without_colour(self, tmp_path):
