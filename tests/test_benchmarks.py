@@ -104,7 +104,7 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "tools"))
     page = import_module("results_page")
     monkeypatch.setattr(page, "WHOLE", "coliags")
-    made = dict(page.tables(out))
+    made = page.tables(out)
     after = page.filled("".join(f"<!-- table {name} -->\nold<!-- end -->" for name in made), made)
     assert all(table in after for table in made.values()) and "old<" not in after
     for kind in ("colour", "depth"):

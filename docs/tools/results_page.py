@@ -174,8 +174,8 @@ def table(columns: Columns, rows: Sequence[str], kind: str = "method") -> str:
     return markdown_table(simple_table([kind, *columns], cells)) + "\n"
 
 
-def tables(folder: Path) -> Iterator[tuple[str, str]]:
-    """All tables of the measurement in a folder, by name."""
+def equal_time_tables(folder: Path) -> Iterator[tuple[str, str]]:
+    """Tables of all methods in equal processor time."""
     equal = comparison(folder, "equal-time")
     kinds = {kind: comparison(folder, "equal-time", f"{kind}-depth") for kind in ("expected", "median")}
     colour, depth = colour_columns(equal), depth_columns(equal, kinds)
@@ -188,14 +188,41 @@ def tables(folder: Path) -> Iterator[tuple[str, str]]:
     shown = [name for name in equal.methods if name in SHOWN]
     yield "scenes-psnr", scene_table(equal, "psnr", shown, ".2f")
     yield "scenes-depth", scene_table(equal, "depth_mse_inner", shown, "")
+
+
+def plateau_tables(folder: Path) -> Iterator[tuple[str, str]]:
+    """Tables of the first methods to their plateau."""
     plateau = comparison(folder, "plateau")
     yield "plateau-colour", table(colour_columns(plateau), plateau.methods)
     yield "plateau-cost", table(cost_columns(plateau), plateau.methods)
+
+
+def row_tables(folder: Path) -> Iterator[tuple[str, str]]:
+    """Tables of the paper's ablation."""
     rows = comparison(folder, "paper-rows", reference=WHOLE)
     yield "rows-colour", table(colour_columns(rows), rows.methods)
     yield "rows-depth", table(depth_columns(rows, {}), rows.methods)
+
+
+def seed_tables(folder: Path) -> Iterator[tuple[str, str]]:
+    """Table of the seeds."""
     seeds = comparison(folder, "seeds")
     yield "seeds", table(seed_columns(seeds), seeds.methods)
+
+
+#: Tables of each comparison, by its folder in the archive.
+TABLES = {
+    "equal-time": equal_time_tables,
+    "plateau": plateau_tables,
+    "paper-rows": row_tables,
+    "seeds": seed_tables,
+}
+
+
+def tables(folder: Path) -> dict[str, str]:
+    """All tables of the comparisons that are in a folder, by name."""
+    there = [of for name, of in TABLES.items() if (folder / name).is_dir()]
+    return {name: made for of in there for name, made in of(folder)}
 
 
 def comparison(folder: Path, name: str, protocol: str = "paper", reference: str = REFERENCE) -> Comparison:
@@ -216,7 +243,7 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(ARCHIVE) as archive:
             archive.extractall(folder, filter="data")
-        after = filled(before, dict(tables(Path(folder))))
+        after = filled(before, tables(Path(folder)))
     if "--check" in arguments:
         return int(after != before)
     PAGE.write_text(after, encoding="utf-8")
