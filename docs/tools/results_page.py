@@ -118,14 +118,13 @@ def turned_columns(of: Comparison) -> Columns:
 
 
 def cost_columns(of: Comparison) -> Columns:
-    """Steps, processor time, Gaussians, peak memory and planned densification."""
+    """Steps, processor time, Gaussians and planned densification."""
     plans = {result.method: result.provenance.get("training", {}).get("plan") or "none" for result in of.results}
     return {
         "steps": of.cost(",.0f", lambda result: result.steps),
         "processor time, s": of.cost(".0f", lambda result: result.cost.processor_seconds),
         "Gaussians in a view": of.cost(",.0f", lambda result: result.cost.gaussians),
-        "peak memory, MiB": of.cost(",.0f", lambda result: result.cost.peak_memory_mib),
-        "growth": plans,
+        "growth": {name: plan.removeprefix("this run ") for name, plan in plans.items()},
     }
 
 
