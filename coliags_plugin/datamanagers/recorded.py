@@ -194,7 +194,7 @@ class RecordedDataManager(DataManager):
     def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> dict[str, Any]:
         facts: dict[str, Any] = {"source": str(source), "count": len(points), "seed": self.settings.seed}
         if isinstance(source, Path):
-            if source.is_relative_to(scene):  # results are shared, and no one's folders with them
+            if source.is_relative_to(scene):  # results are shared: no path of this machine
                 facts["source"] = source.relative_to(scene).as_posix()
             if source.is_file():
                 facts["sha256"] = file_sha256(source)
