@@ -1,4 +1,4 @@
-"""Freed memory is given back once the process has grown by half a gibibyte."""
+"""The heap is trimmed once the process has grown by half a gibibyte."""
 
 import ctypes
 import subprocess
@@ -9,15 +9,15 @@ import pytest
 # Blocks of 64 KiB, below the size from which glibc maps each apart; the last one stays, so that the heap cannot shrink.
 HOLES = """
 import numpy as np
-from coliags_plugin.engine.heap import FreeMemory, resident_memory
+from coliags_plugin.engine.heap import HeapTrimmer, resident_memory
 
-memory, kept = FreeMemory(), []
+heap, kept = HeapTrimmer(), []
 for count in (2_000, 12_000):
     blocks = [np.ones(8_192) for _ in range(count)]
     kept.append(blocks[-1])
     del blocks
     before = resident_memory()
-    memory.give_back()
+    heap.trim_if_grown()
     print((before - resident_memory()) // 2**20)
 """
 
