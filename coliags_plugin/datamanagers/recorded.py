@@ -21,7 +21,7 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.datamanagers.recording import Recording, Shot
+from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import with_valid_seen_masks
@@ -192,12 +192,10 @@ class RecordedDataManager(DataManager):
         return points, self._described_points(recording.points_source, points, path)
 
     def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> dict[str, Any]:
-        facts: dict[str, Any] = {"source": str(source), "count": len(points), "seed": self.settings.seed}
-        if isinstance(source, Path):
-            if source.is_relative_to(scene):  # results are shared: no path of this machine
-                facts["source"] = source.relative_to(scene).as_posix()
-            if source.is_file():
-                facts["sha256"] = file_sha256(source)
+        name = portable_name(source, scene) if isinstance(source, Path) else source
+        facts: dict[str, Any] = {"source": name, "count": len(points), "seed": self.settings.seed}
+        if isinstance(source, Path) and source.is_file():
+            facts["sha256"] = file_sha256(source)
         return facts
 
 

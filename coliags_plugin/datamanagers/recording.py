@@ -72,14 +72,18 @@ class Recording:
 _BLOCK = 1 << 20
 
 
+def portable_name(path: Path, folder: Path) -> str:
+    """Path relative to a scene's folder, or the file name alone outside of it: no path of this machine."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
     """SHA-256 of the names and sizes of large files and the contents of small ones."""
     digest = hashlib.sha256()
     for path in filter(None, large):
-        name = path.relative_to(folder) if path.is_relative_to(folder) else path.name
         with _readable(path):
             size = path.stat().st_size
-        digest.update(f"{Path(name).as_posix()} {size}\n".encode("utf-8", "surrogateescape"))
+        digest.update(f"{portable_name(path, folder)} {size}\n".encode("utf-8", "surrogateescape"))
     for path in filter(None, small):
         with _readable(path), path.open("rb") as file:
             while block := file.read(_BLOCK):

@@ -244,13 +244,15 @@ class TestWithoutDepth:
         folder = write_undistorted(tmp_path / "wall", depths=None, points=PointCloud(torch.rand(5, 3)))
         assert small(folder).points.colors is None
 
-    def test_points_from_a_named_file(self, mine, points):
+    def test_points_from_a_named_file(self, mine, points, tmp_path):
         np.savez(mine / "cloud.npz", positions=points.positions.numpy())
         scene = small(mine, initial_points="file", points_file="cloud.npz")
         torch.testing.assert_close(scene.points.positions, points.positions)
         assert scene.train[0].depth is not None
-        other = small(mine, initial_points="file", points_file=str(mine / "cloud.npz"), points_count=7)
+        elsewhere = (mine / "cloud.npz").rename(tmp_path / "elsewhere.npz")
+        other = small(mine, initial_points="file", points_file=str(elsewhere), points_count=7)
         assert len(other.points) == 7
+        assert other.provenance["points"]["source"] == "elsewhere.npz"
 
     def test_a_missing_file(self, mine):
         with pytest.raises(InputError, match=r"no file .*nothing.ply"):
