@@ -22,7 +22,7 @@ from coliags_plugin.results.record import Result
 
 FOLDER = Path(__file__).parents[1] / "results"
 #: Columns of a table in front of the metrics, and behind them.
-RUN = ("scene", "method", "split", "seed", "set", "frames")
+RUN = ("scene", "method", "split", "seed", "protocol", "set", "frames")
 COST = ("gaussians", "processor_seconds", "peak_memory_mib", "key")
 
 
@@ -41,18 +41,18 @@ def main(name: str, comparisons: Sequence[Path]) -> None:
 
 
 def table(results: Sequence[Result]) -> str:
-    """CSV with a row for each run and test set: means over its frames, empty where no frame has the metric."""
+    """CSV with a row for each run, protocol and test set: means over its frames, empty where no frame has the metric."""
     metrics = list(dict.fromkeys(name for result in results for name in result.metrics))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*RUN, *metrics, *COST])
-    for result in sorted(results, key=lambda result: (result.scene.name, result.method, result.seed)):
+    for result in sorted(results, key=lambda of: (of.scene.name, of.method, of.seed, of.protocol.name)):
+        run = (result.scene.name, result.method, result.scene.split, result.seed, result.protocol.name)
         for name, part in result.sets.items():
-            run = (result.scene.name, result.method, result.scene.split, result.seed, name, len(part.frames))
             means = [part.mean(metric) for metric in metrics]
             cost = [result.cost.gaussians, result.cost.processor_seconds, result.cost.peak_memory_mib]
             numbers = ["" if value is None else f"{value:.6g}" for value in (*means, *cost)]
-            writer.writerow([*run, *numbers, result.key])
+            writer.writerow([*run, name, len(part.frames), *numbers, result.key])
     return text.getvalue()
 
 
