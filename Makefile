@@ -27,11 +27,11 @@ demo: install
 
 # In a process per CPU, up to four; each would take all CPUs otherwise.
 test: install-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
 
 # Long sweeps: fuzz, kills, full disks, browsers, notebooks, benchmarks and the contract of every ablation.
 test-thorough: install-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "thorough and not slow and not gpu"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal -m "thorough and not slow and not gpu"
 
 test-slow: install-dev
 	$(BIN)/python -m pytest -q -m slow

@@ -181,6 +181,7 @@ def test_a_notebook_shows_an_error_as_one_message():
     assert line.startswith("InputError: gone is not a run folder. Expected")
 
 
+@pytest.mark.thorough
 def test_examples_of_the_pages_run(tmp_path, monkeypatch):
     """In the order of the page, each with a few steps of a small model."""
     write_wall(tmp_path / "SCENE", frames=17)

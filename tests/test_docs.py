@@ -232,6 +232,7 @@ for words in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.thorough
 def test_the_tutorial_runs_as_written(tmp_path):
     scene = write_wall(tmp_path / "SCENE")
     for language, name in (("python", "edges.py"), ("yaml", "coliags-edges.yaml")):

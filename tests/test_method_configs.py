@@ -13,18 +13,8 @@ from coliags_plugin.config.method_files import method_files, method_folder
 FOLDER = method_folder()
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
 
-#: Methods of the quick suite; ``make test-thorough`` checks the others, which differ from one of these by few options.
-QUICK = {
-    "coliags",
-    "coliags-plus",
-    "coliags-sparse-depth",
-    "scaffold-gs",
-    "3dgs",
-    "2dgs",
-    "gaussian-pancakes",
-    "pr-endo",
-    "reim-nerf-small",
-}
+#: Methods of the quick suite; ``make test-thorough`` checks the others, which take longer or differ by few options.
+QUICK = {"coliags", "scaffold-gs", "3dgs", "2dgs"}
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {
     "reim-nerf": (

@@ -37,6 +37,7 @@ def test_the_renderers_of_a_cpu():
     assert "20 Gaussians, 16x8" in speed and speed.count("frames/s") == 2
 
 
+@pytest.mark.thorough
 @needs_triton
 def test_a_device_that_is_not_there(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", "12.8")
@@ -87,6 +88,7 @@ def test_a_wrong_renderer_fails(monkeypatch, spoiled, told):
         assert result.status == "failed" and told in result.detail and "--set renderer=torch" in result.detail
 
 
+@pytest.mark.thorough
 @needs_triton
 def test_a_wrong_kernel_fails(monkeypatch):
     """The opacities of a Gaussian are off by a thousandth in the kernel's table."""

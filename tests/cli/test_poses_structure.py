@@ -47,6 +47,7 @@ def tube(tmp_path_factory):
     return write_tube(tmp_path_factory.mktemp("tubes") / "tube", COUNT)
 
 
+@pytest.mark.thorough
 def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
     assert "coliags poses triangulate" in refused(capsys, "train", "scaffold-gs", "--data", tube)
     out = tmp_path / "out"
@@ -76,6 +77,7 @@ def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
     assert trains(f"coliags train scaffold-gs --data {out}", tmp_path / "run-2")
 
 
+@pytest.mark.thorough
 def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog):
     out = tmp_path / "out"
     caplog.set_level("INFO")
@@ -94,6 +96,7 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
     assert capsys.readouterr().out.splitlines()[-1].endswith("--set datamanager.split=all-train")
 
 
+@pytest.mark.thorough
 def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog):
     caplog.set_level("INFO")
     whole, half = tmp_path / "whole", tmp_path / "half"

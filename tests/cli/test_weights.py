@@ -104,6 +104,7 @@ def test_bad_input(capsys, cache, tmp_path):
     assert run("weights", "lpips", "--net", "resnet") == 2
 
 
+@pytest.mark.thorough
 def test_ctrl_c_keeps_what_arrived(server, cache):
     server.cuts, server.go_on = [20_000_000, 1_000_000], threading.Event()
     code = f"""

@@ -317,6 +317,7 @@ def test_checksum_of_a_file_that_cannot_be_read(tmp_path):
         file_sha256(tmp_path)
 
 
+@pytest.mark.thorough
 def test_nothing_else_in_the_package_reaches_for_the_network():
     package = Path(module.__file__).parents[1]
     users = set()

@@ -53,6 +53,7 @@ def test_a_lock_that_cannot_be_written(tmp_path):
         pass
 
 
+@pytest.mark.thorough
 def test_no_module_needs_fcntl():
     """Which Windows does not have; torch and filelock do without it."""
     code = """if True:

@@ -446,6 +446,7 @@ def phantom(tmp_path_factory) -> Path:
     return write_phantom(tmp_path_factory.mktemp("phantoms") / "colmap", "colmap")
 
 
+@pytest.mark.thorough
 def test_the_phantoms_sparse_depth_lies_on_its_wall(phantom):
     for frame in in_video_order(read(phantom, "colmap")):
         assert len(frame.sparse_depth.depth) > 100
@@ -491,6 +492,7 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
         assert mean == pytest.approx(stored, rel=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("place", "model"), [("sparse", "PINHOLE"), ("distorted_sparse", "SIMPLE_RADIAL")])
 def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_images(shared_data, place, model):
     """As far from there as COLMAP says, in pixels of the stored image: scene cameras and views agree."""
@@ -515,6 +517,7 @@ def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_images(shar
     assert mean == pytest.approx(reference.compute_mean_reprojection_error(), abs=0.01)
 
 
+@pytest.mark.thorough
 def test_undistorting_is_what_colmap_did(shared_data):
     """Features of the SIMPLE_RADIAL model through our lens are the PINHOLE model's, which COLMAP undistorted."""
     before, after = (read_model(shared_data / "colmap_23img" / place) for place in ("distorted_sparse", "sparse"))

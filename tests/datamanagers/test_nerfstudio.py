@@ -359,6 +359,7 @@ def test_neither_depth_nor_points(folder):
 # The phantom's layout
 
 
+@pytest.mark.thorough
 def test_the_phantom_is_the_one_of_the_pinhole_that_its_images_are_undistorted_to(tmp_path):
     bent, plain = (read(write_phantom(tmp_path / name, name, noise=0.0), name) for name in ("nerfstudio", "c3vd"))
     assert bent.provenance["lens"] == "OpenCVLens"

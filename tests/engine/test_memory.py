@@ -46,6 +46,7 @@ def test_storages_are_counted_until_they_are_freed():
     assert 8000 + 2000 <= live.peak <= 8000 + 4 * 2000 + 100 and len(second) == 1000
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
 @pytest.mark.parametrize("method", METHODS)
 def test_the_prediction_is_what_a_step_takes(method, tmp_path):

@@ -57,6 +57,7 @@ def errors(camera, other):
     return float((camera.center - other.center).norm()), math.degrees(turn.magnitude())
 
 
+@pytest.mark.thorough
 def test_a_known_perturbation_is_undone(model, frame):
     turn, shift = torch.tensor([0.01, -0.02, 0.03]), torch.tensor([0.4, 0.3, -0.5])
     wrong = replace(frame, camera=frame.camera.moved(turn, shift, 40.0))
@@ -67,6 +68,7 @@ def test_a_known_perturbation_is_undone(model, frame):
     assert model.weight.requires_grad and model.weight.grad is None
 
 
+@pytest.mark.thorough
 def test_its_scores_have_names_of_their_own_and_are_better(model, frame):
     scorer = Scorer("paper", ["psnr", "ssim"])
     darker = replace(frame, image=(frame.image * 0.8).to(torch.uint8))

@@ -45,7 +45,7 @@ STEPS = {
     "reim-nerf-small": ("field.width=16", "sampler.pixels=64"),
     "scaffold-gs-distance": (),
 }
-QUICK = ("coliags", "coliags-in-vivo", "pr-endo")
+QUICK = ("coliags", "pr-endo")
 
 
 def make_trainer(path, method, steps=4, more=(), scene=None):
@@ -183,6 +183,7 @@ def test_gradients_cross_devices_and_stay_on_theirs():
             here.grad + there.grad
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["coliags", *(pytest.param(name, marks=pytest.mark.thorough) for name in METHODS)])
 def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
     with PretendedCuda():
@@ -233,6 +234,7 @@ def test_triton_kernels_wait_for_the_number_of_pairs_besides(method, tmp_path):
     assert found <= WAITS + Counter({"local_scalar_dense renderers/triton_kernels/placing.py": 1})
 
 
+@pytest.mark.thorough
 def test_the_volume_renderer_waits_for_nothing(tmp_path):
     found = waits_of_a_step(tmp_path / "run", "reim-nerf-small", *STEPS["reim-nerf-small"])
     assert found == Counter({"tolist engine/trainer.py": 1})

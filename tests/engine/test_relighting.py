@@ -54,6 +54,7 @@ def wall_albedo(points):
     return 0.25 + 0.08 * waves
 
 
+@pytest.mark.thorough
 def test_training_recovers_the_fall_off_and_the_roughness(tmp_path):
     """Intensity and albedo are known as a product only, as are intensity and reflectance, and fall-off up to a factor:
 
@@ -111,6 +112,7 @@ def resumable(path) -> Trainer:
     return Trainer(load_method("pr-endo", RESUMED), wall_scene(), "wall", RunFolder(path), 0, CPU)
 
 
+@pytest.mark.thorough
 def test_resume_is_bit_exact_with_noise_and_growth(tmp_path):
     whole = resumable(tmp_path / "whole")
     whole.start()

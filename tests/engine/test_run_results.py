@@ -130,6 +130,7 @@ def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
     assert result.metrics["depth_mse_seen"] == result.metrics["depth_mse"]
 
 
+@pytest.mark.thorough
 def test_refined_poses_add_metrics_and_change_no_other(result, whole):
     found = read_result(evaluate(whole, "paper", refine_poses=True) / RESULT_FILE)
     added = ["psnr_pose_refined", "ssim_pose_refined", "psnr_pose_color_refined", "ssim_pose_color_refined"]
@@ -187,6 +188,7 @@ def test_other_truth_has_another_hash(loaded, result, whole, scene):
     assert found.truth_sha256 != result.sets["rotation"].truth_sha256
 
 
+@pytest.mark.thorough
 def test_runs_that_did_not_go_as_configured_have_keys_of_their_own(loaded, result):
     """Stopped half-way, or with a schedule that was changed on the way: neither is a run of so many steps."""
     half = loaded(stop=4, overrides=["schedule.checkpoint_every=3"])

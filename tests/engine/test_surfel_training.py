@@ -34,6 +34,7 @@ def make_trainer(path):
     return Trainer(load_method("2dgs", EARLY), wall_scene(), "wall", RunFolder(path), 0, torch.device("cpu"))
 
 
+@pytest.mark.thorough
 def test_a_run_counts_all_losses_changes_rows_and_resumes_to_the_bit(tmp_path):
     whole = make_trainer(tmp_path / "whole")
     whole.start()

@@ -137,6 +137,7 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
     np.testing.assert_allclose(seen[0].harmonics, seen[1].harmonics, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_run_without_a_recorded_scale_is_as_it_was(small, tmp_path):
     """Runs of versions that did not scale lie in the unit of their scene."""
     path = tmp_path / "mm"

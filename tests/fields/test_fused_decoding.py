@@ -56,7 +56,12 @@ def make(name, **options):
     return field
 
 
-@pytest.fixture(params=["numba", "triton", pytest.param("cuda", marks=pytest.mark.gpu)])
+NUMBA, CUDA = "numba", pytest.param("cuda", marks=pytest.mark.gpu)
+#: Of the quick suite; all else takes long in triton's interpreter.
+by_each = pytest.mark.parametrize("made", [NUMBA, "triton", CUDA], indirect=True)
+
+
+@pytest.fixture(params=[NUMBA, pytest.param("triton", marks=pytest.mark.thorough), CUDA])
 def made(request, monkeypatch):
     """:func:`make`, of fields that either kernels decode: triton's in its interpreter, or on a device."""
     if request.param == "numba":
@@ -120,6 +125,7 @@ def test_all_or_none_of_the_children_are_drawn(opacity, share, made):
     assert len(drawn.visible_sources) > 0
 
 
+@by_each
 def test_a_single_anchor(made):
     field = made("scaffold", voxel_size=100.0)
     assert field.element_count == 1
@@ -128,7 +134,7 @@ def test_a_single_anchor(made):
 
 # On a device every example would be compiled for seconds.
 @pytest.mark.thorough
-@pytest.mark.parametrize("made", ["numba", "triton"], indirect=True)
+@pytest.mark.parametrize("made", [NUMBA, "triton"], indirect=True)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     children=st.integers(1, 20), features=st.integers(1, 50), units=st.tuples(st.integers(1, 70), st.integers(1, 70)),

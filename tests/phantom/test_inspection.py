@@ -129,6 +129,7 @@ def test_a_colon_without_such_a_path_is_an_error(colon, monkeypatch):
     assert "another seed" in str(refused.value)
 
 
+@pytest.mark.thorough
 def test_automatic_gain_swings_up_to_its_span_and_most_of_the_rotated_views_is_seen(tmp_path):
     small = {"width": 48, "height": 38, "rotation_views": 6, "texture_spacing": 0.4, "supersampling": 1}
     options = {**COARSE, **small, "seed": 3, "frames": 60, "interreflection": 0.0}

@@ -60,6 +60,7 @@ def test_breathing_swings_across_the_colon_with_its_period():
     np.testing.assert_allclose(shift[2], shift[6], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_wave_of_zero_is_the_rigid_phantom_to_the_bit(living, tmp_path):
     still = replace(living.motion, wave=0.0 * living.motion.wave, shift=0.0 * living.motion.shift).at(3)
     np.testing.assert_array_equal(still.vertices, living.world.surface.vertices)
@@ -174,6 +175,7 @@ def test_softness_spreads_light_and_keeps_it():
     np.testing.assert_allclose(sensor.softened(np.ones((38 * 48, 3), np.float32), 3.0), 1.0, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_an_examination_turns_fast_and_touches_the_moving_wall():
     settings = PhantomSettings(
         **SMALL | {"trajectory": "examination", "frames": 120, "turns": 2, "contacts": 1, "wave": 2.0, "seed": 1}

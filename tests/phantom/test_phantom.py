@@ -163,6 +163,7 @@ def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypat
     assert all(one[name] != other[name] for name in one if name.endswith((".png", ".ply")) and "seen" not in name)
 
 
+@pytest.mark.thorough
 def test_raw_layout_is_the_releases_own(raw):
     names = {path.name for path in raw.iterdir()}
     assert {"0000_color.png", "0008_depth.tiff", "0004_normals.tiff", "pose.txt", "coverage_mesh.obj"} <= names

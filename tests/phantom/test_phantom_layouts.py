@@ -56,6 +56,7 @@ def test_sizes_rotation_views_and_lenses_are_as_told_and_asked_for(name):
 FRAMES = 27
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", phantom_layouts)
 def test_the_phantoms_split_is_the_one_that_its_manager_reads(name, tmp_path):
     """Points, masks and turned views go by the phantom's own idea of which frames are trained on."""

@@ -270,6 +270,7 @@ def test_depth_has_smooth_relative_noise_and_bleeds_over_edges():
     assert 10.5 < given[80, 99] < 39.5 and 10.5 < given[80, 100] < 39.5
 
 
+@pytest.mark.thorough
 def test_only_what_is_given_for_training_has_errors(tmp_path):
     options = TINY | {"width": 48, "height": 38, "mesh_spacing": 2.0, "lamps": GUIDES}
     generate(PhantomSettings(**options), tmp_path / "exact")
@@ -285,6 +286,7 @@ def test_only_what_is_given_for_training_has_errors(tmp_path):
     assert 0.01 < apart.min() and apart.max() < 3.0
 
 
+@pytest.mark.thorough
 def test_a_turned_view_is_exposed_for_what_it_sees():
     options = TINY | {"width": 48, "height": 38, "mesh_spacing": 2.0, "gain_span": 50.0, "noise": 0.0}
     metered = prepare(PhantomSettings(**options), idle)

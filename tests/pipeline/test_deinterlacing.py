@@ -45,6 +45,7 @@ def test_one_field_is_interpolated_along_columns(image):
     np.testing.assert_array_equal(one_field(image), np.floor(expected + 0.5))
 
 
+@pytest.mark.thorough
 def test_it_is_nearer_to_the_frame_of_its_first_moment_and_is_followed_as_that_is():
     """On a camera that shakes: where its motion is even, combs move along with it and are followed, to wrong places."""
     places = np.clip(80 + np.cumsum(RNG.integers(-8, 9, 120)), 0, 159)
@@ -78,6 +79,7 @@ def test_which_videos_look_interlaced():
         assert not looks_interlaced(progressive)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["video", "images"])
 def test_it_is_read_so_where_it_looks_so_and_all_else_is_as_it_is(tmp_path, kind, caplog):
     def source(name, frames, **options):

@@ -44,6 +44,7 @@ def posed(done, monkeypatch):
     monkeypatch.setattr(capture_stages, "make_poses", poses)
 
 
+@pytest.mark.thorough
 def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, workers, done):
     cp.reconstruct(video, tmp_path / "alone")
     alone = list(done)
@@ -61,6 +62,7 @@ def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, wo
     assert done == alone
 
 
+@pytest.mark.thorough
 def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, atlas, tmp_path, workers, caplog):
     died = TaskOutcome("died", "the process was ended by SIGKILL")
     executor = workers(died)
@@ -88,6 +90,7 @@ def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
     assert job.doing == f"{tmp_path.name}, sub-map 3 train"
 
 
+@pytest.mark.thorough
 def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, workers, monkeypatch):
     mesh, failing = training_stages.mesh, [1]
 
@@ -109,6 +112,7 @@ def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, wor
     assert done == list(TRAINING[2:])
 
 
+@pytest.mark.thorough
 def test_it_stops_and_goes_on(done, atlas, tmp_path, workers):
     workers(None, KeyboardInterrupt())
     with pytest.raises(InterruptedRunError, match="goes on where it stopped"):
@@ -119,6 +123,7 @@ def test_it_stops_and_goes_on(done, atlas, tmp_path, workers):
     assert done == [*SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
 
 
+@pytest.mark.thorough
 def test_what_a_worker_of_a_killed_call_has_written_is_taken_over(done, atlas, tmp_path, workers, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(Record, "take_over", lambda *_: None)
@@ -131,6 +136,7 @@ def test_what_a_worker_of_a_killed_call_has_written_is_taken_over(done, atlas, t
     assert parts(executor) == [] and not list((tmp_path / "out").glob(".reconstruction-*.json"))
 
 
+@pytest.mark.thorough
 def test_other_options_are_refused_or_repeated(done, atlas, tmp_path, workers):
     workers()
     cp.reconstruct(atlas, tmp_path / "out", jobs=1)

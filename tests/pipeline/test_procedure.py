@@ -214,6 +214,7 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     assert Procedure.read(tmp_path / "none") and Survey.read(tmp_path / "none")
 
 
+@pytest.mark.thorough
 def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path, workers, monkeypatch):
     make_poses, tried = capture_stages.make_poses, []
 
@@ -251,6 +252,7 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
     )
 
 
+@pytest.mark.thorough
 def test_a_long_video_that_is_cut_off_is_reconstructed_as_far_as_it_goes(done, tmp_path, workers, caplog):
     whole = write_avi(film(range(150)), tmp_path / "whole.avi", 25)
     (tmp_path / "cut.avi").write_bytes(whole.read_bytes()[: whole.stat().st_size * 7 // 10])
@@ -300,6 +302,7 @@ def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_
     assert (tmp_path / "out" / "segment-002" / "frames" / "frames.json").is_file()
 
 
+@pytest.mark.thorough
 def test_a_node_without_the_video_is_told_before_the_survey(long_video, tmp_path, workers, monkeypatch):
     ray = pytest.importorskip("ray")
     cluster, node = RayExecutor.__new__(RayExecutor), {"NodeID": "n1", "NodeManagerAddress": "10.0.0.2"}

@@ -165,6 +165,7 @@ def test_bad_input_leaves_nothing(tmp_path, capsys):
         assert not out.exists()
 
 
+@pytest.mark.thorough
 def test_a_tube_is_reconstructed_from_its_frames(tmp_path, monkeypatch):
     """All stages on ten small frames; a few steps of training, so that only the path is exact."""
     monkeypatch.setattr(distillation, "STEPS", 3)

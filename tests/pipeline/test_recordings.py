@@ -81,6 +81,7 @@ def test_images_beside_a_video_without_calibration_are_the_frames(recording):
     assert opened_recording(recording, SfmSettings()) == (recording, SfmSettings())
 
 
+@pytest.mark.thorough
 def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_by_its_folder(done, tmp_path, workers):
     """Images and poses alone, distorted, black outside an octagon (docs/layouts/c3vd-v2.md)."""
     shown = octagon_mask(270, 216)

@@ -163,6 +163,7 @@ def test_tracks_give_every_frame_a_pose(tracked):
     assert tracked.submaps() == [(0, range(8))]
 
 
+@pytest.mark.thorough
 def test_blurred_images_get_no_poses(tmp_path):
     images = list_images(write_tube(tmp_path / "scene", 8, 2.0) / "images")
     for path in images:
@@ -171,6 +172,7 @@ def test_blurred_images_get_no_poses(tmp_path):
         reconstruct(images, TRACKED)
 
 
+@pytest.mark.thorough
 def test_places_between_models_are_told(tmp_path):
     images = list_images(write_tube(tmp_path / "scene", 16, 2.0) / "images")
     windows = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=8)})

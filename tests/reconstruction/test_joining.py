@@ -71,6 +71,7 @@ def test_models_of_the_same_wall_become_one(halves):
         assert len(more) == len(light) == len(np.unique(ids))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("moves", [False, True])
 def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatch):
     video, _, parts = halves

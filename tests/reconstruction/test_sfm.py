@@ -97,6 +97,7 @@ def test_the_written_scene_is_read_as_it_is(atlas, found, tmp_path):
     assert scene.points.colors.float().std() > 20
 
 
+@pytest.mark.thorough
 def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     images = list_images(phantom / "images")
     with caplog.at_level(logging.INFO):
@@ -113,6 +114,7 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     assert found.correlation < -0.5
 
 
+@pytest.mark.thorough
 def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
     found = reconstruct(
         list_images(phantom / "images"), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE"))
@@ -121,6 +123,7 @@ def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
 
 
+@pytest.mark.thorough
 def test_an_implausible_focal_length_is_refused(tube):
     camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
     told = r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees"
@@ -154,6 +157,7 @@ def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog)
     assert len(open_scene(tmp_path / "scene", options=["split=all-train"]).train) == COUNT
 
 
+@pytest.mark.thorough
 def test_models_of_other_cameras_keep_their_own(tube, tmp_path):
     """Two tubes in images of two sizes have no camera in common."""
     for index, frame in enumerate(tube_frames(COUNT, 3.0)):
@@ -175,6 +179,7 @@ def test_masked_parts_have_no_features(tube):
     assert max(seen) < 62
 
 
+@pytest.mark.thorough
 def test_nothing_is_said_by_the_library(tube, capfd):
     logging.getLogger("coliags_plugin").setLevel(logging.ERROR)
     try:
@@ -224,6 +229,7 @@ def test_images_that_repeat_are_left_out_and_named(found, tube, tmp_path, caplog
     refusal("all 3 images show the same", tmp_path)
 
 
+@pytest.mark.thorough
 def test_black_surroundings_move_the_cameras_centre(found, tube, tmp_path):
     """Of an unknown camera: the same path as of the picture alone."""
     settings = SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factors=(0.63,), refine=False))

@@ -177,7 +177,7 @@ def with_features(gaussians):
     return dataclasses.replace(gaussians, features=features)
 
 
-@by_each
+@by_each_at_length
 @pytest.mark.parametrize(("primitive", "name"), [scene for scene in SCENES if scene[1] not in CROWDED])
 def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
     check_against_the_definition(renderer, primitive, name)
@@ -245,7 +245,7 @@ def test_features_and_the_centres_own_gradient_agree_with_the_definition(rendere
         assert relative(gradient, true_gradients[key]) <= (1e-4 if key == "pose" else 2e-5), key
 
 
-@by_each
+@by_each_at_length
 @pytest.mark.parametrize(
     ("primitive", "name", "parts"),
     [

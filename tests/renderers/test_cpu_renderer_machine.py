@@ -248,6 +248,7 @@ def test_views_may_wait_for_their_gradients_in_any_order():
         assert torch.equal(gaussians.means.grad, expected)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_forked_processes_draw_even_where_another_thread_was_drawing():
     code = """

@@ -94,6 +94,7 @@ def test_a_sound_scene_is_not_suspected(scene):
     assert check.depth.nearest < check.depth.median < check.depth.farthest <= 100.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
 def test_poses_in_another_convention_are_called_by_it(scene, reading):
     # Each of these changes undoes itself.
@@ -131,6 +132,7 @@ def estimate(scene):
     return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
 
 
+@pytest.mark.thorough
 def test_estimated_depth_is_judged_where_it_is_confident(estimate):
     check = check_scene(estimate)
     assert check.findings == []
@@ -218,6 +220,7 @@ def test_a_jump_a_standstill_black_and_repeated_images(scene):
     assert of_images(repeated) == "images repeat"
 
 
+@pytest.mark.thorough
 def test_constant_and_unknown_depth(scene):
     flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
     findings = whats(flat)
@@ -262,6 +265,7 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
     return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)), {})
 
 
+@pytest.mark.thorough
 def test_a_camera_that_pauses_is_not_suspected_and_its_pauses_are_not_compared(frames):
     sound = paused(frames)
     check = check_scene(sound)
@@ -295,6 +299,7 @@ def lit(frames: list[Frame]) -> list[Frame]:
     return [replace(frame, image=(frame.image * factor).byte()) for frame, factor in zip(frames, factors, strict=True)]
 
 
+@pytest.mark.thorough
 def test_reversed_depth_contradicts_the_lamp(frames):
     def scene_of(frames):
         return Scene("lit", frames, {}, PointCloud(torch.zeros(0, 3)), {})
@@ -339,6 +344,7 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
         assert sum(fact in line for line in log) == 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])
 def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
     assert run("data", "check", shared_data / name, "--set", "max_frames=4", "--set", f"frame_step={step}") == 0
@@ -383,6 +389,7 @@ def test_where_features_fail_points_are_followed(unmatched):
     assert "Points followed through" in page_text(check_page(check))
 
 
+@pytest.mark.thorough
 def test_where_features_contradict_right_poses_points_are_followed(scene, monkeypatch):
     def wrong(pairs):
         rng = np.random.default_rng(0)
@@ -422,6 +429,7 @@ def test_images_that_show_nothing_again_leave_poses_undecided(unmatched):
     assert check.findings == [] and check.matches == {}
 
 
+@pytest.mark.thorough
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
     argv = ("data", "check", folder, "--html", tmp_path / "check.html")
     assert run(*argv) == 0
@@ -438,6 +446,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
     assert "z, mm" in page
 
 
+@pytest.mark.thorough
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     inverted = changed(scene, pose=torch.linalg.inv)
     write_frames(tmp_path / "inverted", inverted.video)

@@ -135,6 +135,7 @@ def test_a_fit_of_so_many_steps_is_the_same_again(runs):
         assert torch.equal(values, second.state_dict()[name])
 
 
+@pytest.mark.thorough
 def test_distilled_colours_fall_with_the_distance_to_the_lamp(runs, monkeypatch):
     """As those of frames do, here of the run's own, which a colour that is the same from everywhere cannot."""
     trained = runs("pr-endo").load()

@@ -98,6 +98,7 @@ def test_a_page_of_a_method_without_a_lamp_speaks_of_no_light(run_of):
     assert "Gaussians; " in text and "recorded light" not in text
 
 
+@pytest.mark.thorough
 def test_meshes_of_the_run_are_layers_of_the_page(run_of):
     run = run_of("2dgs")
     mesh = TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), np.full((3, 3), 200, np.uint8))

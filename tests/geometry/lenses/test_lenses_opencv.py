@@ -61,6 +61,7 @@ def test_unprojecting_is_cv2s():
     np.testing.assert_allclose(LENS.unproject(pixels + 0.5)[:, :2], reference, rtol=0, atol=1e-8)
 
 
+@pytest.mark.thorough
 @settings(max_examples=30, deadline=None)
 @given(x=st.floats(-0.9, 0.9), y=st.floats(-0.9, 0.9), z=st.floats(0.01, 200.0), width=st.sampled_from([1350, 338]))
 def test_projecting_and_unprojecting_are_inverse(x, y, z, width):

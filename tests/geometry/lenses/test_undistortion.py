@@ -116,6 +116,7 @@ def test_legacy_pinhole_is_opencvs_undistort(shared_data):
     assert np.abs(halved.astype(int) - resized.astype(int)).mean() < 0.5
 
 
+@pytest.mark.thorough
 def test_official_frame_through_the_true_lens_has_no_dark_corner(shared_data):
     frame = cv2.imread(str(shared_data / "c3vd_official_frame" / "color.png"))
     for name in NAMES:

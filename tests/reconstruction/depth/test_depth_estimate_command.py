@@ -72,6 +72,7 @@ def contents(folder):
     return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.thorough
 def test_the_data_check_trusts_the_estimate_and_contradicts_other_poses(estimated, tmp_path, capsys):
     assert run("data", "check", estimated) == 0
     assert "nothing suspect" in capsys.readouterr().out

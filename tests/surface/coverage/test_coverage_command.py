@@ -123,6 +123,7 @@ def test_of_a_short_video_the_seen_wall_is_written_and_why_there_is_no_section(p
     assert {file.name for file in out.iterdir()} == {"coverage.html", "coverage.json", "coverage.ply", "map.png"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("phantom", ["c3vd"], indirect=True)
 def test_a_scene_of_unknown_unit_has_its_areas_in_square_units(phantom, tmp_path):
     scene = open_recording(phantom)

@@ -88,12 +88,14 @@ def test_what_lies_too_far_is_not_fused():
     assert mesh.vertices[:, 2].max() < 16
 
 
+@pytest.mark.thorough
 def test_transparent_views_have_no_surface():
     with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
         fuse_run(exact_run(alpha=0.7))
     assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)).mesh)
 
 
+@pytest.mark.thorough
 def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     run = exact_run()
     asked = []

@@ -74,6 +74,7 @@ def test_with_a_texture(tmp_path):
     assert read_mesh(made.folder / "mesh.ply").colors is not None, "PLY keeps colours at vertices"
 
 
+@pytest.mark.thorough
 def test_truth_beside_the_scene_is_found(tmp_path):
     (tmp_path / "scene/truth").mkdir(parents=True)
     write_mesh(tmp_path / "scene/truth/mesh.ply", wall_mesh())
@@ -114,6 +115,7 @@ def test_truth_of_another_unit_is_refused(tmp_path):
     assert not (tmp_path / "mesh").exists()
 
 
+@pytest.mark.thorough
 def test_a_scene_of_unknown_scale(truth, tmp_path):
     """Its unit is said, and truth in mm is only that of a scene with the same poses."""
     folder = write_wall(tmp_path / "wall", 9, 160, 120)
