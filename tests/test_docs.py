@@ -424,14 +424,21 @@ def test_generated_pages_cite_rightly(name):
 # Tables of results
 
 
-def test_tables_of_results_are_those_of_the_archive(tmp_path):
-    with tarfile.open(DOCS / "results" / "comparisons.tar.xz") as archive:
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["comparisons", "measurement"])
+def test_tables_of_results_are_those_of_the_archive(name, tmp_path):
+    with tarfile.open(DOCS / "results" / f"{name}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
     for folder in tmp_path.iterdir():
         table = tool("results")["table"](find_results([folder / "results"]))
         assert (DOCS / "results" / f"{folder.name}.csv").read_text() == table
         cells = json.loads((folder / "plan.json").read_text())["cells"]
         assert cells and all((folder / cell["result"]).is_file() for cell in cells)
+
+
+@pytest.mark.thorough
+def test_tables_of_the_page_are_those_of_the_archive():
+    assert tool("results_page")["main"](["--check"]) == 0
 
 
 def test_protocols_page_names_every_protocol_metric_and_version():

@@ -33,6 +33,8 @@ TABLE = re.compile(r"(?<=<!-- table )([\w-]+)( -->\n).*?(?=<!-- end -->)", re.DO
 REFERENCE, WHOLE = "coliags", "depth-imve-imia"
 #: Methods whose every scene is shown.
 SHOWN = ("coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs-distance-gain", "3dgs-depth-gain", "pr-endo")
+#: How many of the scenes, which come first, have light as ``coliags-plus`` models it.
+ASSUMED = 5
 #: Columns of a table: texts by method, by the columns' titles.
 Columns = dict[str, Mapping[str, str]]
 
@@ -129,11 +131,17 @@ def cost_columns(of: Comparison) -> Columns:
 
 
 def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) -> str:
-    """A metric of every scene."""
+    """A metric of every scene, and its means over those with assumed light and over all others."""
     values = {name: scene_means(own) for name, own in of.values(metric).items()}
-    scenes = dict.fromkeys(result.scene.name for result in of.results)
-    columns: Columns = {name: {scene: text(value, form) for scene, value in values[name].items()} for name in methods}
-    return table(columns, [*scenes], "scene")
+    scenes = [*dict.fromkeys(result.scene.name for result in of.results)]
+    groups = {f"mean of these {ASSUMED}": scenes[:ASSUMED], "mean of the others": scenes[ASSUMED:]}
+    columns: Columns = {
+        name: {scene: text(value, form) for scene, value in values[name].items()}
+        | {group: text(np.mean([values[name][scene] for scene in own]), form) for group, own in groups.items()}
+        for name in methods
+    }
+    rows = [*scenes[:ASSUMED], [*groups][0], *scenes[ASSUMED:], [*groups][1]]
+    return table(columns, rows, "scene")
 
 
 def seed_columns(of: Comparison) -> Columns:
