@@ -41,7 +41,7 @@ def main(name: str, comparisons: Sequence[Path]) -> None:
 
 
 def table(results: Sequence[Result]) -> str:
-    """CSV with a row for each run, protocol and test set: means over its frames, empty where no frame has the metric."""
+    """CSV with a row for each run, protocol and test set: means over frames, empty where no frame has the metric."""
     metrics = list(dict.fromkeys(name for result in results for name in result.metrics))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

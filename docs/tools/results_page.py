@@ -134,14 +134,13 @@ def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) 
     """A metric of every scene, and its means over those with assumed light and over all others."""
     values = {name: scene_means(own) for name, own in of.values(metric).items()}
     scenes = [*dict.fromkeys(result.scene.name for result in of.results)]
-    groups = {f"mean of these {ASSUMED}": scenes[:ASSUMED], "mean of the others": scenes[ASSUMED:]}
+    rows = {scene: [scene] for scene in scenes[:ASSUMED]} | {f"mean of these {ASSUMED}": scenes[:ASSUMED]}
+    rows |= {scene: [scene] for scene in scenes[ASSUMED:]} | {"mean of the others": scenes[ASSUMED:]}
     columns: Columns = {
-        name: {scene: text(value, form) for scene, value in values[name].items()}
-        | {group: text(np.mean([values[name][scene] for scene in own]), form) for group, own in groups.items()}
+        name: {row: text(np.mean([values[name][scene] for scene in own]), form) for row, own in rows.items()}
         for name in methods
     }
-    rows = [*scenes[:ASSUMED], [*groups][0], *scenes[ASSUMED:], [*groups][1]]
-    return table(columns, rows, "scene")
+    return table(columns, [*rows], "scene")
 
 
 def seed_columns(of: Comparison) -> Columns:
