@@ -19,7 +19,7 @@ from tests.scenes import SMALL, wall_scene
 
 CPU = torch.device("cpu")
 #: Those whose memory docs/rendering.md tells.
-METHODS = ("3dgs", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("2dgs", "coliags")))
+METHODS = ("3dgs", "2dgs", "coliags")
 
 
 def make_trainer(path, method="3dgs", device=CPU, overrides=(), scene=None):

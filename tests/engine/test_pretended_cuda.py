@@ -184,7 +184,7 @@ def test_gradients_cross_devices_and_stay_on_theirs():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("method", ["coliags", *(pytest.param(name, marks=pytest.mark.thorough) for name in METHODS)])
+@pytest.mark.parametrize("method", ["coliags", *METHODS])
 def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
     with PretendedCuda():
         trainer = make_trainer(tmp_path / "run", method)
