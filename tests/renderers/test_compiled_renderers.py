@@ -245,7 +245,8 @@ def test_features_and_the_centres_own_gradient_agree_with_the_definition(rendere
         assert relative(gradient, true_gradients[key]) <= (1e-4 if key == "pose" else 2e-5), key
 
 
-@by_each_at_length
+@pytest.mark.thorough  # numba compiles every set of outputs
+@by_each
 @pytest.mark.parametrize(
     ("primitive", "name", "parts"),
     [
