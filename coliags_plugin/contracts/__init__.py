@@ -20,7 +20,7 @@ from coliags_plugin.contracts.fields import (
 from coliags_plugin.contracts.following import Follower, Logger, scalars
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
-from coliags_plugin.contracts.schedule import Schedule, log_linear
+from coliags_plugin.contracts.schedule import Schedule, log_linear, steps_text
 from coliags_plugin.contracts.training import Draw, ParameterRows, Sampler, Strategy, TrainedModel, TrainingStep
 
 __all__ = [
@@ -59,4 +59,5 @@ __all__ = [
     "knows_lamp",
     "log_linear",
     "scalars",
+    "steps_text",
 ]

@@ -48,6 +48,13 @@ class Schedule:
         return range((self.at(after) // interval + 1) * interval, self.at(until), interval)
 
 
+def steps_text(steps: range) -> str:
+    """Name steps in a sentence: "never", "at step 330" or "at 24 steps, from 96 to 832"."""
+    if len(steps) < 2:
+        return f"at step {steps[0]}" if steps else "never"
+    return f"at {len(steps)} steps, from {steps[0]} to {steps[-1]}"
+
+
 def log_linear(start: float, end: float, progress: float) -> float:
     """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (docs/methods.md 2.3).
 

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep
+from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep, steps_text
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.core.settings import Settings
@@ -91,11 +91,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
                 f"this run neither densifies nor prunes: its {self.schedule.steps} steps leave no multiple of {every} "
                 f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
             )
-        resetting = f"at {len(resets)}, from {resets[0]} to {resets[-1]}" if resets else "never"
-        return (
-            f"this run clones, splits and prunes at {len(events)} steps, from {events[0]} to {events[-1]}, and resets "
-            f"opacities {resetting}"
-        )
+        return f"this run clones, splits and prunes {steps_text(events)}, and resets opacities {steps_text(resets)}"
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep[ExplicitRows], rows: ParameterRows) -> dict[str, int]:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep
+from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep, steps_text
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.strategies.image_gradients import gradient_lengths
@@ -92,7 +92,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
                 f"this run neither grows nor prunes anchors: its {self.schedule.steps} steps leave no multiple of "
                 f"{every} between steps {self.schedule.at(self.settings.growth_from)} and {self.until}"
             )
-        return f"this run grows and prunes anchors at {len(events)} steps, from {events[0]} to {events[-1]}"
+        return f"this run grows and prunes anchors {steps_text(events)}"
 
     def most_added(self, pixels: int) -> int:
         """The births of all events."""

@@ -94,12 +94,13 @@ def test_opacities_are_reset_and_adam_forgets_them():
 @pytest.mark.parametrize(
     ("steps", "plan", "expected"),
     [
-        (30_000, "at 144 steps, from 600 to 14900, and resets opacities at 4, from 3000 to 12000",
+        (30_000, "at 144 steps, from 600 to 14900, and resets opacities at 4 steps, from 3000 to 12000",
          range(600, 14_901, 100)),
-        (3000, "at 45 steps, from 64 to 1472, and resets opacities at 4, from 300 to 1200", range(64, 1500, 32)),
-        (1999, "at 30 steps, from 64 to 992, and resets opacities at 4, from 200 to 800", range(64, 999, 32)),
+        (3000, "at 45 steps, from 64 to 1472, and resets opacities at 4 steps, from 300 to 1200", range(64, 1500, 32)),
+        (1999, "at 30 steps, from 64 to 992, and resets opacities at 4 steps, from 200 to 800", range(64, 999, 32)),
         (1990, "and resets opacities never", range(64, 995, 32)),
         (20, "at 2 steps, from 4 to 8, and resets opacities never", [4, 8]),
+        (12, "at step 4, and resets opacities never", [4]),
         (2, "neither densifies nor prunes: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
     ],
 )  # fmt: skip

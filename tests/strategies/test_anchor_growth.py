@@ -69,6 +69,7 @@ def test_statistics_keep_their_share_of_the_run(steps, first, last):
         (3000, "at 42 steps, from 160 to 1472", range(160, 1500, 32)),
         (200, "at 3 steps, from 32 to 96", [32, 64, 96]),
         (20, "at 2 steps, from 4 to 8", [4, 8]),
+        (12, "at step 4", [4]),
         (2, "neither grows nor prunes anchors: its 2 steps leave no multiple of 4 between steps 0 and 1", []),
     ],
 )
