@@ -46,13 +46,14 @@ docs: install-dev $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
 	@echo "built build/site/index.html"
 
-# What docs/results.md has of phantoms-12, from nothing: trials, runs, tables and archive. Some twenty core hours.
+# What docs/results.md has of phantoms-12, from nothing: trials, runs, archive, tables and picture. Some twenty core hours.
 results: install-dev
 	for part in tune measure plateau write; do \
 	  OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py $$part $(RESULTS) || exit 1; \
 	done
 	$(BIN)/python docs/tools/results.py measurement $(addprefix $(RESULTS)/,equal-time paper-rows seeds plateau)
 	$(BIN)/python docs/tools/results_page.py
+	$(BIN)/python docs/tools/results_picture.py $(RESULTS)
 
 # The outputs stored in docs/notebooks.
 notebooks: install-dev

@@ -10,13 +10,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import tyro
 
 from coliags_plugin.comparison.named_files import load_ablation
-from coliags_plugin.core.images import write_image
+from coliags_plugin.core.images import read_rgb, write_image
 from tests.pipeline.procedures import SUBMAPS, join, similarity, write_procedure
 from tests.scenes import write_wall
 from tests.textured_tube import tube_frames
@@ -66,7 +67,7 @@ def test_joins_of_a_procedure_are_judged_by_its_truth(run, monkeypatch, tmp_path
     assert f"| joins of segments | {'1 right, 0 wrong' if is_right else '0 right, 1 wrong'}, 0 not judged |" in table
 
 
-def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
+def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_path):
     results = import_module("results")
     methods = load_ablation("rivals")
     few = [one for one in methods if one.name in ("coliags", "3dgs-depth")]
@@ -109,6 +110,16 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, tmp_path):
     assert all(table in after for table in made.values()) and "old<" not in after
     for kind in ("colour", "depth"):
         assert re.search(r"^\| 3dgs-depth \|.* \| [01] of 1 \| \u2013 \|$", made[f"with-depth-{kind}"], re.MULTILINE)
+    picture = import_module("results_picture")
+    here = {"METHODS": [*chosen], "CHOSEN_BY": {"test": "psnr"}, "ASSUMED": 0, "PICTURE": tmp_path / "picture.jpg"}
+    for name, value in here.items():
+        monkeypatch.setattr(picture, name, value)
+    picture.main(out)
+    drawn = cv2.imread(str(here["PICTURE"]))[..., ::-1]
+    recorded = read_rgb(scene / "images" / f"{capsys.readouterr().out.split()[-1]}.png")
+    height, width = 2 * recorded.shape[0], 2 * recorded.shape[1]
+    assert drawn.shape == (2 * (24 + height) + 52, max(3 * width + 2 * 8, 480), 3), "three columns, and a scale"
+    assert np.abs(cv2.resize(drawn[24 : 24 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
 
 
 def test_the_training_step_by_stages(run):
