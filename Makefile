@@ -7,6 +7,8 @@ DEMO ?= demo
 DEMO_STEPS ?= 300
 RESULTS ?= results
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
+# Containers often forbid bytecode files; each process then compiles the whole package again, for three seconds.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-thorough test-slow lint docs results notebooks matrix install install-dev system clean
 
