@@ -144,13 +144,25 @@ def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) 
 
 
 def seed_columns(of: Comparison) -> Columns:
-    """Mean PSNR of each seed, and the deviation over seeds within a scene."""
-    means, deviations = {}, {}
-    for name, by_scene in of.values("psnr").items():
-        grid = np.array([[*seeds.values()] for seeds in by_scene.values()])
-        means[name] = " / ".join(text(mean, ".2f") for mean in grid.mean(axis=0))
-        deviations[name] = text(np.sqrt(grid.var(axis=1, ddof=1).mean()), ".2f")
-    return {"PSNR of seeds 0 / 1 / 2, dB": means, "deviation over seeds, within a scene": deviations}
+    """Mean PSNR and lead of each seed, the deviation over seeds within a scene, and that of the means of all scenes."""
+    values = of.values("psnr")
+    grids = {name: np.array([[*by_seed.values()] for by_seed in own.values()]) for name, own in values.items()}
+    rivals = [name for name in grids if name != of.reference]
+    means = {name: grid.mean(axis=0) for name, grid in grids.items()}
+    leads = {name: means[of.reference] - means[name] for name in rivals}
+    return {
+        "PSNR of seeds 0 / 1 / 2, dB": {name: by_seed_text(own, ".2f") for name, own in means.items()},
+        f"lead of {of.reference}, dB": {name: by_seed_text(own, "+.2f") for name, own in leads.items()},
+        "deviation over seeds: within a scene": {
+            name: text(np.sqrt(grid.var(axis=1, ddof=1).mean()), ".2f") for name, grid in grids.items()
+        },
+        "of the mean": {name: text(own.std(ddof=1), ".2f") for name, own in means.items()},
+    }
+
+
+def by_seed_text(values: np.ndarray, form: str) -> str:
+    """A value of each seed, formatted. [S]"""
+    return " / ".join(text(value, form) for value in values)
 
 
 def significance_columns(leads: Mapping[str, RivalComparison]) -> Columns:
@@ -169,7 +181,7 @@ def lead_text(row: RivalComparison) -> str:
     return f"{row.lead:+.2f}{interval}"
 
 
-def text(value: float, form: str) -> str:
+def text(value: float | np.floating, form: str) -> str:
     """A number in a format; without one, two significant digits and no exponent."""
     return f"{value:{form}}" if form else f"{float(f'{value:.2g}'):f}".rstrip("0").rstrip(".")
 
