@@ -3,7 +3,7 @@
     python docs/tools/results.py ARCHIVE COMPARISON ...
 
 takes the archive's name, without its ending, and folders of ``coliags compare``. The same folders give the same bytes.
-Cells without a result are left out.
+Cells without a result are left out, and results that are in no cell.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import json
 import lzma
 import sys
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from coliags_plugin.results.reading import find_results
 from coliags_plugin.results.record import Result
@@ -31,8 +32,10 @@ def main(name: str, comparisons: Sequence[Path]) -> None:
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar:
         for folder in sorted(comparisons, key=lambda path: path.name):
-            (FOLDER / f"{folder.name}.csv").write_text(table(find_results([folder / "results"])), encoding="utf-8")
-            for file, content in files(folder):
+            plan = finished(folder)
+            results = find_results(sorted(folder / cell["result"] for cell in plan["cells"]))
+            (FOLDER / f"{folder.name}.csv").write_text(table(results), encoding="utf-8")
+            for file, content in files(folder, plan):
                 member = tarfile.TarInfo(f"{folder.name}/{file}")
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
@@ -56,10 +59,15 @@ def table(results: Sequence[Result]) -> str:
     return text.getvalue()
 
 
-def files(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of what a comparison's report needs: the plan of its finished cells, and their results."""
-    plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+def finished(folder: Path) -> dict[str, Any]:
+    """The plan of a comparison with the cells that have a result."""
+    plan: dict[str, Any] = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     plan["cells"] = [cell for cell in plan["cells"] if (folder / cell["result"]).is_file()]
+    return plan
+
+
+def files(folder: Path, plan: Mapping[str, Any]) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of what a comparison's report needs: the plan of its finished cells, and their results."""
     yield "plan.json", (json.dumps(plan, indent=2) + "\n").encode()
     for name in sorted(cell["result"] for cell in plan["cells"]):
         yield name, (folder / name).read_bytes()
