@@ -118,7 +118,7 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_pat
     drawn = cv2.imread(str(here["PICTURE"]))[..., ::-1]
     recorded = read_rgb(scene / "images" / f"{capsys.readouterr().out.split()[-1]}.png")
     height, width = 2 * recorded.shape[0], 2 * recorded.shape[1]
-    assert drawn.shape == (2 * (24 + height) + 52, max(3 * width + 2 * 8, 480), 3), "three columns, and a scale"
+    assert drawn.shape == (3 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "three rows, and a scale"
     assert np.abs(cv2.resize(drawn[24 : 24 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
 
 

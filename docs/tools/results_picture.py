@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from results_page import ASSUMED, PAGE, REFERENCE, comparison
 
 import coliags_plugin
+from coliags_plugin.api.views import RenderedView
 from coliags_plugin.outputs.colormaps import color_bar, colorize_depth, common_limits, side_by_side, stacked
 from coliags_plugin.results.record import Result
 
@@ -36,27 +38,34 @@ def main(out: Path) -> None:
     of_reference = {result.scene.name: result for result in results if result.method == REFERENCE}
     scene = median({name: of_reference[name].mean("psnr") or 0.0 for name in [*of_reference][ASSUMED:]})
     frames = {part: median(values(of_reference[scene], part)) for part in CHOSEN_BY}
-    shown = {result.method: result for result in results if result.scene.name == scene and result.method in METHODS}
+    shown = {result.method: result for result in results if result.scene.name == scene}
     runs = {name: coliags_plugin.Run(path) for name, path in run_folders(out / "equal-time", scene).items()}
-    picture = stacked([row for part, frame in frames.items() for row in pictures(part, frame, shown, runs)])
+    views = {name: {part: runs[name].render(frame) for part, frame in frames.items()} for name in METHODS}
+    true_depths = {part: true_depth(view) for part, view in views[METHODS[0]].items()}
+    limits = {part: common_limits([depth]) for part, depth in true_depths.items()}
+    recorded = {part: (view.true_rgb, true_depths[part]) for part, view in views[METHODS[0]].items()}
+    rows = [row(recorded, {part: f"{title}, recorded" for part, title in TITLES.items()}, limits)]
+    for name, own in views.items():
+        titles = {part: f"{name}, {values(shown[name], part)[frame]:.1f} dB" for part, frame in frames.items()}
+        rows.append(row({part: (view.rgb, view.depth) for part, view in own.items()}, titles, limits))
+    bars = [color_bar(of, "mm", "depth") for of in limits.values()]
+    picture = stacked([*rows, side_by_side(bars, [f"depth, {TITLES[part]}" for part in limits])])
     cv2.imwrite(str(PICTURE), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     print(f"{PICTURE}: {scene}, {', '.join(frames.values())}")
 
 
-def pictures(
-    part: str, frame: str, results: Mapping[str, Result], runs: Mapping[str, coliags_plugin.Run]
-) -> Iterator[np.ndarray]:
-    """A row of colours, one of depths and the scale of these, of a frame by all methods."""
-    views = {name: runs[name].render(frame) for name in METHODS}
-    first = views[METHODS[0]]
-    assert first.true_rgb is not None and first.true_depth is not None  # a phantom has both
-    limits = common_limits([first.true_depth])
-    titles = ["recorded"] + [f"{name}, {values(results[name], part)[frame]:.1f} dB" for name in METHODS]
-    colours = [first.true_rgb, *(view.rgb for view in views.values())]
-    depths = [first.true_depth, *(view.depth for view in views.values())]
-    yield side_by_side([enlarged(image) for image in colours], [f"{TITLES[part]}: {title}" for title in titles])
-    yield side_by_side([enlarged(colorize_depth(depth, limits)) for depth in depths], ["depth"] * len(depths))
-    yield color_bar(limits, "mm", "depth")
+def row(
+    images: Mapping[str, tuple[Any, np.ndarray]], titles: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
+) -> np.ndarray:
+    """Colours and depth of each chosen frame, side by side."""
+    shown = [image for part, (rgb, depth) in images.items() for image in (rgb, colorize_depth(depth, limits[part]))]
+    return side_by_side([enlarged(image) for image in shown], [text for part in images for text in (titles[part], "")])
+
+
+def true_depth(view: RenderedView) -> np.ndarray:
+    """The true depth of a frame; a phantom has it."""
+    assert view.true_depth is not None
+    return view.true_depth
 
 
 def values(result: Result, part: str) -> dict[str, float]:
