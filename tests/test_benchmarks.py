@@ -119,7 +119,7 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_pat
     recorded = read_rgb(scene / "images" / f"{capsys.readouterr().out.split()[-1]}.png")
     height, width = 2 * recorded.shape[0], 2 * recorded.shape[1]
     assert drawn.shape == (3 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "three rows, and a scale"
-    assert np.abs(cv2.resize(drawn[24 : 24 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
+    assert np.abs(cv2.resize(drawn[48 : 48 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
 
 
 def test_the_training_step_by_stages(run):

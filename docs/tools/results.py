@@ -67,7 +67,7 @@ def finished(folder: Path) -> dict[str, Any]:
 
 
 def files(folder: Path, plan: Mapping[str, Any]) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of what a comparison's report needs: the plan of its finished cells, and their results."""
+    """The files of a comparison in the archive, names and contents: its plan, and the results of the plan's cells."""
     yield "plan.json", (json.dumps(plan, indent=2) + "\n").encode()
     for name in sorted(cell["result"] for cell in plan["cells"]):
         yield name, (folder / name).read_bytes()

@@ -8,7 +8,6 @@ A table stands between the comments ``<!-- table NAME -->`` and ``<!-- end -->``
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import tarfile
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from coliags_plugin.comparison.plan_file import PlannedCell, read_plan
 from coliags_plugin.reporting.markdown import markdown_table
 from coliags_plugin.reporting.model import simple_table
 from coliags_plugin.results.comparisons import RivalComparison, compare_with_rivals, scene_means
@@ -245,9 +245,14 @@ def tables(folder: Path) -> dict[str, str]:
 
 def comparison(folder: Path, name: str, protocol: str = "paper", reference: str = REFERENCE) -> Comparison:
     """The results of a comparison under one protocol, methods and scenes in the order of the plan."""
-    plan = json.loads((folder / name / "plan.json").read_text(encoding="utf-8"))
-    files = [folder / name / cell["result"] for cell in plan["cells"] if cell["protocol"] == protocol]
+    files = [folder / name / cell.result for cell in planned_cells(folder / name, protocol)]
     return Comparison([read_result(file) for file in files if file.is_file()], reference)
+
+
+def planned_cells(folder: Path, protocol: str) -> list[PlannedCell]:
+    """The cells of a comparison's plan under one protocol."""
+    plan = read_plan(folder)
+    return [] if plan is None else [cell for cell in plan.cells if cell.protocol == protocol]
 
 
 def filled(page: str, made: Mapping[str, str]) -> str:

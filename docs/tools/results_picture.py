@@ -3,23 +3,20 @@
     python docs/tools/results_picture.py OUT
 
 takes the folder of benchmarks/results.py. The scene is the one of those with light that no method assumes in which the
-reference has its median PSNR over them, and so are the frames.
+reference has its median PSNR over them; frames are chosen alike.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from results_page import ASSUMED, PAGE, REFERENCE, comparison
+from results_page import ASSUMED, PAGE, REFERENCE, comparison, planned_cells
 
 import coliags_plugin
-from coliags_plugin.api.views import RenderedView
 from coliags_plugin.outputs.colormaps import color_bar, colorize_depth, common_limits, side_by_side, stacked
 from coliags_plugin.results.record import Result
 
@@ -36,36 +33,35 @@ def main(out: Path) -> None:
     """Choose scene and frames, render, and write the picture."""
     results = comparison(out, "equal-time").results
     of_reference = {result.scene.name: result for result in results if result.method == REFERENCE}
-    scene = median({name: of_reference[name].mean("psnr") or 0.0 for name in [*of_reference][ASSUMED:]})
-    frames = {part: median(values(of_reference[scene], part)) for part in CHOSEN_BY}
-    shown = {result.method: result for result in results if result.scene.name == scene}
-    runs = {name: coliags_plugin.Run(path) for name, path in run_folders(out / "equal-time", scene).items()}
-    views = {name: {part: runs[name].render(frame) for part, frame in frames.items()} for name in METHODS}
-    true_depths = {part: true_depth(view) for part, view in views[METHODS[0]].items()}
-    limits = {part: common_limits([depth]) for part, depth in true_depths.items()}
-    recorded = {part: (view.true_rgb, true_depths[part]) for part, view in views[METHODS[0]].items()}
-    rows = [row(recorded, {part: f"{title}, recorded" for part, title in TITLES.items()}, limits)]
-    for name, own in views.items():
-        titles = {part: f"{name}, {values(shown[name], part)[frame]:.1f} dB" for part, frame in frames.items()}
-        rows.append(row({part: (view.rgb, view.depth) for part, view in own.items()}, titles, limits))
-    bars = [color_bar(of, "mm", "depth") for of in limits.values()]
-    picture = stacked([*rows, side_by_side(bars, [f"depth, {TITLES[part]}" for part in limits])])
+    scene = median_name({name: of_reference[name].mean("psnr") or 0.0 for name in [*of_reference][ASSUMED:]})
+    frames = {part: median_name(values(of_reference[scene], part)) for part in CHOSEN_BY}
+    shown = {result.method: result for result in results if result.scene.name == scene and result.method in METHODS}
+    runs = {
+        cell.method: coliags_plugin.Run(out / "equal-time" / cell.run)
+        for cell in planned_cells(out / "equal-time", "paper")
+        if cell.scene == scene and cell.method in METHODS
+    }
+    columns = [column(part, frame, shown, runs) for part, frame in frames.items()]
+    picture = side_by_side(columns, [TITLES[part] for part in frames])
     cv2.imwrite(str(PICTURE), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     print(f"{PICTURE}: {scene}, {', '.join(frames.values())}")
 
 
-def row(
-    images: Mapping[str, tuple[Any, np.ndarray]], titles: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
-) -> np.ndarray:
-    """Colours and depth of each chosen frame, side by side."""
-    shown = [image for part, (rgb, depth) in images.items() for image in (rgb, colorize_depth(depth, limits[part]))]
-    return side_by_side([enlarged(image) for image in shown], [text for part in images for text in (titles[part], "")])
-
-
-def true_depth(view: RenderedView) -> np.ndarray:
-    """The true depth of a frame; a phantom has it."""
-    assert view.true_depth is not None
-    return view.true_depth
+def column(part: str, frame: str, results: Mapping[str, Result], runs: Mapping[str, coliags_plugin.Run]) -> np.ndarray:
+    """Colours and depth of a frame as recorded and by each method, below each other, and the scale of depth."""
+    views = {name: runs[name].render(frame) for name in METHODS}
+    first = views[METHODS[0]]
+    assert first.true_rgb is not None and first.true_depth is not None  # a phantom has both
+    limits = common_limits([first.true_depth])
+    shown = [("recorded", first.true_rgb, first.true_depth)]
+    shown += [
+        (f"{name}, {values(results[name], part)[frame]:.1f} dB", view.rgb, view.depth) for name, view in views.items()
+    ]
+    rows = [
+        side_by_side([enlarged(rgb), enlarged(colorize_depth(depth, limits))], [title, ""])
+        for title, rgb, depth in shown
+    ]
+    return stacked([*rows, color_bar(limits, "mm", "depth")])
 
 
 def values(result: Result, part: str) -> dict[str, float]:
@@ -75,15 +71,9 @@ def values(result: Result, part: str) -> dict[str, float]:
     return {frame: value for frame, value in pairs if value is not None}
 
 
-def median(of: Mapping[str, float]) -> str:
-    """The name whose value is the median, the upper of two."""
+def median_name(of: Mapping[str, float]) -> str:
+    """Name of the median of named values; of an even number, that of the upper of the middle two."""
     return sorted(of, key=lambda name: of[name])[len(of) // 2]
-
-
-def run_folders(folder: Path, scene: str) -> dict[str, Path]:
-    """The folder of each method's run on a scene."""
-    cells = json.loads((folder / "plan.json").read_text(encoding="utf-8"))["cells"]
-    return {cell["method"]: folder / cell["run"] for cell in cells if cell["scene"] == scene and cell["seed"] == 0}
 
 
 def enlarged(image: np.ndarray) -> np.ndarray:
