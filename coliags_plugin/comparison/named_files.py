@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -138,7 +139,15 @@ class VariantEntry(Settings):
     """One variant: a method, with changes."""
 
     method: str | None = None  # name or path of a method config; null: the ablation's base
-    set: tuple[str, ...] = ()  # key.path=value changes of it
+    set: tuple[str, ...] = ()  # key.path=value changes of it, or lists of them
+
+    @field_validator("set", mode="before")
+    @classmethod
+    def _joined_lists(cls, changes: Any) -> Any:
+        """Each list among the changes, such as the anchored one of another variant, as its members."""
+        if not isinstance(changes, tuple):
+            return changes
+        return tuple(chain.from_iterable(entry if isinstance(entry, tuple) else (entry,) for entry in changes))
 
 
 class AblationSettings(Settings):

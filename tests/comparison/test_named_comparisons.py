@@ -71,6 +71,7 @@ def test_options_become_changes_of_the_data_manager(written):
         (load_ablation, "base: coliags\nvariants: {}", "mine.yaml:3: variants"),
         (load_ablation, "base: coliags\nvariants: {a: {sets: []}}", "unknown key 'sets'.*Did you mean 'set'"),
         (load_ablation, "base: coliags\nvariants: {a: 3}", "mine.yaml:3: variants.a"),
+        (load_ablation, "base: coliags\nvariants: {a: [[[b]]]}", "mine.yaml:3: variants.a.set"),
     ],
 )
 def test_faults_are_named_by_line_and_key(written, load, text, told):
@@ -135,7 +136,8 @@ def test_the_sizes_of_embeddings_are_in_their_names():
 def test_short_forms(written, tmp_path):
     name = written(
         "description: x\nbase: coliags\nvariants:\n  whole:\n  rival: scaffold-gs\n  local: deeper.yaml\n"
-        "  small: [field.features=8, field.children=4]\n  both: {method: 3dgs, set: [field.sh_degree=0]}\n"
+        "  small: &small [field.features=8, field.children=4]\n  both: {method: 3dgs, set: [field.sh_degree=0]}\n"
+        "  joined: [field.voxel_pixels=1, *small]\n"
     )
     variants = {variant.name: (variant.method, variant.overrides) for variant in load_ablation(name)}
     assert variants == {
@@ -144,6 +146,7 @@ def test_short_forms(written, tmp_path):
         "local": (str(tmp_path / "deeper.yaml"), ()),
         "small": ("coliags", ("field.features=8", "field.children=4")),
         "both": ("3dgs", ("field.sh_degree=0",)),
+        "joined": ("coliags", ("field.voxel_pixels=1", "field.features=8", "field.children=4")),
     }
 
 
