@@ -53,7 +53,7 @@ results: install-dev
 	for part in tune measure plateau write; do \
 	  OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py $$part $(RESULTS) || exit 1; \
 	done
-	$(BIN)/python docs/tools/results.py measurement $(addprefix $(RESULTS)/,equal-time paper-rows seeds plateau)
+	$(BIN)/python docs/tools/results.py measurement $(addprefix $(RESULTS)/,equal-time paper-rows seeds plateau ladder-*)
 	$(BIN)/python docs/tools/results_page.py
 	$(BIN)/python docs/tools/results_picture.py $(RESULTS)
 

@@ -126,8 +126,13 @@ def cost_columns(of: Comparison) -> Columns:
         "steps": of.cost(",.0f", lambda result: result.steps),
         "processor time, s": of.cost(".0f", lambda result: result.cost.processor_seconds),
         "Gaussians in a view": of.cost(",.0f", lambda result: result.cost.gaussians),
-        "growth": {name: plan.removeprefix("this run ") for name, plan in plans.items()},
+        "growth": {name: growth_text(plan) for name, plan in plans.items()},
     }
+
+
+def growth_text(plan: str) -> str:
+    """What a run planned, in today's words: its archived text gives a single event a range of steps."""
+    return re.sub(r"at 1( steps)?, from (\d+) to \2\b", r"at step \2", plan.removeprefix("this run "))
 
 
 def scene_table(of: Comparison, metric: str, methods: Sequence[str], form: str) -> str:
@@ -209,9 +214,13 @@ def equal_time_tables(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def plateau_tables(folder: Path) -> Iterator[tuple[str, str]]:
-    """Tables of the first methods to their plateau."""
+    """Tables of the first methods: PSNR by run length on the tuning phantoms, and what the longest run reaches."""
     plateau = comparison(folder, "plateau")
+    lengths = sorted(int(path.name.removeprefix("ladder-")) for path in folder.glob("ladder-*"))
+    rungs = {f"{steps:,} steps": comparison(folder, f"ladder-{steps}").column("psnr", ".2f") for steps in lengths}
+    yield "ladder", table(rungs, plateau.methods)
     yield "plateau-colour", table(colour_columns(plateau), plateau.methods)
+    yield "plateau-depth", table(depth_columns(plateau, {}), plateau.methods)
     yield "plateau-cost", table(cost_columns(plateau), plateau.methods)
 
 
