@@ -144,7 +144,7 @@ class VariantEntry(Settings):
     @field_validator("set", mode="before")
     @classmethod
     def _joined_lists(cls, changes: Any) -> Any:
-        """Each list among the changes, such as the anchored one of another variant, as its members."""
+        """Flatten lists among the changes, such as the anchored one of another variant, by one level."""
         if not isinstance(changes, tuple):
             return changes
         return tuple(chain.from_iterable(entry if isinstance(entry, tuple) else (entry,) for entry in changes))

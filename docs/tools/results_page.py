@@ -131,7 +131,7 @@ def cost_columns(of: Comparison) -> Columns:
 
 
 def growth_text(plan: str) -> str:
-    """What a run planned, in today's words: its archived text gives a single event a range of steps."""
+    """Planned densification of a run as text; the archive's range of a single event becomes its step."""
     return re.sub(r"at 1( steps)?, from (\d+) to \2\b", r"at step \2", plan.removeprefix("this run "))
 
 
@@ -214,7 +214,7 @@ def equal_time_tables(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def plateau_tables(folder: Path) -> Iterator[tuple[str, str]]:
-    """Tables of the first methods: PSNR by run length on the tuning phantoms, and what the longest run reaches."""
+    """Tables of run lengths on the tuning phantoms, and of the longest runs on the test phantoms."""
     plateau = comparison(folder, "plateau")
     lengths = sorted(int(path.name.removeprefix("ladder-")) for path in folder.glob("ladder-*"))
     rungs = {f"{steps:,} steps": comparison(folder, f"ladder-{steps}").column("psnr", ".2f") for steps in lengths}
