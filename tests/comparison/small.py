@@ -79,6 +79,14 @@ def undisturbed_hashes(methods, wall, folder, steps):
     return hashes(folder)
 
 
+def lock_holder(file):
+    """The process that a lock's file names, at work or killed; None where nobody has the lock."""
+    try:
+        return int(file.read_text(encoding="utf-8").split()[1])
+    except (FileNotFoundError, IndexError):  # removed at the end; empty at the beginning
+        return None
+
+
 def until(what, value):
     """Wait until a function of no argument returns something true, and return that."""
     end = time.monotonic() + 300.0

@@ -10,7 +10,16 @@ import pytest
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.engine.run_folder import RunFolder
-from tests.comparison.small import OFTEN, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
+from tests.comparison.small import (
+    OFTEN,
+    check_logs,
+    hashes,
+    lock_holder,
+    start_compare,
+    trainings,
+    undisturbed_hashes,
+    until,
+)
 
 pytestmark = pytest.mark.thorough
 
@@ -28,9 +37,8 @@ def driver(wall, folder):
 
 
 def process_of(folder, method):
-    """The worker that has the run of a method."""
-    (lock,) = folder.glob(f"runs/wall/{method}/.*.lock")
-    return int(until("name in the lock", lambda: lock.read_text(encoding="utf-8")).split()[1])
+    """The worker that has the run of a method; None if none has, be it that the run is done."""
+    return next(filter(None, map(lock_holder, folder.glob(f"runs/wall/{method}/.*.lock"))), None)
 
 
 def run_of(folder, method):
@@ -72,8 +80,8 @@ def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
     until("step", lambda: run_of(folder, "coliags"))
     struck = process_of(folder, "coliags")
     os.kill(struck, signal.SIGKILL)
-    until("retry", lambda: process_of(folder, "coliags") != struck)
-    workers = [process_of(folder, method) for method in METHODS]
+    until("retry", lambda: process_of(folder, "coliags") not in (None, struck))
+    workers = [worker for method in METHODS if (worker := process_of(folder, method))]
     first.kill()
     _, told = first.communicate()
     assert "SIGKILL" in told and "trying again" in told

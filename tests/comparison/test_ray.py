@@ -22,7 +22,17 @@ from coliags_plugin.execution import ray_executor
 from coliags_plugin.execution.ray_executor import RayExecutor
 from coliags_plugin.execution.tasks import Task
 from tests.commands import refused
-from tests.comparison.small import OFTEN, TINY, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
+from tests.comparison.small import (
+    OFTEN,
+    TINY,
+    check_logs,
+    hashes,
+    lock_holder,
+    start_compare,
+    trainings,
+    undisturbed_hashes,
+    until,
+)
 
 STEPS = 300
 METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance")
@@ -93,9 +103,9 @@ def under_way(folder):
     """A process that has taken some steps of a run and has not ended; None where there is none."""
     for lock in folder.glob("runs/wall/*/.s0-*.lock"):
         run = lock.with_name(lock.name[1:].removesuffix(".lock"))
-        text = lock.read_text(encoding="utf-8").split()
-        if len(text) > 1 and 20 < RunFolder(run).logged_step < STEPS and is_running(int(text[1])):
-            return int(text[1])
+        holder = lock_holder(lock)
+        if holder and 20 < RunFolder(run).logged_step < STEPS and is_running(holder):
+            return holder
     return None
 
 

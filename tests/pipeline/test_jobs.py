@@ -17,7 +17,7 @@ from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.pipeline import capture_stages, training_stages
 from coliags_plugin.pipeline.jobs import PartJob
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome, StageRecord
-from tests.comparison.small import until
+from tests.comparison.small import lock_holder, until
 from tests.pipeline.conftest import TRAINING, write_atlas
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)
@@ -156,11 +156,7 @@ def test_workers_are_processes_and_one_that_is_killed_is_replaced(atlas, tmp_pat
         driver = subprocess.Popen([sys.executable, "-c", code, *argv], stderr=messages, stdout=messages)
 
     def worker():
-        for file in (tmp_path / "out").glob(".lock-*"):
-            words = file.read_text().split()
-            if len(words) > 1:
-                return int(words[1])
-        return None
+        return next(filter(None, map(lock_holder, (tmp_path / "out").glob(".lock-*"))), None)
 
     os.kill(until("worker", worker), signal.SIGKILL)
     driver.wait()
