@@ -342,6 +342,18 @@ def test_the_benchmarks_have_both_kinds_of_scenes(name, seeds, unassumed):
         assert {chosen.trajectory for chosen in scenes.values()} == {"pullback", "rotation", "inspection"}
 
 
+def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
+    scenes = {key: scene.phantom_settings for key, scene in load_benchmark("phantoms-tracked").settings.scenes.items()}
+    errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
+    for key, chosen in scenes.items():
+        assert key.endswith(f"-{chosen.seed}")
+        of_scene = {name: getattr(chosen, name) for name in errors}
+        if key.startswith("exact"):
+            assert chosen.model_copy(update=errors) == scenes[key.replace("exact", "tracked")]
+        else:
+            assert of_scene == errors
+
+
 def test_the_earlier_benchmark_is_as_it_was():
     for scene in load_benchmark("phantoms-8").settings.scenes.values():
         record = scene.phantom_settings.model_dump()
