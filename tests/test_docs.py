@@ -425,7 +425,7 @@ def test_generated_pages_cite_rightly(name):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", ["comparisons", "measurement"])
+@pytest.mark.parametrize("name", ["comparisons", "measurement", "tracked"])
 def test_tables_of_results_are_those_of_the_archive(name, tmp_path):
     with tarfile.open(DOCS / "results" / f"{name}.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
