@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -79,12 +80,12 @@ def undisturbed_hashes(methods, wall, folder, steps):
     return hashes(folder)
 
 
-def lock_holder(file):
-    """The process that a lock's file names, at work or killed; None where nobody has the lock."""
-    try:
-        return int(file.read_text(encoding="utf-8").split()[1])
-    except (FileNotFoundError, IndexError):  # removed at the end; empty at the beginning
-        return None
+def lock_holder(folder, pattern):
+    """A process that one of these locks names, at work or killed; None where nobody has one."""
+    for lock in folder.glob(pattern):
+        with suppress(FileNotFoundError, IndexError):  # removed at the end; empty at the beginning
+            return int(lock.read_text(encoding="utf-8").split()[1])
+    return None
 
 
 def until(what, value):

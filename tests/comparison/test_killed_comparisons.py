@@ -38,7 +38,7 @@ def driver(wall, folder):
 
 def process_of(folder, method):
     """The worker that has the run of a method; None if none has, be it that the run is done."""
-    return next(filter(None, map(lock_holder, folder.glob(f"runs/wall/{method}/.*.lock"))), None)
+    return lock_holder(folder, f"runs/wall/{method}/.*.lock")
 
 
 def run_of(folder, method):

@@ -103,7 +103,7 @@ def under_way(folder):
     """A process that has taken some steps of a run and has not ended; None where there is none."""
     for lock in folder.glob("runs/wall/*/.s0-*.lock"):
         run = lock.with_name(lock.name[1:].removesuffix(".lock"))
-        holder = lock_holder(lock)
+        holder = lock_holder(lock.parent, lock.name)
         if holder and 20 < RunFolder(run).logged_step < STEPS and is_running(holder):
             return holder
     return None

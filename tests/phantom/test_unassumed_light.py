@@ -347,11 +347,10 @@ def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
     errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
     for key, chosen in scenes.items():
         assert key.endswith(f"-{chosen.seed}")
-        of_scene = {name: getattr(chosen, name) for name in errors}
         if key.startswith("exact"):
             assert chosen.model_copy(update=errors) == scenes[key.replace("exact", "tracked")]
         else:
-            assert of_scene == errors
+            assert {name: getattr(chosen, name) for name in errors} == errors
 
 
 def test_the_earlier_benchmark_is_as_it_was():

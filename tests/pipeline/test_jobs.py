@@ -154,11 +154,7 @@ def test_workers_are_processes_and_one_that_is_killed_is_replaced(atlas, tmp_pat
     argv = ["reconstruct", str(atlas), "--output", str(tmp_path / "out"), "--jobs", "2"]
     with (tmp_path / "told.txt").open("w") as messages:
         driver = subprocess.Popen([sys.executable, "-c", code, *argv], stderr=messages, stdout=messages)
-
-    def worker():
-        return next(filter(None, map(lock_holder, (tmp_path / "out").glob(".lock-*"))), None)
-
-    os.kill(until("worker", worker), signal.SIGKILL)
+    os.kill(until("worker", lambda: lock_holder(tmp_path / "out", ".lock-*")), signal.SIGKILL)
     driver.wait()
     text = (tmp_path / "told.txt").read_text()
     assert "SIGKILL" in text and "trying again" in text
