@@ -389,6 +389,8 @@ def generated(name: str) -> str:
 def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
     text = generated("options")
     for name in REGISTRIES[kind]:
+        if REGISTRIES[kind].source(name) != "built in":  # of tests that ran before
+            continue
         assert f"### {kind}: {name}\n" in text
         settings = getattr(REGISTRIES[kind].get(name), "Settings", None)
         for option, field in {} if settings is None else settings.model_fields.items():

@@ -257,16 +257,9 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
     },
     ("phantom_layouts", "phantom layout"): {
         "c3vd": "coliags_plugin.phantom.layouts.c3vd:C3VDLayout",
-        "c3vd-raw": "coliags_plugin.phantom.layouts.c3vd:C3VDRawLayout",
-        "c3vd-v2": "coliags_plugin.phantom.layouts.c3vd:C3VDv2Layout",
         "colmap": "coliags_plugin.phantom.layouts.colmap:ColmapLayout",
-        "endogslam": "coliags_plugin.phantom.layouts.endogslam:EndoGSLAMLayout",
-        "endomapper": "coliags_plugin.phantom.layouts.endomapper:EndoMapperLayout",
         "nerfstudio": "coliags_plugin.phantom.layouts.nerfstudio:NerfstudioLayout",
-        "pr-endo": "coliags_plugin.phantom.layouts.endogslam:PREndoLayout",
-        "reim-nerf": "coliags_plugin.phantom.layouts.reim_nerf:ReimNerfLayout",
         "rgbd": "coliags_plugin.phantom.layouts.rgbd:RGBDLayout",
-        "rotatecolon": "coliags_plugin.phantom.layouts.rotatecolon:RotateColonLayout",
     },
 }
 #: All kinds by their names.

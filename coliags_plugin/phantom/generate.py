@@ -253,7 +253,7 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         index = number if part == "video" else number - frames
         pose = phantom.poses[index] if part == "video" else rotated[index]
         z_depth = phantom.given_depth(image(exposure.z_depth), number)
-        taken = PhantomFrame(part, index, image(color), z_depth, image(exposure.normals))
+        taken = PhantomFrame(part, index, image(color), z_depth)
         layout.write_frame(folder, taken)
         if phantom.motion is not None:
             fits.append(_to_rest(phantom, exposure, pose))
@@ -277,8 +277,6 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         positions, colors = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         points = WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
         layout.write_points(folder, points, given[:frames], lens)
-    if layout.has_coverage_mesh:
-        _write_coverage_mesh(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
     if phantom.motion is not None:
@@ -400,18 +398,6 @@ def _write_mesh(path: Path, surface: ColonSurface, albedo: Float[np.ndarray, "V 
     shades = dict(zip(("red", "green", "blue"), colors.T, strict=True))
     properties = point_properties(surface.vertices) | normals | shades
     write_ply(path, properties, surface.triangles, "millimetres; colour = albedo ^ (1 / 2.2)")
-
-
-def _write_coverage_mesh(path: Path, surface: ColonSurface, observed: Bool[np.ndarray, "F"]) -> None:
-    """Write C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for others."""
-    with path.open("w") as file:
-        file.write("# millimetres; vt 1 = observed, vt 2 = not observed\n")
-        np.savetxt(file, surface.vertices, "v %.6f %.6f %.6f")
-        file.write("vt 0.25 0.5\nvt 0.75 0.5\n")
-        corners = np.empty((len(surface.triangles), 6), np.int64)
-        corners[:, ::2] = surface.triangles.astype(np.int64) + 1
-        corners[:, 1::2] = np.where(observed, 1, 2)[:, None]
-        np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
 
 
 def _write_gains(path: Path, gains: Float[np.ndarray, "T 3"]) -> None:

@@ -1,4 +1,4 @@
-"""Ray-traced rendering of the mesh through a lens: radiance, z-depth and normals."""
+"""Ray-traced rendering of the mesh through a lens: radiance and z-depth."""
 
 from __future__ import annotations
 
@@ -92,7 +92,6 @@ class Exposure:
 
     radiance: Float[np.ndarray, "P 3"]  # linear, before exposure
     z_depth: Float[np.ndarray, "P"]  # mm at the pixel's centre; 0 where the ray hits nothing
-    normals: Float[np.ndarray, "P 3"]  # unit, camera axes, towards the camera; 0 where the ray hits nothing
     triangles: Int[np.ndarray, "T"]  # indices of all triangles hit
     hits: Hits  # of the pixels' centres
     cover: UInt8[np.ndarray, "P"]  # what is over the wall there, see Cover
@@ -105,7 +104,7 @@ def expose(
     indirect: IndirectLight | None,
     during: Sequence[Float[np.ndarray, "4 4"]] = (),
 ) -> Exposure:
-    """Render one image. Colour is the mean of a pixel's samples; z-depth, normal and cover are those of its centre.
+    """Render one image. Colour is the mean of a pixel's samples; z-depth and cover are those of its centre.
 
     With poses ``during`` the exposure, it is the mean over these, of one sample of a pixel each in turn.
     """
@@ -132,13 +131,10 @@ def expose(
     hits = world.tracer.cast(camera_to_world, sensor.centers)
     met[hits.triangle[hits.found]] = True
     z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
-    normals = np.zeros((pixels, 3), np.float32)
-    facing = _unit(world.tracer.interpolate(world.surface.normals, hits.kept()))
-    normals[hits.found] = rotated(facing, camera_to_world[:3, :3].T)
     cover = np.zeros(pixels, np.uint8)
     if world.bodies:
         cover = _seen(world, camera_to_world, sensor.centers, hits, spacing, None)[1]
-    return Exposure(radiance, z_depth, normals, np.flatnonzero(met), hits, cover)
+    return Exposure(radiance, z_depth, np.flatnonzero(met), hits, cover)
 
 
 def _seen(

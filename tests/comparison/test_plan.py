@@ -77,7 +77,7 @@ def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
     assert keys(wall).fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance["fingerprint"]
 
 
-@pytest.mark.parametrize("layout", ["c3vd", "pr-endo"])
+@pytest.mark.parametrize("layout", ["c3vd", "colmap"])
 def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
     phantom = PhantomSettings(layout=layout, frames=9)
     request = make_request(["coliags"], [tmp_path], None, 1, "paper", (), 5, ())

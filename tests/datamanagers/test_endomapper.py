@@ -13,8 +13,8 @@ import torch
 from coliags_plugin.datamanagers.endomapper.reader import EndoMapperDataManager
 from coliags_plugin.datamanagers.recognition import find_format, recognised, unposed_format
 from coliags_plugin.geometry.lenses.vicalib import read_calibration
-from coliags_plugin.phantom.layouts.endomapper import EndoMapperLayout
 from tests.datamanagers.spoiling import edit
+from tests.layouts.endomapper import EndoMapperLayout
 from tests.phantom.phantom_layouts import in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 96, 72

@@ -69,9 +69,9 @@ def write_layout(folder: Path, name: str) -> Lens:
     """The spot in a phantom's layout: a point of the wall where frame INDEX sees it."""
     layout = phantom_layouts.get(name)()
     lens, _ = layout.lens(WIDTH, HEIGHT)
-    depth, normals = np.full((HEIGHT, WIDTH), 20.0), np.zeros((HEIGHT, WIDTH, 3))
+    depth = np.full((HEIGHT, WIDTH), 20.0)
     for index in range(COUNT):
-        layout.write_frame(folder, PhantomFrame("video", index, spot(lens), depth, normals))
+        layout.write_frame(folder, PhantomFrame("video", index, spot(lens), depth))
     layout.write_sequence(folder, "video", poses(), lens)
     if layout.has_points:
         position, color = POINT + poses()[INDEX, :3, 3], np.full((1, 3), 200, np.uint8)

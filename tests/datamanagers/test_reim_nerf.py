@@ -16,7 +16,7 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.reim_nerf.files import ray_cosines
 from coliags_plugin.datamanagers.reim_nerf.reader import ReimNerfDataManager, ReimNerfDataSettings
 from coliags_plugin.geometry.lenses.models import LENSES, undistortion_map
-from coliags_plugin.phantom.layouts.reim_nerf import SCENE_SCALE
+from tests.layouts.reim_nerf import SCENE_SCALE
 from tests.phantom.phantom_layouts import distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT, FRAMES = 90, 72, 27

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+import tests.layouts  # noqa: F401  (registers them)
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError

@@ -37,7 +37,7 @@ def make_seeds(folder: Path) -> None:
         place = folder / name
         shutil.copytree(scene, place)
         truth = place / "truth"
-        for file in [*truth.glob("albedo.npz"), *place.rglob("*_normals.tiff"), *place.rglob("coverage_mesh.obj")]:
+        for file in truth.glob("albedo.npz"):
             file.unlink()
     poses = np.load(made["c3vd"] / "truth/camera_to_world.npy")
     surface = read_mesh(made["c3vd"] / "truth/mesh.ply")

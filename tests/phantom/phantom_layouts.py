@@ -1,4 +1,4 @@
-"""Tiny phantoms in every layout, and what a scene read from one is compared with."""
+"""Tiny phantoms in every layout, those of tests/layouts among them, and what a scene read from one is compared with."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import tests.layouts  # noqa: F401  (registers them)
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recognition import find_format

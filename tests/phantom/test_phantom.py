@@ -16,7 +16,6 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.phantom import interreflection
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
@@ -29,13 +28,6 @@ TINY = phantom_layouts.TINY | {"width": 48, "height": 38, "frames": 17, "rotatio
 def phantom(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("phantoms") / "plain"
     generate(PhantomSettings(**TINY), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def raw(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("phantoms") / "raw"
-    generate(PhantomSettings(**{**TINY, "layout": "c3vd-raw", "width": 54, "height": 43, "frames": 9}), folder)
     return folder
 
 
@@ -161,35 +153,6 @@ def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypat
     assert one == two
     assert one.keys() == other.keys()
     assert all(one[name] != other[name] for name in one if name.endswith((".png", ".ply")) and "seen" not in name)
-
-
-@pytest.mark.thorough
-def test_raw_layout_is_the_releases_own(raw):
-    names = {path.name for path in raw.iterdir()}
-    assert {"0000_color.png", "0008_depth.tiff", "0004_normals.tiff", "pose.txt", "coverage_mesh.obj"} <= names
-    lit = octagon_mask(54, 43)
-    color, depth, normals = (read(raw / f"0004_{kind}") for kind in ("color.png", "depth.tiff", "normals.tiff"))
-    assert not color[~lit].any() and not depth[~lit].any() and not normals[~lit].any()
-    assert depth.dtype == normals.dtype == np.uint16 and depth[lit].min() > 0
-    lens = LENSES["omnidirectional"].resized(54, 43)
-    row, column = np.nonzero(lit)
-    directions = lens.unproject(np.stack([column, row], axis=1) + 0.5)
-    z = depth[lit] * (100.0 / 65535.0)
-    pose = poses(raw / "pose.txt")[4].reshape(4, 4).T
-    points = (directions * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    assert phantom_layouts.distance_from_wall(raw, torch.from_numpy(points[z < 99.9])).max() < 0.004
-    unit = normals[..., ::-1][lit] / 65535.0 * 2.0 - 1.0
-    np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=1e-3)
-    assert ((unit * directions).sum(axis=1) < 0.05).mean() > 0.99  # towards the camera
-    assert (raw / "rotation/seen/0000_seen.png").is_file()
-
-
-def test_coverage_mesh_marks_observed_faces(raw):
-    lines = (raw / "coverage_mesh.obj").read_text().splitlines()
-    faces = [line.split()[1:] for line in lines if line.startswith("f ")]
-    flags = np.array([[int(corner.split("/")[1]) for corner in face] for face in faces])
-    assert set(np.unique(flags)) == {1, 2} and np.all(flags == flags[:, :1])
-    np.testing.assert_array_equal(flags[:, 0] == 1, np.load(raw / "truth/mesh_seen.npz")["face_seen_by_any_frame"])
 
 
 def test_nothing_is_replaced_or_left_half_written(phantom, tmp_path):

@@ -33,11 +33,14 @@ def told() -> dict[str, list[str]]:
     return rows
 
 
-def test_every_name_is_a_layout_and_every_layout_is_told():
-    assert list(phantom_layouts) == sorted(told())
+BUILT_IN = [name for name in phantom_layouts if phantom_layouts.source(name) == "built in"]
 
 
-@pytest.mark.parametrize("name", phantom_layouts)
+def test_every_layout_is_told():
+    assert sorted(told()) == BUILT_IN
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_sizes_rotation_views_and_lenses_are_as_told_and_asked_for(name):
     layout, (_, size, rotation) = layout_of(name), told()[name]
     assert isinstance(layout, Layout)

@@ -1,4 +1,4 @@
-"""Writes C3VD's raw and undistorted layouts: frames, poses and camera."""
+"""Writes C3VD's undistorted layout: frames, poses and camera."""
 
 from __future__ import annotations
 
@@ -82,10 +82,3 @@ def depth_steps(z_depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
     known = np.isfinite(z_depth) & (z_depth > 0.0)
     steps = np.rint(np.where(known, z_depth, 0.0) * _STEPS_PER_MM)
     return np.where(known, np.clip(steps, 1, C3VD_DEPTH.far), 0).astype(np.uint16)
-
-
-def normal_steps(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
-    """Unit normals, camera axes, in C3VD's encoding: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays."""
-    encoded = np.rint((normals + 1.0) * (0.5 * 65535.0)).clip(0.0, 65535.0).astype(np.uint16)
-    encoded[~normals.any(axis=-1)] = 0
-    return encoded

@@ -30,7 +30,6 @@ class PhantomFrame:
     index: int  # within its part, from 0
     color: UInt8[np.ndarray, "H W 3"]  # RGB
     z_depth: Float[np.ndarray, "H W"]  # mm; 0 where there is no wall
-    normals: Float[np.ndarray, "H W 3"]  # unit, camera axes, towards the camera; 0 where there is no wall
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,6 @@ class Layout(ABC):
     has_rotation: ClassVar[bool] = False
     #: Whether the layout supports initial points.
     has_points: ClassVar[bool] = False
-    #: Whether the mesh and its coverage belong to the layout, as ``coverage_mesh.obj``.
-    has_coverage_mesh: ClassVar[bool] = False
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The lens of frames of this size, and the mask of lit pixels [H, W].

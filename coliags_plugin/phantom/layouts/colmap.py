@@ -24,7 +24,7 @@ class ColmapLayout(Layout):
     has_points = True
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; depth and normals are not part of this layout."""
+        """See :class:`Layout`; depth is not part of this layout."""
         write_image_and_mask(folder, _name(frame.index), frame.color)
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:

@@ -31,7 +31,7 @@ class NerfstudioLayout(Layout):
         return OpenCVLens(**vars(plain.pinhole), **_DISTORTION), lit
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout."""
+        """See :class:`Layout`."""
         write_image(folder / "images" / _name(frame.index), frame.color)
         steps = np.rint(frame.z_depth / DEPTH_UNIT).clip(0.0, 65535.0)
         write_image(folder / "depth" / _name(frame.index), steps.astype(np.uint16))

@@ -26,7 +26,7 @@ class RGBDLayout(Layout):
     """Images and depth named by timestamps, groundtruth.txt, camera.json, and TUM's file lists."""
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout."""
+        """See :class:`Layout`."""
         write_frame(folder, f"{_time(frame.index)}.png", frame.color, frame.z_depth, DEPTH_SCALE)
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:

@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 
+import tests.layouts  # noqa: F401  (registers c3vd-raw)
 from coliags_plugin.api.scenes import make_phantom
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import OmnidirectionalLens

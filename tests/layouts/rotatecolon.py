@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
@@ -14,9 +12,9 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
 from coliags_plugin.datamanagers.units import write_unit
-from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
+from coliags_plugin.phantom.layouts.base import Layout
 
 _TEST_VIEWS = "test_views_1"
 #: Stored depth per mm, as in the dataset, and Blender's depth of the background.
@@ -31,18 +29,17 @@ class RotateColonLayout(Layout):
     has_rotation = True
     has_points = True
 
-    def is_test(self, index: int) -> bool:
+    def is_test(self, index):
         """Never: the test views are the rotation views."""
         return False
 
-    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+    def lens(self, width, height):
         """Square pixels, the principal point in the middle. All pixels are lit."""
         focal = 0.5 * width / math.tan(0.5 * _ANGLE)
         lens = PinholeLens(focal, focal, 0.5 * width, 0.5 * height, width, height)
         return lens, np.ones((height, width), bool)
 
-    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout, nor is the depth of test views."""
+    def write_frame(self, folder, frame):
         views = _TEST_VIEWS if frame.part == "rotation" else TRAIN_VIEWS
         write_image(folder / views / f"{frame.index:04d}.png", frame.color)
         if frame.part == "video":
@@ -54,8 +51,7 @@ class RotateColonLayout(Layout):
                 folder / TRAIN_DEPTH / f"{frame.index:04d}.exr", {**channels, "ViewLayer.Depth.Z": depth}
             )
 
-    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+    def write_sequence(self, folder, part, poses, lens):
         frames = [
             {"file_path": str(index), "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
             for index, pose in enumerate(poses)
@@ -63,10 +59,9 @@ class RotateColonLayout(Layout):
         write_json(folder / (TEST if part == "rotation" else TRAIN), {"camera_angle_x": _ANGLE, "frames": frames})
         write_unit(folder, "mm")
 
-    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+    def write_points(self, folder, points, poses, lens):
         write_ply(folder / POINTS, point_properties(points.positions, points.colors))
 
-    def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
+    def seen_mask(self, folder, part, index):
         """In ``truth/``: the dataset has no seen masks."""
         return folder / "truth" / "seen" / f"{index:04d}_seen.png"

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-from jaxtyping import Bool, Float
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.datamanagers.rgbd.writer import TRAJECTORY, write_frame
 from coliags_plugin.datamanagers.units import write_unit
-from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.models import FisheyeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_text
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
+from coliags_plugin.phantom.layouts.base import Layout
 from coliags_plugin.phantom.layouts.rgbd import DEPTH_SCALE
 
 CALIBRATION = "calibration.xml"
@@ -29,7 +26,7 @@ class EndoMapperLayout(Layout):
 
     default_size = (1440, 1080)
 
-    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+    def lens(self, width, height):
         """A wide Kannala-Brandt lens, and the circle of its image."""
         lens = _LENS.resized(width, height)
         column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -37,16 +34,12 @@ class EndoMapperLayout(Layout):
         lit = np.linalg.norm(rays, axis=1) <= 1.0 / np.cos(np.radians(_LIT))
         return lens, lit.reshape(height, width)
 
-    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout."""
+    def write_frame(self, folder, frame):
         height, width = frame.z_depth.shape
         _, lit = self.lens(width, height)
         write_frame(folder, f"{frame.index:04d}.png", frame.color, frame.z_depth, DEPTH_SCALE, lit)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
-        if not isinstance(lens, FisheyeLens):
-            raise TypeError("EndoMapper's lens is a fisheye")
+    def write_sequence(self, folder, part, poses, lens):
         tum.write(folder / TRAJECTORY, Trajectory(poses, timestamps=np.arange(len(poses), dtype=np.float64)))
         atomic_write(folder / CALIBRATION, calibration_text(lens, DEPTH_SCALE))
         write_unit(folder, "mm")

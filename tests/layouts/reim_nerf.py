@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reim_nerf.files import C3VD_RANGE, PARTS, ray_cosines
 from coliags_plugin.datamanagers.reim_nerf.reader import MASK_FILE
-from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
+from coliags_plugin.phantom.layouts.base import Layout
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.
 SCENE_SCALE = 0.0095
@@ -30,12 +27,12 @@ class ReimNerfLayout(Layout):
 
     default_size = (1350, 1080)
 
-    def __init__(self) -> None:
-        self._cosines: Float[np.ndarray, "H W"] | None = None
+    def __init__(self):
+        self._cosines = None
         #: Nearest and farthest normalised distance by frame, for the JSON files.
-        self._ranges: dict[int, tuple[float, float]] = {}
+        self._ranges = {}
 
-    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+    def lens(self, width, height):
         """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
         lens = LENSES["fisheye"].resized(width, height)
         # Its preprocessing counts pixel centres at integers.
@@ -44,12 +41,11 @@ class ReimNerfLayout(Layout):
         column, row = np.meshgrid(np.arange(width), np.arange(height))
         return lens, np.hypot(column - cx, row - cy) <= radius
 
-    def is_test(self, index: int) -> bool:
+    def is_test(self, index):
         """All but REIM-NeRF's training frames, its validation frames among them."""
         return index % 5 != 0 or _validates(index)
 
-    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; z-depth is clipped at C3VD's 100 mm, normals are not part of this layout."""
+    def write_frame(self, folder, frame):
         clipped = np.minimum(frame.z_depth.astype(np.float64), C3VD_RANGE)
         height, width = clipped.shape
         if self._cosines is None or self._cosines.shape != clipped.shape:
@@ -63,8 +59,7 @@ class ReimNerfLayout(Layout):
         nearest, farthest = float(known.min(initial=DISTMAP_SCALE)), float(known.max(initial=0.0))
         self._ranges[frame.index] = (0.9 * nearest, 1.1 * farthest)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`; the mask, and a JSON file for each part of REIM-NeRF's split."""
+    def write_sequence(self, folder, part, poses, lens):
         _, lit = self.lens(lens.width, lens.height)
         write_image(folder / MASK_FILE, np.where(lit, 0, 255).astype(np.uint8))
         shift = -(poses[:, :3, 3] + _AHEAD * poses[:, :3, 2]).mean(axis=0)
@@ -83,9 +78,7 @@ class ReimNerfLayout(Layout):
             write_json(folder / f"transforms_{name}.json", {**camera, "frames": held})
 
 
-def _camera(lens: Lens) -> dict[str, Any]:
-    if not isinstance(lens, FisheyeLens):
-        raise TypeError("REIM-NeRF's lens is a fisheye")
+def _camera(lens):
     k = lens.pinhole
     return {
         "camera_model": "FISHEYE_OPENCV",
@@ -104,16 +97,16 @@ def _camera(lens: Lens) -> dict[str, Any]:
     }
 
 
-def _validates(index: int) -> bool:
+def _validates(index):
     return index % 25 == 0 and index > 0
 
 
-def _parts_of(index: int) -> tuple[str, ...]:
+def _parts_of(index):
     """REIM-NeRF's split: every fifth frame trains, of those every fifth but the first validates; all are ``test``."""
     if index % 5:
         return "test", "true_test"
     return "test", "val" if _validates(index) else "train"
 
 
-def _name(index: int) -> str:
+def _name(index):
     return f"{index:04d}_color.png"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.files import write_arrays
@@ -14,11 +11,11 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, PREPARED_PINHOLE, SH0
-from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
+from coliags_plugin.phantom.layouts.base import Layout, part_folder
 from coliags_plugin.phantom.trajectory import TEST_EVERY
 
 #: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.
@@ -34,27 +31,24 @@ class EndoGSLAMLayout(Layout):
     has_rotation = True
     has_points = True
 
-    def is_test(self, index: int) -> bool:
+    def is_test(self, index):
         """EndoGSLAM's: 7, 15, 23, ..."""
         return index % TEST_EVERY == TEST_EVERY - 1
 
-    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+    def lens(self, width, height):
         """EndoGSLAM's camera of undistorted frames, scaled to the size. All pixels are lit."""
         return PinholeLens.of(PREPARED_PINHOLE.resized(width, height)), np.ones((height, width), bool)
 
-    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; depth is rounded down like EndoGSLAM's script does."""
+    def write_frame(self, folder, frame):
         folder = part_folder(folder, frame.part)
         steps = np.clip(np.floor(frame.z_depth / PREPARED_DEPTH.size), 0.0, 255.0).astype(np.uint8)
         write_image(folder / "color" / f"{frame.index:04d}_color.png", frame.color)
         write_image(folder / "depth" / f"{frame.index:04d}_depth.tiff", steps)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+    def write_sequence(self, folder, part, poses, lens):
         write_poses(part_folder(folder, part) / "pose.txt", poses)
 
-    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+    def write_points(self, folder, points, poses, lens):
         training = [index for index in range(len(poses)) if not self.is_test(index)]
         _write_params(folder / PARAMS, Trajectory(poses[training], intrinsics=lens.pinhole), points)
 
@@ -64,26 +58,24 @@ class PREndoLayout(EndoGSLAMLayout):
 
     has_rotation = False
 
-    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`."""
+    def write_frame(self, folder, frame):
         super().write_frame(folder / _DATA / _SCENE, frame)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`; poses are in params.npz."""
+    def write_sequence(self, folder, part, poses, lens):
+        """Poses are in params.npz."""
 
-    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+    def write_points(self, folder, points, poses, lens):
         results = folder / f"{_DATA}{OPTIMIZED}" / _SCENE
         means = _write_params(results / PARAMS, Trajectory(poses, intrinsics=lens.pinhole), points)
         cloud = results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply"
         _write_gaussians(cloud, means, points.colors)
 
-    def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
+    def seen_mask(self, folder, part, index):
         """In the scene's folder, beside the images."""
         return super().seen_mask(folder / _DATA / _SCENE, part, index)
 
 
-def _write_params(path: Path, trajectory: Trajectory, points: WallPoints) -> Float[np.ndarray, "N 3"]:
+def _write_params(path, trajectory, points):
     """Write ``params.npz`` like EndoGSLAM, with given poses and an isotropic Gaussian at every point.
 
     The map's points are returned in EndoGSLAM's world, that of the first camera, mm.
@@ -105,7 +97,7 @@ def _write_params(path: Path, trajectory: Trajectory, points: WallPoints) -> Flo
     return np.asarray(means)
 
 
-def _write_gaussians(path: Path, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> None:
+def _write_gaussians(path, positions, colors):
     """Write isotropic Gaussians of equal size as a 3DGS PLY file of spherical-harmonics degree 0."""
     count = len(positions)
     properties = point_properties(positions)
