@@ -24,18 +24,6 @@ class DataManager(ABC, Generic[SettingsT]):
         """Evidence in the folder that it has this format; None without. Reads no pixels."""
         return None
 
-    @classmethod
-    def recognise_unposed(cls, path: Path) -> bool:
-        """Whether a folder is of this format but for its poses. Reads no pixels."""
-        return False
-
-    def without_poses(self) -> DataManager:
-        """The data manager, with the same options, that puts every camera of such a folder at the origin.
-
-        Itself where the options say where poses are.
-        """
-        return self
-
     def at_stored_size(self) -> DataManager:
         """The data manager, with the same options, that reads images at their stored size, each when it is used.
 

@@ -41,7 +41,7 @@ def find_format(path: Path) -> str:
             f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
             "a scene's own folder",
             "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Images "
-            "without poses become a scene by coliags poses track, if there is depth, or coliags poses sfm",
+            "without poses become a scene by coliags poses sfm; beside depth, rgbd reads them with a TUM trajectory",
         )
     if len(found) > 1:
         seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
@@ -80,10 +80,3 @@ def recognised(path: Path) -> dict[str, str]:
     """Evidence in a folder for each format that recognises it, by the format's name."""
     reasons = {name: registry.datamanagers.get(name).recognise(path) for name in formats()}
     return {name: reason for name, reason in reasons.items() if reason is not None}
-
-
-def unposed_format(path: Path) -> str | None:
-    """The format of a folder that lacks only its poses; None where there is none, or a format recognises it as is."""
-    if not path.exists() or recognised(path):
-        return None
-    return next((name for name in formats() if registry.datamanagers.get(name).recognise_unposed(path)), None)

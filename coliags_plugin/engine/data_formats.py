@@ -11,7 +11,6 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
-from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component, is_auto, make_component, resolved
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
@@ -20,7 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import first_error
-from coliags_plugin.datamanagers.recognition import find_format, unposed_format
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.engine.progress import progress_callback
 
@@ -111,25 +110,6 @@ def open_scene(
     except NoPointsError as error:
         log.warning("%s", error)
         return _manager(name, options, initial_points="none").load(path, progress)
-
-
-def open_video(
-    path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
-) -> tuple[Scene, bool]:
-    """Read all frames of a video as training frames, to estimate their poses; arguments as of :func:`open_scene`.
-
-    The folder is a scene, or one of a format that can do without poses (``rgbd``); split and initial points are not
-    to be chosen. The scene, and whether it has poses; where not, all its cameras are at the origin.
-    """
-    options = (*options, "split=all-train", "initial_points=none")
-    name = data_format or unposed_format(path)
-    if name is not None and registry.datamanagers.get(name).recognise_unposed(path):
-        manager = _manager(name, options)
-        unposed = manager.without_poses()
-        if unposed is not manager:
-            log.info("%s: format %s without poses", path, name)
-            return unposed.load(path, progress), False
-    return open_scene(path, data_format, options, progress), True
 
 
 def _manager(name: str, options: Sequence[str], **more: str) -> DataManager:

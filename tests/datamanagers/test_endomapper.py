@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from coliags_plugin.datamanagers.endomapper.reader import EndoMapperDataManager
-from coliags_plugin.datamanagers.recognition import find_format, recognised, unposed_format
+from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.geometry.lenses.vicalib import read_calibration
 from tests.datamanagers.spoiling import edit
 from tests.layouts.endomapper import EndoMapperLayout
@@ -100,11 +100,3 @@ def test_the_scale_of_depth_is_that_of_the_file_or_the_option(mine):
     edit("calibration.xml", "<depth_scale.*", "")(mine)
     torch.testing.assert_close(load(mine, depth_scale=250.0).train[0].depth, 2.0 * before, equal_nan=True)
     assert load(mine, depth="none", initial_points="none").train[0].depth is None
-
-
-def test_poses_can_be_tracked_where_there_are_none(mine):
-    (mine / "trajectory.txt").unlink()
-    assert unposed_format(mine) == "endomapper"
-    frame = EndoMapperDataManager(EndoMapperDataManager.Settings()).without_poses().load(mine).train[0]
-    assert torch.equal(frame.camera.camera_to_world, torch.eye(4))
-    assert torch.isfinite(frame.depth).float().mean() > 0.9

@@ -16,7 +16,6 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.formats import format_of, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -107,10 +106,6 @@ def write_c3vd(folder: Path) -> None:
     write_c3vd_scene(folder, [frame.image.numpy() for frame in frames()], poses(), PINHOLE, points=points)
 
 
-def write_rgbd(folder: Path) -> None:
-    write_rgbd_scene(folder, frames(), poses())
-
-
 def write_colmap(folder: Path) -> None:
     one = np.ones(1)
     places = [frame.camera.project(torch.from_numpy(POINT)[None])[0].numpy() for frame in frames()]
@@ -121,8 +116,8 @@ def write_colmap(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("write", "name"),
-    [(write_c3vd, "c3vd"), (write_rgbd, "rgbd"), (write_colmap, "colmap")],
-    ids=["c3vd", "rgbd", "colmap"],
+    [(write_c3vd, "c3vd"), (write_colmap, "colmap")],
+    ids=["c3vd", "colmap"],
 )
 def test_a_spot_is_read_where_a_scene_writer_wrote_it(write, name, tmp_path):
     write(tmp_path / "scene")

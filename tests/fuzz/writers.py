@@ -102,16 +102,10 @@ WRITERS: dict[str, Writer] = {
         )
     ),
     "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--output", o / "tube")),
-    "poses track": Writer(
-        lambda i, o: (
-            *("poses", "track", i / "unposed", "--output", o / "tracked"),
-            *_settings("tracking.method=hybrid", "tracking.pose_graph=false"),
-        )
-    ),
     "poses export": Writer(lambda i, o: ("poses", "export", i / "procedure", "--output", o / "exported")),
     "poses sfm": Writer(
         lambda i, o: (
-            *("poses", "sfm", i / "unposed/rgb", "--output", o / "found"),
+            *("poses", "sfm", i / "tube/images", "--output", o / "found"),
             *("--camera", "PINHOLE", "--params", (i / "params.txt").read_text()),
         )
     ),
@@ -147,9 +141,7 @@ WRITERS: dict[str, Writer] = {
 
 def make_inputs(folder: Path) -> None:
     """Make what the commands read."""
-    import torch
 
-    from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
     from coliags_plugin.export.splats.files import write_splats
     from coliags_plugin.pipeline.frame_sources import frame_source
     from coliags_plugin.pipeline.frame_storage import remove_frames
@@ -158,7 +150,7 @@ def make_inputs(folder: Path) -> None:
     from tests.export.splats.clouds import random_cloud
     from tests.pipeline.films import film, write_images
     from tests.pipeline.procedures import write_procedure
-    from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+    from tests.textured_tube import INTRINSICS, write_tube
 
     folder.mkdir(parents=True)
     _done("phantom", "-o", folder / "scene", *_PHANTOM, *_COARSE)
@@ -183,10 +175,6 @@ def make_inputs(folder: Path) -> None:
     write_splats(folder / "wall.ply", _wall(folder / "scene"), "ply")
     _done("import", folder / "wall.ply", "--data", folder / "scene", "--output", folder / "opaque")
     write_tube(folder / "tube", 9)
-    frames = tube_frames(6, step=0.5)
-    poses = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
-    write_rgbd_scene(folder / "unposed", frames, poses)
-    (folder / "unposed/trajectory.txt").unlink()
     write_procedure(folder / "procedure")
     source = frame_source(write_images(folder / "film", film(range(0, 72, 6))))
     for name in ("stored", "removed"):

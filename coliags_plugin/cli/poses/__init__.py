@@ -10,7 +10,6 @@ import tyro
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.poses.export import PosesExportCommand
 from coliags_plugin.cli.poses.structure import PosesSfmCommand, PosesTriangulateCommand
-from coliags_plugin.cli.poses.track import PosesTrackCommand
 from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand
 
 Subcommand = (
@@ -18,14 +17,13 @@ Subcommand = (
     | Annotated[PosesAlignCommand, tyro.conf.subcommand("align")]
     | Annotated[PosesTriangulateCommand, tyro.conf.subcommand("triangulate")]
     | Annotated[PosesSfmCommand, tyro.conf.subcommand("sfm")]
-    | Annotated[PosesTrackCommand, tyro.conf.subcommand("track")]
     | Annotated[PosesExportCommand, tyro.conf.subcommand("export")]
 )
 
 
 @dataclass(frozen=True)
 class PosesCommand(arguments.CommandGroup):
-    """Convert, compare and export camera poses, triangulate points, or estimate poses from images or depth."""
+    """Convert, compare and export camera poses, triangulate points, or estimate poses from images."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""

@@ -101,17 +101,6 @@ def is_calibrated(folder: Path) -> bool:
     return not any((folder / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(folder))
 
 
-def lacks_trajectory(folder: Path) -> bool:
-    """Whether a folder holds images, depth and a camera in this layout, but no trajectory."""
-    return (
-        folder.is_dir()
-        and any((folder / name).is_dir() for name in IMAGE_FOLDERS)
-        and any((folder / name).is_dir() for name in DEPTH_FOLDERS)
-        and (any((folder / name).is_file() for name in CAMERA_FILES) or is_calibrated(folder))
-        and not any(tum.recognise(path) for path in _trajectories(folder))
-    )
-
-
 def find_trajectory(folder: Path, named: str | None) -> Path:
     """The trajectory file: the one the user names, relative to the folder or absolute, or the only one there is."""
     if named is not None:
@@ -123,7 +112,7 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
         raise InputError(
             f"{folder} has images but no {' or '.join(TRAJECTORIES)}",
             EXPECTED,
-            "Add it, or estimate one from depth by coliags poses track",
+            "Add the trajectory of the SLAM system that tracked the video, or estimate poses by coliags poses sfm",
         )
     if len(trajectories) > 1:
         raise InputError(

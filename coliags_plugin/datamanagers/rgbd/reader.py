@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
@@ -84,24 +83,16 @@ class RGBDDataManager(RecordedDataManager):
         """See :class:`DataManager`."""
         return files.recognise(path) if files.is_calibrated(path) == cls.is_calibrated else None
 
-    @classmethod
-    def recognise_unposed(cls, path: Path) -> bool:
-        """See :class:`DataManager`."""
-        return files.lacks_trajectory(path) and files.is_calibrated(path) == cls.is_calibrated
-
-    def without_poses(self) -> DataManager:
-        """See :class:`DataManager`."""
-        return self if self.settings.trajectory is not None else UnposedRGBDDataManager(self.settings)
-
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
         images = files.find_images(path)
         depths = files.find_depths(path) if settings.depth == "metric" else []
-        file, trajectory = self._trajectory(path, images)
+        file = files.find_trajectory(path, settings.trajectory)
+        trajectory = tum.read(file)
         by_time = self._by_time(images)
         pair = self._paired_by_time if by_time else self._paired_by_order
-        frames = pair(images, depths, trajectory, file or path)
+        frames = pair(images, depths, trajectory, file)
         camera = files.find_camera(path, frames.images[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
@@ -136,7 +127,7 @@ class RGBDDataManager(RecordedDataManager):
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
-            "trajectory": None if file is None else file.name,
+            "trajectory": file.name,
             "intrinsics_from": camera.path.name,
             "lens": type(camera.lens).__name__,
             "focal_scale": None if isinstance(camera.lens, PinholeLens) else settings.focal_scale,
@@ -145,14 +136,12 @@ class RGBDDataManager(RecordedDataManager):
             "masks": len(masks),
             "depth_is_estimated": bool(confidences),
             **rectification.facts(),
-            "pose_convention": None,
-        }
-        if file is not None:
-            facts["pose_convention"] = {
+            "pose_convention": {
                 "order": "TUM: camera-to-world, quaternion with w last",
                 "poses": len(trajectory),
                 "summary": trajectory.summary(printed_unit(self.stated_unit(path))),
-            }
+            },
+        }
         points = next((file for file in (path / POINTS_FILE, files.find_mesh(path)) if file and file.is_file()), None)
         return Recording(
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
@@ -166,11 +155,6 @@ class RGBDDataManager(RecordedDataManager):
             else partial(files.read_obj_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
         )
-
-    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
-        """The trajectory and its file."""
-        file = files.find_trajectory(path, self.settings.trajectory)
-        return file, tum.read(file)
 
     def _by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
@@ -295,15 +279,3 @@ class RGBDDataManager(RecordedDataManager):
                 "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
             )
         return scale
-
-
-class UnposedRGBDDataManager(RGBDDataManager):
-    """RGB-D data manager without a trajectory: every camera is at the origin.
-
-    Not in the registry, so that it cannot be used for training.
-    """
-
-    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
-        identity = np.tile(np.eye(4), (len(images), 1, 1))
-        # Each image's pose has its own timestamp, so that only depth has to be matched.
-        return None, Trajectory(identity, timestamps=files.times(images) if self._by_time(images) else None)
