@@ -185,7 +185,7 @@ class RecordedDataManager(DataManager):
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",
-                f"Create a scene with points: coliags poses triangulate {shlex.quote(str(path))} -o FOLDER; or put "
+                f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or {from_file}",
             )
         points = subsampled(own(), settings.points_count, generator, recording.points_source)

@@ -1,1 +1,1 @@
-"""Camera poses and 3D points from images: structure from motion, triangulation and depth."""
+"""Camera poses and 3D points from images: structure from motion, and depth."""

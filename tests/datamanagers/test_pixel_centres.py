@@ -20,8 +20,6 @@ from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.formats import format_of, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import PhantomFrame, WallPoints
-from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
-from coliags_plugin.reconstruction.structure.triangulation import Observations, Triangulation
 from tests.commands import run
 from tests.phantom.phantom_layouts import in_video_order, read
 
@@ -101,27 +99,11 @@ def test_a_spot_is_read_where_a_layout_wrote_it(name, tmp_path):
         np.testing.assert_allclose(frame.sparse_depth.pixels[0], spot_found(frame.image), atol=0.05)
 
 
-def write_c3vd(folder: Path) -> None:
+def test_a_spot_is_read_where_a_scene_writer_wrote_it(tmp_path):
     points = PointCloud(torch.zeros(1, 3), None)
-    write_c3vd_scene(folder, [frame.image.numpy() for frame in frames()], poses(), PINHOLE, points=points)
-
-
-def write_colmap(folder: Path) -> None:
-    one = np.ones(1)
-    places = [frame.camera.project(torch.from_numpy(POINT)[None])[0].numpy() for frame in frames()]
-    seen = tuple(Observations(place, 20.0 * one, np.zeros(1, np.int64)) for place in places)
-    points = POINT[None], np.full((1, 3), 200, np.uint8)
-    write_colmap_scene(folder, frames(), Triangulation(*points, one, one, np.full(1, COUNT), seen, 1.0, COUNT, 1))
-
-
-@pytest.mark.parametrize(
-    ("write", "name"),
-    [(write_c3vd, "c3vd"), (write_colmap, "colmap")],
-    ids=["c3vd", "colmap"],
-)
-def test_a_spot_is_read_where_a_scene_writer_wrote_it(write, name, tmp_path):
-    write(tmp_path / "scene")
-    check(tmp_path / "scene", name, PINHOLE)
+    images = [frame.image.numpy() for frame in frames()]
+    write_c3vd_scene(tmp_path / "scene", images, poses(), PINHOLE, points=points)
+    check(tmp_path / "scene", "c3vd", PINHOLE)
 
 
 def of_json(name: str, key: str = "cx") -> Callable[[Path], float]:

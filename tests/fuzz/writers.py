@@ -101,7 +101,6 @@ WRITERS: dict[str, Writer] = {
             *("--plot", o / "errors.png"),
         )
     ),
-    "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--output", o / "tube")),
     "poses export": Writer(lambda i, o: ("poses", "export", i / "procedure", "--output", o / "exported")),
     "poses sfm": Writer(
         lambda i, o: (

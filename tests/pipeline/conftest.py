@@ -17,8 +17,8 @@ from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
 from coliags_plugin.pipeline.procedure import run
 from coliags_plugin.pipeline.stages import StageOutcome
 from coliags_plugin.pipeline.worker import PartTask, work
-from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from tests.pipeline.films import film
+from tests.reconstruction.seen_points import frame_model
 from tests.task_list import TaskList
 from tests.textured_tube import tube_frames
 

@@ -23,10 +23,10 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from coliags_plugin.pipeline.submaps import Submap, find_submaps
-from coliags_plugin.reconstruction.structure.colmap_database import frame_model
 from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
 from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas
+from tests.reconstruction.seen_points import frame_model
 from tests.textured_tube import tube_frames
 
 SUBMAP = ("check_data", "estimate_depth", *TRAINING)

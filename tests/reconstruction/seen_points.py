@@ -7,12 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
-from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
 from tests.textured_tube import INTRINSICS, tube_frames
 
 #: Frames, the one after which most points change, and points seen from both sides of it.
 COUNT, GAP, COMMON = 8, 3, 9
+
+
+def frame_model(frames, names=None):
+    """A reconstruction of posed frames of one camera, without points: frame i is COLMAP's image i + 1."""
+    poses = np.stack([frame.camera.camera_to_world.double().numpy() for frame in frames])
+    names = names or [f"{index}.png" for index in range(len(frames))]
+    return posed_model(colmap_poses(poses), names, [frames[0].camera.intrinsics], [0] * len(frames))
 
 
 def seen_points(shift=0.0):

@@ -16,7 +16,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure import joining, sfm
-from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY, Rays, adjust, held_out_error
+from coliags_plugin.reconstruction.structure.adjustment import (
+    TEST_EVERY,
+    Rays,
+    adjust,
+    held_out_error,
+    median_of_points,
+    widest_between,
+)
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
@@ -279,3 +286,16 @@ def test_a_wall_that_moves_is_split_into_stretches_of_which_each_can_give_depth(
     assert sfm._far_apart(centers, 5, 50.0) == []
     ends = [0, *sfm._far_apart(centers, 6, 12.0), 80]
     assert all(np.ptp(centers[first:last, 0]) >= 12.0 for first, last in pairwise(ends))
+
+
+def test_medians_of_points():
+    values = np.array([3.0, np.nan, 1.0, 2.0, np.nan, 5.0, 4.0])
+    points = np.array([0, 0, 0, 0, 2, 3, 3])
+    np.testing.assert_array_equal(median_of_points(values, points, 4), [2.0, 0.0, 0.0, 4.0])
+
+
+def test_the_angle_between_two_rays():
+    rays = np.array([[2.0, 0.0, 30.0], [-2.0, 0.0, 30.0], [0.0, 0.0, 1.0]])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    found = widest_between(rays, np.array([0, 0, 1]), 2)
+    np.testing.assert_allclose(found, [np.degrees(2.0 * np.arctan(2.0 / 30.0)), 0.0], atol=1e-9)

@@ -15,10 +15,8 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
 from coliags_plugin.reconstruction.structure.matching import (
     alike_pairs,
-    all_pairs,
     epipolar_matches,
     mutual_matches,
-    video_pairs,
 )
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
@@ -121,14 +119,6 @@ def matched_when_moved(x, y, scale=1.0):
 def test_cameras_in_one_place_match_nothing():
     spots = features([[10, 10], [40, 40]], np.eye(128)[:2])
     assert not len(epipolar_matches(spots, spots, (camera(), camera()), *LOOSE))
-
-
-def test_pairs_of_a_video():
-    assert video_pairs(4, 1) == [(0, 1), (1, 2), (2, 3)]
-    assert {second - first for first, second in video_pairs(100, 5)} == {1, 2, 3, 4, 5, 8, 16}
-    count = sum(100 - step for step in (1, 2, 3, 4, 5, 8, 16))
-    assert len(video_pairs(100, 5)) == len(set(video_pairs(100, 5))) == count
-    assert all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 
 
 def test_highlights_and_masks_yield_no_features():

@@ -9,13 +9,12 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.poses.export import PosesExportCommand
-from coliags_plugin.cli.poses.structure import PosesSfmCommand, PosesTriangulateCommand
+from coliags_plugin.cli.poses.structure import PosesSfmCommand
 from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand
 
 Subcommand = (
     Annotated[PosesConvertCommand, tyro.conf.subcommand("convert")]
     | Annotated[PosesAlignCommand, tyro.conf.subcommand("align")]
-    | Annotated[PosesTriangulateCommand, tyro.conf.subcommand("triangulate")]
     | Annotated[PosesSfmCommand, tyro.conf.subcommand("sfm")]
     | Annotated[PosesExportCommand, tyro.conf.subcommand("export")]
 )
@@ -23,7 +22,7 @@ Subcommand = (
 
 @dataclass(frozen=True)
 class PosesCommand(arguments.CommandGroup):
-    """Convert, compare and export camera poses, triangulate points, or estimate poses from images."""
+    """Convert, compare and export camera poses, or estimate them from images."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""

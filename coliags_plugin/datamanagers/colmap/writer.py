@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
-from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 
 if TYPE_CHECKING:
@@ -21,15 +20,6 @@ class SeenPoints(NamedTuple):
 
     pixels: Float[np.ndarray, "K 2"]
     points: Int[np.ndarray, "K"]
-
-
-def write_image_and_mask(
-    folder: Path, name: str, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
-) -> None:
-    """Write an image and its optional mask, True where a pixel counts; ``name`` ends in ``.png``."""
-    write_image(folder / "images" / name, image)
-    if mask is not None:
-        write_mask(folder / "masks" / name, mask)
 
 
 def add_points(

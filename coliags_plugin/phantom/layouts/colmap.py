@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
+from coliags_plugin.core.images import write_image
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
@@ -25,7 +26,7 @@ class ColmapLayout(Layout):
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; depth is not part of this layout."""
-        write_image_and_mask(folder, _name(frame.index), frame.color)
+        write_image(folder / "images" / _name(frame.index), frame.color)
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
@@ -20,7 +21,6 @@ from coliags_plugin.reconstruction.structure.features import (
     image_and_mask,
 )
 from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
-from coliags_plugin.reconstruction.structure.outliers import difference_from_neighbours
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +34,8 @@ _FEWEST, _FEWEST_OF_FRAME = 30, 10
 _AGREEMENT = 0.15
 #: Difference of log depth from the neighbours' above which a point does not count.
 _UNLIKE = 0.3
+#: Neighbours of a point in its frame, and how many of them have to agree: a fold's edge leaves one side.
+_NEIGHBOURS, _AGREEING = 8, 4
 #: Percentiles of the points' depth, and the factors on them: features are rare where the lumen is dark.
 _NEAREST, _FARTHEST = (1.0, 0.6), (99.0, 2.0)
 
@@ -135,6 +137,17 @@ def _neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"
     known = depths > 0.0
     depths = depths[known]
     return np.asarray(depths[~(difference_from_neighbours(pixels[known], np.log(depths)) > _UNLIKE)])
+
+
+def difference_from_neighbours(
+    pixels: Float[np.ndarray, "K 2"], log_depth: Float[np.ndarray, "K"]
+) -> Float[np.ndarray, "K"]:
+    """How far log depths of one frame are from half of the nearest observations; NaN in a frame with too few."""
+    if len(pixels) <= _NEIGHBOURS:
+        return np.full(len(pixels), np.nan)
+    nearest = np.asarray(cKDTree(pixels).query(pixels, _NEIGHBOURS + 1)[1])[:, 1:]
+    differences = np.abs(log_depth[nearest] - log_depth[:, None])
+    return np.asarray(np.partition(differences, _AGREEING - 1, axis=1)[:, _AGREEING - 1])
 
 
 def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:

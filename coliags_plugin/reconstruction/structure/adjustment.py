@@ -15,9 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 from coliags_plugin.reconstruction.structure.mapping import solve_bundle
-from coliags_plugin.reconstruction.structure.outliers import median_of_points
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
-from coliags_plugin.reconstruction.structure.tracks import widest_between
 
 if TYPE_CHECKING:
     import pycolmap
@@ -216,3 +214,31 @@ def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray,
             if fits[row]:
                 track.add_element(int(rays.images[row]), int(rays.rows[row]))
         model.add_point3D(points[index], track, black)
+
+
+def widest_between(rays: Float[np.ndarray, "K 3"], points: Int[np.ndarray, "K"], count: int) -> Float[np.ndarray, "N"]:
+    """Upper bound of the widest angle between each point's rays, degrees: twice the largest angle to their mean.
+
+    ``rays`` have unit length; ``points`` are those that they belong to, of ``count``. NaN for a point with NaN rays.
+    """
+    mean = np.zeros((count, 3))
+    np.add.at(mean, points, rays)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    sines = np.linalg.norm(np.cross(rays, mean[points]), axis=1)
+    widest = np.zeros(count)
+    np.maximum.at(widest, points, sines)
+    return np.degrees(2.0 * np.arcsin(np.minimum(widest, 1.0)))
+
+
+def median_of_points(
+    values: Float[np.ndarray, "K"], points: Int[np.ndarray, "K"], count: int
+) -> Float[np.ndarray, "N"]:
+    """Lower median of each point's observations that are not NaN; 0 for a point without any."""
+    known = ~np.isnan(values)
+    values, points = values[known], points[known]
+    order = np.lexsort((values, points))
+    counts = np.bincount(points, minlength=count)
+    middle = np.cumsum(counts) - counts + np.maximum(counts - 1, 0) // 2
+    medians = np.zeros(count)
+    medians[counts > 0] = values[order][middle[counts > 0]]
+    return medians

@@ -26,7 +26,6 @@ from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_l
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, adjusted
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
-from coliags_plugin.reconstruction.structure.outliers import median_of_points
 from coliags_plugin.reconstruction.structure.point_tracks import PointFinder, View
 from coliags_plugin.reconstruction.structure.rigidity import rigid_frames
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings

@@ -25,12 +25,6 @@ _DUPLICATE_DISTANCE = 2.0
 _MAX_SCALE_RATIO = 1.6
 
 
-def video_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
-    """Pairs of COLMAP's sequential matching: frames 1, 2, ..., ``overlap`` and 2, 4, ..., 2^(overlap - 1) apart."""
-    steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
-    return sorted((first, first + step) for step in steps for first in range(count - step))
-
-
 def camera_centers(frames: Sequence[Frame]) -> Float[np.ndarray, "N 3"]:
     """World positions of the frames' cameras."""
     return np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])

@@ -82,7 +82,7 @@ class MatchedVideo:
         with tempfile.TemporaryDirectory() as scratch:
             database, folder = Path(scratch) / "database.db", Path(scratch) / "models"
             if not self.tracks:
-                write_database(database, cameras, named, self.keypoints, self.matches, verified=False)
+                write_database(database, cameras, named, self.keypoints, self.matches)
                 return map_images(database, folder, settings, len(self.images), progress)
             windows = self.windows(settings.tracks.longest_window)
             if len(windows) > 1:
@@ -91,7 +91,7 @@ class MatchedVideo:
             for window in with_progress(windows, "find poses", progress if len(windows) > 1 else None):
                 frames = slice(window.start, window.stop)
                 inside = {(i, j): pairs for (i, j), pairs in self.matches.items() if i in window and j in window}
-                write_database(database, cameras, named[frames], self.keypoints[frames], inside, False, window.start)
+                write_database(database, cameras, named[frames], self.keypoints[frames], inside, window.start)
                 models += map_tracks(database, folder, settings)
                 database.unlink()
                 shutil.rmtree(folder)

@@ -13,14 +13,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.reconstruction.depth.completion import complete, near_rim, smooth_surface
-from coliags_plugin.reconstruction.depth.depth_range import find_range, given_range
+from coliags_plugin.reconstruction.depth.depth_range import difference_from_neighbours, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
 from coliags_plugin.reconstruction.depth.fusion import depth_confidence
-from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
+from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Pose
-from coliags_plugin.reconstruction.robust_fit import robust_fit
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 
@@ -262,3 +261,19 @@ def test_files_that_do_not_fit_are_refused(tmp_path):
     np.save(tmp_path / "lit.npy", depth[:, :60])
     with pytest.raises(InputError, match="60 x 80 pixels, frame lit 96 x 80"):
         FilePrior.of(tmp_path, [frame])
+
+
+def grid(size=12):
+    return np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2) * 5.0
+
+
+def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
+    pixels = grid()
+    log_depth = np.where(pixels[:, 0] < 30.0, 3.0, 4.0)
+    clean = difference_from_neighbours(pixels, log_depth)
+    np.testing.assert_array_equal(clean, 0.0)
+    log_depth[40] += 0.7
+    found = difference_from_neighbours(pixels, log_depth)
+    assert found[40] == pytest.approx(0.7)
+    np.testing.assert_array_equal(np.delete(found, 40), 0.0)
+    assert np.isnan(difference_from_neighbours(pixels[:8], log_depth[:8])).all()
