@@ -57,8 +57,8 @@ class Options:
     counts: str = "20000,50000,100000,200000"
     """Numbers of Gaussians, comma separated."""
     backends: str = "torch,cpu"
-    """Renderers by name, comma separated; triton and gsplat need a CUDA device. Ratios and differences are to the
-    first."""
+    """Renderers by name, comma separated; triton needs a CUDA device, and gsplat the package
+    docs/example_renderer besides. Ratios and differences are to the first."""
     device: str = "cpu"
     """Where to compute."""
     primitives: str = "gaussians3d"

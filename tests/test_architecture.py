@@ -33,7 +33,7 @@ LAYERS = (
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 #: Loaded when a command or component runs, never when a module is imported.
-LAZY = {"open3d", "pycolmap", "numba", "triton", "gsplat", "gsply", "pooch", "requests", "viser", "nerfstudio", "ray"}
+LAZY = {"open3d", "pycolmap", "numba", "triton", "gsply", "pooch", "requests", "viser", "nerfstudio", "ray"}
 LAZY |= {"pyarrow", "tensorboard", "wandb"}
 
 SOURCES = {

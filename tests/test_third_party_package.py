@@ -1,4 +1,4 @@
-"""The example package of docs/, installed beside this one as far as entry points can tell."""
+"""The example packages of docs/, installed beside this one as far as entry points can tell."""
 
 from __future__ import annotations
 
@@ -6,21 +6,32 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from runpy import run_path
 
 import pytest
+import torch
 
+from coliags_plugin.checks.trial_views import INPUTS, strewn
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.scenes import write_wall
 
 tomllib = pytest.importorskip("tomllib")  # Python 3.11
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "example_package"
+RENDERER = EXAMPLE.with_name("example_renderer")
 
 
 @pytest.fixture
-def coliags(tmp_path):
-    """Runs the command line where the example is installed."""
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+def example():
+    return EXAMPLE
+
+
+@pytest.fixture
+def coliags(example, tmp_path):
+    """Runs the command line where an example is installed."""
+    project = tomllib.loads((example / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     info = tmp_path / "site" / f"{project['name']}-{project['version']}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n", encoding="utf-8")
@@ -29,7 +40,7 @@ def coliags(tmp_path):
         for group, entries in project["entry-points"].items()
     ]
     (info / "entry_points.txt").write_text("\n".join(groups), encoding="utf-8")
-    places = [str(tmp_path / "site"), str(EXAMPLE), str(EXAMPLE.parents[1])]
+    places = [str(tmp_path / "site"), str(example), str(example.parents[1])]
 
     def run(*argv):
         command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]
@@ -75,3 +86,51 @@ def test_a_method_whose_file_is_missing_is_named(coliags, tmp_path):
         "entry point 'ghost' in coliags_plugin.methods names package coliags_round, which has no ghost.yaml"
         in done.stderr
     )
+
+
+@pytest.mark.parametrize("example", [RENDERER])
+def test_a_renderer_of_another_package_is_registered(coliags):
+    done = coliags("list", "renderers")
+    assert done.returncode == 0, done.stderr
+    assert "(entry point coliags_gsplat:GsplatRenderer)" in done.stdout
+    renderer = renderer_class()
+    assert renderer.obstacle("gaussians3d", torch.device("cpu")) == "runs on cuda, the device is cpu"
+    assert "depth_expected" in renderer.outputs_of("gaussians3d") and "surfels" not in renderer.primitives
+
+
+def renderer_class():
+    """The class of the renderer that is not installed."""
+    return run_path(str(RENDERER / "coliags_gsplat.py"))["COMPONENTS"]["renderers"]["gsplat"]
+
+
+@pytest.fixture
+def gsplat_renderer():
+    """The class of the renderer, where gsplat and a device are."""
+    found = renderer_class().availability()
+    if not found.ok:
+        pytest.skip(found.reason)
+    return renderer_class()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_gsplat_gives_the_definition_s_numbers(gsplat_renderer, count):
+    """In few pixels, at a threshold, rounding decides; an image without Gaussians is the background, with a graph."""
+    gaussians, camera = strewn(200, 96, 64, "gaussians3d")
+    of = {name: getattr(gaussians, name)[:count] for name in (*INPUTS, "source_index", "visible_sources")}
+    wants, background = ("depth_expected", "normals", "rgb"), (0.3, 0.1, 0.9)
+    images, gradients = [], []
+    for renderer, device in (
+        (gsplat_renderer(gsplat_renderer.Settings(background=background)), "cuda"),
+        (TorchRenderer(TorchRendererSettings(alpha_max=0.999, background=background)), "cpu"),
+    ):
+        moved = {name: values.to(device) for name, values in of.items()}
+        leaves = {name: moved[name].requires_grad_() for name in INPUTS}
+        output = renderer.draw(replace(gaussians, **moved), camera.to(device), wants)
+        sum(output[name].square().sum() for name in wants).backward()
+        images.append(torch.cat([output[name].detach().cpu().reshape(64, 96, -1) for name in wants], dim=-1))
+        gradients.append([leaf.grad.cpu() for leaf in leaves.values()])
+    differences = (images[0] - images[1]).abs().amax(-1)
+    assert (differences > 1e-3).float().mean() <= 0.01
+    for found, true in zip(*gradients, strict=True):
+        assert (found - true).norm() <= 1e-2 * true.norm()

@@ -6,19 +6,21 @@ import ctypes
 import importlib
 import os
 import platform
+import traceback
 from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
 from coliags_plugin._version import __version__
-from coliags_plugin.checks.results import CheckResult
-from coliags_plugin.checks.trial_views import Trial, try_renderers
+from coliags_plugin.checks.results import CheckFailedError, CheckResult
+from coliags_plugin.checks.trial_views import try_renderer
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import is_auto, make_component
-from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.engine.devices import choose_device, find_device
 from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders
 from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.renderers.splatting import CutSettings
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.
 LIBRARIES = {
@@ -34,17 +36,17 @@ LIBRARIES = {
 
 _NO_CUDA = (
     "no device: everything runs on the CPU. Where there is one, its renderers are tried here: errors against the "
-    "definition, and frames per second, of 3D Gaussians and surfels; with --device cpu, those of the CPU"
+    "definition, and frames per second; with --device cpu, those of the CPU"
 )
+_HINT = "Until that is mended, --set renderer=torch or --device cpu do without it"
 
 
-def check_installation(device: str = "auto", trial: Trial | None = None) -> list[CheckResult]:
+def check_installation(device: str = "auto") -> list[CheckResult]:
     """Check what training and evaluation depend on; a missing optional part has status ``skipped``.
 
     Args:
         device: Whose renderers are tried on views: ``cpu``, ``cuda`` or ``cuda:N``; ``auto``: of the first CUDA device,
             or none without.
-        trial: Views to try them on, others than the default.
 
     Raises:
         InputError: There is no such device.
@@ -58,9 +60,8 @@ def check_installation(device: str = "auto", trial: Trial | None = None) -> list
         *_cuda(),
     ]
     results += [_library(name, module) for name, module in LIBRARIES.items()]
-    results += [_renderer(name, chosen) for name in registry.renderers]
-    if chosen.type == "cuda" or device == "cpu":
-        results += try_renderers(choose_device(str(chosen)), trial or Trial())
+    tried = choose_device(str(chosen)) if chosen.type == "cuda" or device == "cpu" else None
+    results += [_renderer(name, chosen, tried) for name in registry.renderers]
     results += [_lpips(net) for net in DEFAULT_NETS]
     return results
 
@@ -101,18 +102,27 @@ def _library(name: str, module: str) -> CheckResult:
     return CheckResult(name, "passed", installed)
 
 
-def _renderer(name: str, device: torch.device) -> CheckResult:
+def _renderer(name: str, device: torch.device, tried: torch.device | None) -> CheckResult:
+    """Whether a renderer can run here, and what its trial on a device came to; None: no trial."""
     component, title = make_component("renderers", name), f"renderer {name}"
     if is_auto(component.kind, component.name):
-        try:
-            chosen = choose_renderer(component, "gaussians3d", device)
-        except InputError as error:
-            return CheckResult(title, "failed", str(error))
+        chosen = choose_renderer(component, "gaussians3d", device)
         return CheckResult(title, "passed", f"would use {chosen.name} ({chosen.reason})")
     available = component.target.availability()
-    if available.ok:
-        return CheckResult(title, "passed", f"can run here: {available.reason}")
-    return CheckResult(title, "skipped", f"cannot run here: {available.reason}")
+    if not available.ok:
+        return CheckResult(title, "skipped", f"cannot run here: {available.reason}")
+    can_run = f"can run here: {available.reason}"
+    if tried is None or tried.type not in component.target.devices or not isinstance(component.settings, CutSettings):
+        return CheckResult(title, "passed", can_run)
+    try:
+        return CheckResult(title, "passed", f"{can_run}; {try_renderer(component.target, tried)}")
+    except CheckFailedError as error:
+        return CheckResult(title, "failed", f"{error}. {_HINT}")
+    except Exception as error:  # of a driver, a compiler or a kernel: the reason in every case
+        first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+        told = f"{type(error).__name__}: {first[:300]}".rstrip(" .:")
+        detail = f"{told}. {_HINT}; the traceback is in doctor --json"
+        return CheckResult(title, "failed", detail, traceback=traceback.format_exc())
 
 
 def _lpips(net: str) -> CheckResult:

@@ -185,7 +185,6 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
             "First renderer of ``prefer`` that can render the field; a run records which it is and why.",
         ),
         "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
-        "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
         "triton": "coliags_plugin.renderers.triton_renderer:TritonRenderer",
         "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",

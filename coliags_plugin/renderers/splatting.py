@@ -25,7 +25,7 @@ from coliags_plugin.renderers.checks import check_primitive
 class AutoSettings(Settings):
     """Order of preference, and options common to all splatting renderers."""
 
-    prefer: tuple[str, ...] = ("triton", "gsplat", "cpu", "torch")
+    prefer: tuple[str, ...] = ("triton", "cpu", "torch")
     """Names of renderers, the most preferred first."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Background RGB."""

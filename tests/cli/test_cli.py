@@ -324,7 +324,7 @@ def test_help_and_the_package_import_nothing_heavy():
     assert "Gaussian splatting for colonoscopy" in shown.stdout
     loaded = {name.partition(".")[0] for name in shown.stdout.splitlines()[-1].split()}
     heavy = {"torch", "numpy", "scipy", "cv2", "open3d", "pycolmap", "kornia", "skimage"}
-    assert not loaded & (heavy | {"viser", "gsplat", "nerfstudio"})
+    assert not loaded & (heavy | {"viser", "nerfstudio"})
 
 
 @pytest.mark.thorough

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.renderers import cpu_renderer, gsplat_library, gsplat_renderer, torch_renderer
-from tests.renderers import fake_gsplat
+from coliags_plugin.renderers import cpu_renderer, torch_renderer
 from tests.renderers.test_torch_renderer import INPUTS, pinhole, random_gaussians
 
 WANTS = ("albedo", "depth_accumulated", "one", "many")
@@ -63,24 +62,3 @@ def test_unusable_features_are_refused():
     for spoiled, message in ((torch.zeros(3, 2), "feature one of shape"), (torch.zeros(400, 1).double(), "float64")):
         with pytest.raises(InputError, match=message):
             cpu_renderer.render_gaussians(replace(gaussians, features={"one": spoiled}), camera, ("one",))
-
-
-@pytest.mark.parametrize("wants", [WANTS, ("many", "depth_median"), ("albedo", "one", "inverse_depth_accumulated")])
-def test_gsplat_composites_features_with_the_rest(monkeypatch, wants):
-    """The stand-in for gsplat; its colours as a feature must come out as the colours do, whatever is asked beside."""
-    monkeypatch.setattr(gsplat_library, "load", fake_gsplat.module)
-    gaussians = gaussians_with_features(40, torch.float32)
-    features = {**gaussians.features, "copy": gaussians.colors}
-    gaussians = replace(gaussians, features=features)
-    camera = pinhole(24, 18, 20.0, 20.0, dtype=torch.float32)
-    output = gsplat_renderer.render_with_gsplat(gaussians, camera, ("copy", *wants))
-    torch.testing.assert_close(output["copy"], output.rgb)
-    for name in wants:
-        if name in features:
-            assert output[name].shape == (18, 24, features[name].shape[1])
-            doubled = replace(gaussians, features={**features, name: 2.0 * features[name]})
-            again = gsplat_renderer.render_with_gsplat(doubled, camera, (name,))
-            torch.testing.assert_close(again[name], 2.0 * output[name])
-    none = replace(random_gaussians(0), features={"one": torch.zeros(0, 1)})
-    none = replace(none, **{name: getattr(none, name).float() for name in INPUTS})
-    assert gsplat_renderer.render_with_gsplat(none, camera, ("one",))["one"].shape == (18, 24, 1)
