@@ -34,7 +34,7 @@ LAYERS = (
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 #: Loaded when a command or component runs, never when a module is imported.
 LAZY = {"open3d", "pycolmap", "numba", "triton", "gsply", "pooch", "requests", "viser", "nerfstudio", "ray"}
-LAZY |= {"pyarrow", "tensorboard", "wandb"}
+LAZY |= {"tensorboard", "wandb"}
 
 SOURCES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path

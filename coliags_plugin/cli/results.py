@@ -98,35 +98,27 @@ class ResultsShowCommand:
 
 @dataclass(frozen=True)
 class ResultsExportCommand:
-    """Export results as a long table of every frame's metrics, or in the form of nerfbaselines' results files."""
+    """Export results as a long CSV table of every frame's metrics."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Results files, run folders, or folders to search for results files."""
     output: arguments.Output
-    """File to write; for nerfbaselines a folder."""
-    format: Literal["csv", "parquet", "nerfbaselines"] = "csv"
-    """Form; parquet needs the extra `tables`."""
+    """File to write."""
     json: arguments.AsJson = False
 
     def run(self) -> None:
-        """Write the files."""
+        """Write the table."""
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.results.nerfbaselines import write_nerfbaselines
         from coliags_plugin.results.reading import find_results
-        from coliags_plugin.results.tables import write_csv, write_parquet
+        from coliags_plugin.results.tables import write_csv
 
         if not self.paths:
             raise InputError("no results to export", "at least one file or folder")
         results = find_results(self.paths)
-        if self.format == "nerfbaselines":
-            files = write_nerfbaselines(self.output, results)
-        else:
-            if self.output.is_dir():
-                raise InputError(f"--output {self.output} is a folder", f"a file to write, such as table.{self.format}")
-            write = write_csv if self.format == "csv" else write_parquet
-            write(self.output, results)
-            files = [self.output]
-        print_summary(written=[file.resolve() for file in files], as_json=self.json)
+        if self.output.is_dir():
+            raise InputError(f"--output {self.output} is a folder", "a file to write, such as table.csv")
+        write_csv(self.output, results)
+        print_summary(written=[self.output.resolve()], as_json=self.json)
 
 
 Subcommand = (

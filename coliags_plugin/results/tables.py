@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.results.record import Result
 
@@ -66,23 +65,3 @@ def rows(result: Result) -> Iterator[FrameValue]:
 def write_csv(path: Path, results: Sequence[Result]) -> None:
     """Write the rows of results as CSV, values with all their digits, missing ones empty."""
     atomic_write(path, csv_text(FrameValue._fields, (row for result in results for row in rows(result))))
-
-
-def write_parquet(path: Path, results: Sequence[Result]) -> None:
-    """Write the rows of results as Parquet, missing values null."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise InputError(
-            f"a Parquet file without pyarrow: {error}",
-            "an installation with the extra `tables`",
-            "pip install 'coliags_plugin[tables]', or use --format csv",
-        ) from error
-    types = dict.fromkeys(FrameValue._fields, pyarrow.string())
-    types |= {"seed": pyarrow.int64(), "protocol_version": pyarrow.int64(), "value": pyarrow.float64()}
-    values = [row._asdict() for result in results for row in rows(result)]
-    table = pyarrow.Table.from_pylist(values, schema=pyarrow.schema(list(types.items())))
-    buffer = io.BytesIO()
-    parquet.write_table(table, buffer)
-    atomic_write(path, buffer.getvalue())

@@ -79,9 +79,6 @@ WRITERS: dict[str, Writer] = {
     "view --output": Writer(lambda i, o: ("view", i / "run", "--output", o / "view.html"), again=()),
     "report": Writer(lambda i, o: ("report", i / "run", "--output", o / "report.html", "--format", "all"), again=()),
     "results export": Writer(lambda i, o: ("results", "export", i / "run", "--output", o / "table.csv"), again=()),
-    "results export (nerfbaselines)": Writer(
-        lambda i, o: ("results", "export", i / "run", "--output", o / "table", "--format", "nerfbaselines"), again=()
-    ),
     "compare": Writer(
         lambda i, o: (
             *("compare", "coliags", "--scenes", i / "scene", "--output", o / "comparison", "--steps", 3, *_SMALL),
