@@ -21,7 +21,6 @@ def reconstruct(
     mask: str | Path | None = None,
     device: str = "auto",
     overwrite: bool = False,
-    anonymous: bool = False,
     executor: str | None = None,
     jobs: int | None = None,
     threads: int | None = None,
@@ -39,7 +38,6 @@ def reconstruct(
         mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         overwrite: Repeat stages that were made with other settings, and what follows them.
-        anonymous: Keep absolute paths out of what is written (docs/security.md 4).
         executor: ``local``: in worker processes of this machine, sub-maps at the same time; ``ray``: of a Ray cluster.
             None: in this process, one after the other, unless ``jobs`` are given.
         jobs: Worker processes at a time; None: one per CPU, or per GPU.
@@ -68,4 +66,4 @@ def reconstruct(
     masked = None if mask is None else Path(mask)
     with progress_callback() as progress:
         where = choose_device("cpu" if by_workers else device)
-        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, anonymous, execution, budget)
+        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, execution, budget)

@@ -28,7 +28,6 @@ def report(
     title: str | None = None,
     note: str | None = None,
     scene: Run | str | Path | None = None,
-    anonymous: bool = False,
 ) -> list[Path]:
     """Write a report of evaluated methods: tables with statistics, held-out views, errors, curves and costs.
 
@@ -43,7 +42,6 @@ def report(
         frames: Held-out frames to show per scene and test set; the worst ones are added.
         title: Heading; None: methods and scenes.
         note: A remark shown at the top.
-        anonymous: Leave out absolute paths that results hold (docs/security.md 4).
         scene: A run whose scene the HTML page lets its reader fly through, at most 5 MB more (docs/viewer.md 3).
 
     Returns:
@@ -69,7 +67,7 @@ def report(
     file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
     section = _scene_section(scene) if scene is not None and "html" in wanted else None
     choices = Choices(columns, reference, title, note, frames)
-    return write_report(paths, file, wanted, choices, protocol, methods, section, anonymous)
+    return write_report(paths, file, wanted, choices, protocol, methods, section)
 
 
 def _scene_section(of: Run | str | Path) -> Section:

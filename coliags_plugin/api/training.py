@@ -32,7 +32,6 @@ def train(
     device: str = "auto",
     resume: bool = False,
     overwrite: bool = False,
-    anonymous: bool = False,
     loggers: Sequence[str] = (),
     view_port: int | None = None,
 ) -> Run:
@@ -50,7 +49,6 @@ def train(
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         resume: Continue from the run's latest checkpoint.
         overwrite: Replace an existing run folder.
-        anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
         loggers: What also gets the training log, by name: ``tensorboard``, ``wandb``, or of another package.
         view_port: Port at which browsers see the run while it is trained; None: they do not; 0: any free one.
 
@@ -69,9 +67,7 @@ def train(
     data, on = Path(data), choose_device(device)
     named = {"schedule.steps": steps, "renderer.name": renderer}
     chosen = {key: value for key, value in named.items() if value is not None}
-    request = TrainingRequest(
-        method, data, (*assignments(settings), *assignments(chosen)), seed, data_format, anonymous
-    )
+    request = TrainingRequest(method, data, (*assignments(settings), *assignments(chosen)), seed, data_format)
     chosen_loggers = find_loggers(loggers)
     if view_port is not None:
         from coliags_plugin.export.viewer.serving import check_server
@@ -108,7 +104,6 @@ def import_splats(
     data_format: str | None = None,
     device: str = "auto",
     overwrite: bool = False,
-    anonymous: bool = False,
 ) -> Run:
     """Make a run of a file of 3D Gaussians on a scene, at step 0, to evaluate, render and mesh.
 
@@ -119,7 +114,6 @@ def import_splats(
         data_format: Name of a data manager; None: the one that recognises the folder.
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
         overwrite: Replace an existing run folder.
-        anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
 
     Raises:
         InputError: The file is damaged, compressed or of another lineage, the scene cannot be read, or the folder
@@ -130,5 +124,5 @@ def import_splats(
 
     scene = Path(data)
     folder = RunFolder.default(scene.resolve().name, "imported") if output is None else RunFolder(Path(output))
-    import_run(Path(file), scene, folder, choose_device(device), data_format, overwrite, anonymous)
+    import_run(Path(file), scene, folder, choose_device(device), data_format, overwrite)
     return Run(folder.path, data=scene, device=device)

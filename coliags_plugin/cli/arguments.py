@@ -54,12 +54,6 @@ Device = Annotated[
     str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
-AnonymousRun = Annotated[
-    bool,
-    tyro.conf.arg(
-        help="Keep absolute paths out of the run's files (docs/security.md 4); eval and others then need --data."
-    ),
-]
 AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 
 

@@ -85,8 +85,6 @@ class DepthCheckCommand:
     """Dataset format of the estimate (`coliags list datamanagers`); default: recognised from the files."""
     truth_format: _Format = None
     """Dataset format of the truth; default: recognised from the files."""
-    anonymous: bool = False
-    """Keep absolute paths out of the JSON (docs/security.md 4)."""
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -94,7 +92,6 @@ class DepthCheckCommand:
         from coliags_plugin.checks.depth.check import check_depth
         from coliags_plugin.checks.depth.page import depth_page, write_error_maps
         from coliags_plugin.checks.depth.sources import open_depth
-        from coliags_plugin.core.anonymity import without_places
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reporting.html_page import write_html
         from coliags_plugin.reporting.terminal import page_text
@@ -108,10 +105,9 @@ class DepthCheckCommand:
             write_html(page, self.html)
         if self.maps is not None:
             write_error_maps(check, self.maps)
-        facts = check.as_json()
         print_summary(
             page_text(page),
-            without_places(facts) if self.anonymous else facts,
+            check.as_json(),
             written=[path for path in (self.html, self.maps) if path is not None],
             as_json=self.json,
         )

@@ -40,7 +40,6 @@ class TrainCommand:
     format: arguments.DataFormat = None
     device: arguments.Device = "auto"
     overwrite: arguments.Overwrite = False
-    anonymous: arguments.AnonymousRun = False
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -60,13 +59,11 @@ class TrainCommand:
             device=self.device,
             resume=self.resume,
             overwrite=self.overwrite,
-            anonymous=self.anonymous,
             loggers=self.logger,
             view_port=self.port if self.view else None,
         )
-        moved = ("--data", self.data) if self.anonymous else ()
         facts = {"method": run.method, "scene": run.scene_name, "seed": run.seed, "step": run.step}
-        print_summary(facts=facts, written=[run.path], then=[coliags("eval", run.path, *moved)], as_json=self.json)
+        print_summary(facts=facts, written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,6 @@ class ImportCommand:
     format: arguments.DataFormat = None
     device: arguments.Device = "auto"
     overwrite: arguments.Overwrite = False
-    anonymous: arguments.AnonymousRun = False
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -130,8 +126,5 @@ class ImportCommand:
             data_format=self.format,
             device=self.device,
             overwrite=self.overwrite,
-            anonymous=self.anonymous,
         )
-        moved = ("--data", self.data) if self.anonymous else ()
-        evaluate = coliags("eval", run.path, *moved)
-        print_summary(written=[run.path], then=[evaluate], as_json=self.json)
+        print_summary(written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)

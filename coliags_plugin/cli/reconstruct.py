@@ -68,8 +68,6 @@ class ReconstructCommand:
     device: arguments.Device = "auto"
     overwrite: bool = False
     """Repeat the stages that were made with other options, and what follows them."""
-    anonymous: bool = False
-    """Keep absolute paths out of what is written (docs/security.md 4)."""
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -101,7 +99,6 @@ class ReconstructCommand:
             mask=self.mask,
             device=self.device,
             overwrite=self.overwrite,
-            anonymous=self.anonymous,
             executor=self.executor,
             jobs=self.jobs,
             threads=self.threads,

@@ -41,8 +41,6 @@ class ReportCommand:
         tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...], tyro.conf.UseAppendAction
     ] = ()
     """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json (tables), all."""
-    anonymous: bool = False
-    """Leave out absolute paths that results hold (docs/security.md 4)."""
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -63,7 +61,6 @@ class ReportCommand:
             title=self.title,
             note=self.note,
             scene=self.scene,
-            anonymous=self.anonymous,
         )
         print_summary(written=[file.resolve() for file in files], as_json=self.json)
 

@@ -77,8 +77,6 @@ class DataCommand:
     set: arguments.Assignments = ()
     """An option of the data manager, for instance split=block."""
     format: arguments.DataFormat = None
-    anonymous: bool = False
-    """Keep absolute paths out of the page and the JSON (docs/security.md 4)."""
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -94,8 +92,6 @@ class DataCommand:
             scene = open_scene(self.scene, self.format, self.set, progress)
             at_stored_size = partial(open_scene, self.scene, scene.provenance["dataset"], self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
-        if self.anonymous:
-            check = check.anonymous()
         page = check_page(check)
         if self.html is not None:
             write_html(page, self.html)

@@ -27,6 +27,7 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.locks import locked
+from coliags_plugin.core.text_files import without_places
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.results.hashing import code_key, training_config
 from coliags_plugin.results.reading import NewerResultError, read_result, write_result
@@ -187,6 +188,7 @@ class ComparisonFolder:
 
     def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> FailureRecord:
         """Record why a cell failed; a full disk loses the record, not the reason."""
+        reason = without_places(reason, (self.path, cell.scene.path))
         failure = FailureRecord(
             **cell.named, reason=reason, attempts=attempts, log=str(self.log(cell).relative_to(self.path))
         )

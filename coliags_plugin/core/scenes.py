@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -221,7 +222,8 @@ class Scene:
         test_sets: Held-out frames by set name; ``"test"`` is the split's own, others (``"rotation"``) come with
             the data.
         points: Initial points.
-        provenance: Origin of the data: dataset, layout, calibration, pose convention, split, fingerprints.
+        provenance: Origin of the data: dataset, layout, calibration, pose convention, split, fingerprints; no places.
+        folder: Where it was read from; None: made in memory.
     """
 
     name: str
@@ -229,6 +231,7 @@ class Scene:
     test_sets: dict[str, list[Frame]]
     points: PointCloud
     provenance: JsonObject = field(default_factory=dict)
+    folder: Path | None = None
 
     @property
     def video(self) -> list[Frame]:

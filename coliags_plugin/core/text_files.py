@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from coliags_plugin.core import bounds
@@ -32,3 +32,11 @@ def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
             yield from enumerate(file, start=1)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path}: {error}", expected) from error
+
+
+def without_places(text: str, places: Iterable[Path]) -> str:
+    """A message in which files and folders, and what they hold, stand without the absolute path that leads to them."""
+    for parent in {path.parent for place in places for path in (place.absolute(), place.resolve())}:
+        if parent != parent.parent:
+            text = text.replace(f"{parent}/", "")
+    return text

@@ -114,7 +114,6 @@ class RecordedDataManager(DataManager):
         unit = recording.facts.get("unit") or self.stated_unit(path)
         provenance = {
             "dataset": self.name,
-            "path": str(path.resolve()),
             **recording.facts,
             "unit": unit if unit == "unknown" else "mm",
             "fingerprint": recording.fingerprint,
@@ -130,7 +129,7 @@ class RecordedDataManager(DataManager):
         }
         if self._is_told:
             self._tell(recording, path)
-        return Scene(path.resolve().name, train, test_sets, points, provenance).scaled(FACTORS[unit])
+        return Scene(path.resolve().name, train, test_sets, points, provenance, path.resolve()).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
         """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""

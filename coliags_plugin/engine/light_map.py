@@ -121,7 +121,7 @@ def light_map(trained: TrainedRun) -> JsonObject | None:
     learned = None if field is None else _relative(field.attenuation, rays, trained.device, model.scale)
     if learned is None and gain is None and curve is None:
         return None
-    truth = find_true_light(Path(scene.provenance.get("path", "")))
+    truth = None if scene.folder is None else find_true_light(scene.folder)
     true = None if truth is None else _relative(truth.attenuation, rays, torch.device("cpu"))
     gains = None if gain is None else _centred(gain.log_gains().cpu().double()).exp()
     true_gains = None if truth is None or gains is None else _true_gains(truth, scene)

@@ -21,7 +21,7 @@ from coliags_plugin.results.hashing import code_key
 def run_provenance(
     method: LoadedMethod,
     scene: Scene,
-    scene_path: str,
+    scene_path: str,  # relative to the run folder
     seed: int,
     device: torch.device,
     chosen: ChosenRenderer,

@@ -147,6 +147,10 @@ class RunFolder:
         if not self.config_file.is_file():
             raise InputError(f"{self.path} is not a run folder", "a run to overwrite", "Choose another --output")
 
+    def relative(self, path: str | Path) -> str:
+        """A path from the folder, so that run and data can be moved together and nothing says where they were."""
+        return Path(os.path.relpath(Path(path).resolve(), self.path.resolve())).as_posix()
+
     def method(self) -> LoadedMethod:
         """The run's resolved config."""
         return load_method(str(self.config_file.resolve()))
@@ -164,7 +168,7 @@ class RunFolder:
             return RunIdentity(
                 method=found["method"],
                 scene_name=scene["name"],
-                scene_path=Path(scene["path"]),
+                scene_path=(self.path.resolve() / scene["path"]).resolve(),
                 fingerprint=scene["provenance"].get("fingerprint"),
                 seed=int(found["seed"]),
                 steps=int(found["steps"]),

@@ -38,8 +38,8 @@ from coliags_plugin.results.record import (
 #: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
 SEEN_METRICS = ("psnr", "psnr_gain_fitted", "ssim", "depth_mse", "depth_median_error")
 
-#: Keys of the provenance of a run and of its scene that a result has in another place, or that name a local path.
-_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint", "held_out_used")
+#: Keys of the provenance of a run and of its scene that a result has in another place.
+_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "fingerprint", "held_out_used")
 
 
 class EvaluatedSet:

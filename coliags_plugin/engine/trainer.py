@@ -246,7 +246,8 @@ class Trainer:
 
     def provenance(self) -> JsonObject:
         """Provenance of the run."""
-        made = run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
+        path = self.run.relative(self.scene_path)
+        made = run_provenance(self.method, self.scene, path, self.seed, self.device, self.chosen, self.model)
         return {**made, "plan": self.strategy.plan()}
 
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:

@@ -12,7 +12,6 @@ from typing import Literal
 import torch
 
 from coliags_plugin.config.method_config import method_name
-from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, recorded_scale, training_scale
 from coliags_plugin.engine.evaluator import check_evaluable
@@ -35,7 +34,6 @@ class TrainingRequest:
     overrides: Sequence[str] = ()  # ``key.path=value`` assignments
     seed: int | None = None  # None: 0, or that of the resumed run
     data_format: str | None = None  # a data manager; None: the method's, or the one that recognises the folder
-    anonymous: bool = False  # keep absolute paths out of the run; ``--data`` has to name the scene afterwards
     method_name: str | None = None  # in the run; None: the method's own
     scene_name: str | None = None  # in the run; None: the scene's own
     protocol: str | None = None  # of evaluations that has to fit the run; None: not checked
@@ -85,8 +83,6 @@ def open_training(
     scene = at_scale(scene, training_scale(scene) if scale is None else scale, method.config.near_plane)
     if request.scene_name is not None:
         scene = replace(scene, name=request.scene_name)
-    if request.anonymous:
-        scene, path = replace(scene, provenance=without_places(scene.provenance)), scene.name
     trainer = Trainer(method, scene, path, folder, seed, device)
     if request.protocol is not None:
         check_evaluable(trainer.model, scene, Scorer(request.protocol))

@@ -77,8 +77,6 @@ def check_data(context: StageContext) -> StageOutcome:
     check = check_scene(
         scene, context.progress, (lambda: context.open_posed(stored_size=True)) if scene.is_resized else None
     )
-    if context.anonymous:
-        check = check.anonymous()
     write_html(check_page(check), context.folder / "check.html")
     write_json(context.folder / "check.json", check.as_json())
     made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}

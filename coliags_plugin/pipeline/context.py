@@ -29,8 +29,12 @@ class StageContext:
     data_format: str | None  # of a source that is a scene; None: it is none
     device: torch.device
     progress: Progress | None = None
-    anonymous: bool = False  # keep absolute paths out of what is written
     submap: Submap = LARGEST  # which model of the posed scene is reconstructed
+
+    @property
+    def places(self) -> tuple[Path, ...]:
+        """Files and folders that are given."""
+        return tuple(path for path in (self.out, self.source, self.mask) if path is not None)
 
     def of(self, submap: Submap) -> StageContext:
         """The same for another model of the posed scene."""

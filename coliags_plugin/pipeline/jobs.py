@@ -66,7 +66,7 @@ class PartJobs:
     ) -> None:
         self.context, self.executor, self.options, self._overwrite = context, executor, options, overwrite
         self.record = Record.of(context.out)
-        self.record.is_anonymous = context.anonymous
+        self.record.places = context.places
         self.record.write()
         self.record.take_over_all()
         self.failures: dict[Part, str] = {}
@@ -159,7 +159,6 @@ class PartJob(Job):
             settings=context.settings.model_dump_json(),
             mask=None if context.mask is None else str(context.mask.resolve()),
             data_format=context.data_format,
-            anonymous=context.anonymous,
             part=self.part,
         )
 

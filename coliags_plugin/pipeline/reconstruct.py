@@ -39,7 +39,6 @@ def reconstruct(
     mask: Path | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-    anonymous: bool = False,
     execution: ExecutionOptions | None = None,
     budget: float | None = None,
 ) -> Record | FinishedProcedure:
@@ -70,7 +69,7 @@ def reconstruct(
         is_long = is_procedure(video, frames.every, frames.segment)
     else:
         _refuse_unused(source, settings, mask)
-    context = StageContext(out, source, settings, mask, data_format, device, progress, anonymous)
+    context = StageContext(out, source, settings, mask, data_format, device, progress)
     if is_long:
         with locked(out / LOCK_FILE, out):
             return reconstruct_procedure(context, execution or ExecutionOptions(jobs=1, device=str(device)), overwrite)
@@ -80,7 +79,7 @@ def reconstruct(
         if execution is not None:
             return _by_workers(context, execution, overwrite)
         record = Record.of(out)
-        record.is_anonymous = anonymous
+        record.places = context.places
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
         record.take_over_all()
         failure = run_stages(stages, record, overwrite, lambda: stages_of(context))

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from coliags_plugin._version import __version__
-from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.errors import (
     InputError,
     NotFiniteError,
@@ -26,6 +25,7 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.text_files import without_places
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class Record:
         self, folder: Path, stages: Mapping[str, StageRecord] | None = None, worker: str | None = None
     ) -> None:
         self.folder, self.stages = folder, dict(stages or {})
-        self.is_anonymous = False  # whether absolute paths are kept out of what stages say
+        self.places: Sequence[Path] = (folder,)  # files and folders whose places are kept out of what stages say
         self._is_worker, self._own = worker is not None, set[str]()
         self._file = folder / (RECORD_FILE if worker is None else _worker_file(worker))
 
@@ -124,9 +124,8 @@ class Record:
 
     def put(self, name: str, stage: StageRecord) -> None:
         """Set a stage, in the place it has."""
-        if self.is_anonymous:
-            stage = replace(stage, summary=without_places(stage.summary), warnings=without_places(stage.warnings))
-        self.stages[name] = stage
+        summary, *warnings = (without_places(text, self.places) for text in (stage.summary, *stage.warnings))
+        self.stages[name] = replace(stage, summary=summary, warnings=tuple(warnings))
         self._own.add(name)
         self.write()
 

@@ -58,9 +58,7 @@ def train(context: StageContext) -> StageOutcome:
     data_format = None if context.estimates_depth else context.data_format
     if not context.estimates_depth:
         options += [f"datamanager.{option}" for option in context.model_options]
-    request = TrainingRequest(
-        method_for(context), context.scene, options, settings.seed, data_format, context.anonymous
-    )
+    request = TrainingRequest(method_for(context), context.scene, options, settings.seed, data_format)
     folder = RunFolder(context.run)
     with open_training(request, folder, context.device, "continue") as trainer:
         try:

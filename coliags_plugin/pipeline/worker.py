@@ -29,7 +29,6 @@ class PartTask(Task):
     settings: str  # JSON
     mask: str | None
     data_format: str | None
-    anonymous: bool
     part: Part
 
 
@@ -53,11 +52,11 @@ def complete(task: PartTask) -> None:
     settings = ReconstructionSettings.model_validate_json(task.settings, strict=False)  # of lists
     mask, out = None if task.mask is None else Path(task.mask), Path(task.out)
     device = choose_device(task.device)
-    context = StageContext(out, Path(task.source), settings, mask, task.data_format, device, anonymous=task.anonymous)
+    context = StageContext(out, Path(task.source), settings, mask, task.data_format, device)
     name = part_name(task.part)
     with locked(out / f"{LOCK_FILE}-{name}", out, LOCK_SECONDS):
         record = Record.of(out, name)
-        record.is_anonymous = task.anonymous
+        record.places = context.places
         failure = run_stages(stages_of(context), record, plan=lambda: stages_of(context), parts={task.part})
         if failure is not None:
             raise failure

@@ -335,7 +335,7 @@ def leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]
     for key, value in values.items():
         if isinstance(value, Mapping) and len(value) <= _LARGEST_MAPPING:
             items += leaves(value, f"{prefix}{key}.")
-        elif key != "path" and not (isinstance(value, str) and _ABSOLUTE_PATH.match(value)):
+        elif not (isinstance(value, str) and _ABSOLUTE_PATH.match(value)):
             items.append((f"{prefix}{key}", value))
     return items
 

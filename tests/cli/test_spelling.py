@@ -18,7 +18,7 @@ from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 
 #: Options that come last, in this order.
-TAIL = ("set", "format", "data", "device", "overwrite", "anonymous", "json")
+TAIL = ("set", "format", "data", "device", "overwrite", "json")
 #: Options that name a format otherwise.
 FORMATS = dict.fromkeys(("layout", "estimate_format", "reference_format", "truth_format", "from_format"), "format")
 

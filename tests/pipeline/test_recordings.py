@@ -147,7 +147,7 @@ def test_it_is_reconstructed_with_its_camera(done, recording, tmp_path, monkeypa
     seen = []
     fake = capture_stages.make_poses
     monkeypatch.setattr(capture_stages, "make_poses", lambda context: (seen.append(context.settings), fake(context))[1])
-    cp.reconstruct(recording, tmp_path / "out", anonymous=True)
+    cp.reconstruct(recording, tmp_path / "out")
     assert done == ["make_frames", *CAPTURE, *TRAINING]
     assert seen[0].sfm == opened_recording(recording, SfmSettings())[1]
     assert str(tmp_path) not in (tmp_path / "out" / "reconstruction.json").read_text()

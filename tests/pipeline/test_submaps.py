@@ -149,13 +149,13 @@ def test_a_sub_map_that_fails_does_not_end_the_others(done, atlas, tmp_path, mon
     assert done == [name for name in SUBMAP if name != "check_data"]
 
 
-def test_a_failure_told_anonymously_has_no_path(done, atlas, tmp_path, monkeypatch):
+def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypatch):
     def fails(context):
         raise InputError(f"{context.out / 'depth'} is empty")
 
     monkeypatch.setattr(training_stages, "mesh", fails)
     with pytest.raises(InputError):
-        cp.reconstruct(atlas, tmp_path / "out", anonymous=True)
+        cp.reconstruct(atlas, tmp_path / "out")
     for file in ("reconstruction.json", "index.html"):
         text = (tmp_path / "out" / file).read_text(encoding="utf-8")
         assert "depth is empty" in text and str(tmp_path) not in text

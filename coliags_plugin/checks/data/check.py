@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +15,6 @@ from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import CHANGES
 from coliags_plugin.checks.data.matches import EpipolarAgreement, FrameMatches, epipolar_agreement, follow, match
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale, Pair, agreement, best_scale
-from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 
@@ -44,10 +43,6 @@ class SceneCheck:
     matched_by: Literal["features", "tracks"] | None  # how they are matched; None where there is depth
     findings: list[Finding]  # suspected problems
     undecided: list[Finding]  # what the data are not enough to check
-
-    def anonymous(self) -> SceneCheck:
-        """The same without absolute paths."""
-        return replace(self, scene=replace(self.scene, provenance=without_places(self.scene.provenance)))
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""

@@ -41,8 +41,8 @@ class DepthCheck:
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""
         return {
-            "estimate": str(self.estimate.path),
-            "truth": str(self.truth.path),
+            "estimate": self.estimate.path.resolve().name,
+            "truth": self.truth.path.resolve().name,
             "unit": self.unit,
             "aligned_by_factor": self.scale,
             "frames_matched_by": self.pairs.by,

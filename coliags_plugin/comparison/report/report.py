@@ -30,7 +30,6 @@ def write_report(
     protocol: str = "paper",  # name of the evaluation to read from folders
     methods: Sequence[str] = (),  # to show, in this order; empty: all
     scene: Section | None = None,  # a scene to fly through, of the HTML page alone
-    anonymous: bool = False,  # without absolute paths that results hold
 ) -> list[Path]:
     """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
 
@@ -44,8 +43,6 @@ def write_report(
     for file in files.values():
         refuse_folder(file)
     study = read_study(paths, protocol, methods)
-    if anonymous:
-        study = study.anonymous()
     text = text_page(study, choices)
     screen = screen_page(text, study, choices, scene) if "html" in files else text
     for each, file in files.items():

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 from coliags_plugin.comparison.plan_file import Decision
-from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.results.comparisons import BySeed
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
 
@@ -133,12 +132,6 @@ class Study:
     family: tuple[tuple[str, ...], ...] = ()  # all methods that were planned or given, with all names that each has
     decided: Decision | None = None  # before the first result
 
-    def anonymous(self) -> Study:
-        """The same without absolute paths."""
-        runs = tuple(replace(run, result=_without_places(run.result)) for run in self.runs)
-        missing = tuple(replace(one, reason=without_places(one.reason)) for one in self.missing)
-        return replace(self, runs=runs, missing=missing)
-
     @cached_property
     def by_method(self) -> dict[str, list[StudyRun]]:
         """Results of every method, in the order given."""
@@ -188,8 +181,3 @@ class Study:
     def scenes(self) -> list[str]:
         """Scenes with a result, in the order given."""
         return list(dict.fromkeys(run.scene for run in self.runs))
-
-
-def _without_places(result: Result) -> Result:
-    kept = {name: without_places(getattr(result, name)) for name in ("config", "software", "provenance")}
-    return result.model_copy(update=kept)

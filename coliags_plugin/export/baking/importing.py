@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import save_checkpoint
@@ -37,12 +36,11 @@ def import_run(
     device: torch.device,
     data_format: str | None = None,
     overwrite: bool = False,
-    anonymous: bool = False,
 ) -> None:
     """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
 
     The file is in the frame and unit of the scene in the folder ``data``, which the named data manager reads, or the
-    one that recognises it; ``device`` is recorded. An anonymous run holds no absolute paths.
+    one that recognises it; ``device`` is recorded.
     """
     output.check_free(overwrite)
     cloud = read_splats(file)
@@ -59,11 +57,9 @@ def import_run(
     schedule = Schedule(config.schedule.steps, config.schedule.written_for)
     sizes = [(frame.camera.width, frame.camera.height) for frame in scene.train]
     provenance = {
-        **run_provenance(method, scene, str(data.resolve()), 0, device, chosen, model),
-        "imported": {"file": str(file.resolve()), "gaussians": len(cloud), "sh_degree": cloud.degree},
+        **run_provenance(method, scene, output.relative(data), 0, device, chosen, model),
+        "imported": {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree},
     }
-    if anonymous:
-        provenance = without_places(provenance)
     with atomic_folder(output.path, overwrite=True) as scratch:
         run = RunFolder(scratch)
         run.rewrite(config.to_yaml(), provenance)

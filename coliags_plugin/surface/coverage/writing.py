@@ -63,7 +63,7 @@ def measure_scene(
     """
     check_free(output, overwrite)
     views = recorded_views(scene)
-    source = truth or find_true_surface(Path(scene.provenance.get("path", "")))
+    source = truth or (None if scene.folder is None else find_true_surface(scene.folder))
     true = None if source is None else read_true_surface(source, any_frame=True)
     with progress_callback() as progress:
         coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)

@@ -75,7 +75,7 @@ def mesh_run(
 
 
 def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
-    path = given or find_true_surface(Path(scene.provenance.get("path", "")))
+    path = given or (None if scene.folder is None else find_true_surface(scene.folder))
     if path is None or (given is None and not scene.is_metric):
         return None
     unit = "mm" if scene.is_metric else _same_world(scene, path).length_unit
@@ -156,8 +156,10 @@ def _summary(
 
 def _relative_path(path: Path, scene: Scene) -> str:
     """The path of a file in the scene's folder, or the name of another."""
-    folder, file = Path(scene.provenance.get("path", "")).resolve(), path.resolve()
-    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
+    file = path.resolve()
+    if scene.folder is not None and file.is_relative_to(scene.folder):
+        return file.relative_to(scene.folder).as_posix()
+    return file.name
 
 
 def comparison_blocks(compared: SurfaceComparison) -> list[Block]:

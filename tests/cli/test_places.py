@@ -1,4 +1,4 @@
-"""``--anonymous``: nothing that is written says where the data were."""
+"""Nothing that is written says where the data were."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from coliags_plugin.core.text_files import without_places
 from coliags_plugin.export.splats.files import write_splats
 from tests.commands import run
 from tests.export.splats.clouds import random_cloud
@@ -25,42 +26,47 @@ def telling(folder, *secrets):
     return [path for path in files for secret in secrets if secret.encode() in path.read_bytes()]
 
 
-def test_of_a_run_its_evaluation_and_a_report(tmp_path, scene, capsys):
+def test_of_a_run_its_evaluation_and_a_report(tmp_path, scene):
     small = [word for override in SMALL for word in ("--set", override)]
     out = tmp_path / "out"
     options = ("--steps", 2, "--renderer", "torch", *small)
-    assert run("train", "scaffold-gs", "--data", scene, "--output", out / "run", "--anonymous", *options) == 0
-    provenance = json.loads((out / "run/provenance.json").read_text())
-    assert provenance["scene"]["path"] == provenance["scene"]["provenance"]["path"] == "scene"
-    capsys.readouterr()
-    assert run("eval", out / "run") == 2
-    assert "scene" in capsys.readouterr().err
-    assert run("eval", out / "run", "--data", scene) == 0
-    assert run("report", out / "run", "--output", out / "report.html", "--anonymous") == 0
-    assert not telling(out, "Jane Doe", str(tmp_path))
+    assert run("train", "scaffold-gs", "--data", scene, "--output", out / "run", *options) == 0
+    assert json.loads((out / "run/provenance.json").read_text())["scene"]["path"] == "../../Jane Doe/scene"
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("out", "Jane Doe"):
+        (tmp_path / name).rename(tmp_path / "elsewhere" / name)
+    out = tmp_path / "elsewhere/out"
+    assert run("eval", out / "run") == 0, "run and scene were moved together"
+    assert run("report", out / "run", "--output", out / "report", "--format", "all") == 0
+    assert not telling(out, str(tmp_path))
+    assert telling(out, "Jane Doe") == [out / "run/provenance.json"]
 
 
 def test_of_an_imported_run(tmp_path, scene):
     write_splats(tmp_path / "Jane Doe/cloud.ply", random_cloud(20, degree=0), "ply")
     out = tmp_path / "out/run"
-    assert run("import", tmp_path / "Jane Doe/cloud.ply", "--data", scene, "--output", out, "--anonymous") == 0
+    assert run("import", tmp_path / "Jane Doe/cloud.ply", "--data", scene, "--output", out) == 0
     assert json.loads((out / "provenance.json").read_text())["imported"]["file"] == "cloud.ply"
-    assert not telling(out, "Jane Doe", str(tmp_path))
+    assert not telling(out, str(tmp_path))
 
 
 def test_of_checks(tmp_path, scene, capsys):
     out = tmp_path / "out"
-    data = ("data", "check", scene, "--html", out / "check.html", "--json")
-    assert run(*data) in (0, 1)
-    assert "Jane Doe" in json.dumps(json.loads(capsys.readouterr().out)["data"])
-    assert run(*data, "--anonymous") in (0, 1)
-    depth = ("depth", "check", scene, scene, "--html", out / "depth.html", "--json", "--anonymous")
+    assert run("data", "check", scene, "--html", out / "check.html", "--json") in (0, 1)
     outputs = [capsys.readouterr().out]
-    assert run(*depth) == 0
+    assert run("depth", "check", scene, scene, "--html", out / "depth.html", "--json") == 0
     for text in (*outputs, capsys.readouterr().out):
         told = json.dumps({key: value for key, value in json.loads(text).items() if key not in ("written", "next")})
         assert "Jane Doe" not in told and str(tmp_path) not in told
     assert not telling(out, "Jane Doe", str(tmp_path))
+
+
+def test_of_messages(tmp_path):
+    places = (tmp_path / "out", tmp_path / "Jane Doe/video.mp4")
+    text = (
+        f"{places[1]}: no frame of mm/s, {places[0]}/depth is empty; {tmp_path / 'Jane Doe'}/video.mp4.xml is not there"
+    )
+    assert without_places(text, places) == "video.mp4: no frame of mm/s, out/depth is empty; video.mp4.xml is not there"
 
 
 def test_pictures_hold_nothing_but_pixels(tmp_path):
