@@ -55,8 +55,8 @@ def compare(
         retries: How often a run is resumed whose process was killed or crashed.
 
     Raises:
-        InputError: Methods, scenes or options are not valid or not there, the folder cannot be used, or the disk is
-            too small; nothing was run.
+        InputError: Methods, scenes or options are not valid or not there, or the folder cannot be used; nothing was
+            run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
     from coliags_plugin.comparison.compare import carry_out, make_request

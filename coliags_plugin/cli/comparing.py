@@ -47,7 +47,7 @@ class ComparisonArguments:
     retries: int = 2
     """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
-    """Only print what would be done: every cell with its state, and the disk that is needed."""
+    """Only print what would be done: every cell with its state."""
     set: arguments.Assignments = ()
     """Change a value of every method config, as for train."""
     data: arguments.OptionalPath = None
@@ -73,17 +73,12 @@ class ComparisonArguments:
             self.reference,
             self.primary,
         )
-        options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         folder = ComparisonFolder(self.output)
         if self.dry_run:
-            planned = dry_run(request, folder, options)
-            cells = [
-                {"cell": each.cell.title, "state": each.state, "bytes": each.size, "changed": each.changed}
-                for each in planned.cells
-            ]
-            facts = {"cells": cells, "bytes": planned.size, "free_bytes": planned.free}
-            print_summary(str(planned.table()), facts, as_json=self.json)
+            planned = dry_run(request, folder)
+            print_summary(str(planned), {"cells": planned.rows}, as_json=self.json)
             return
+        options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         done = carry_out(request, folder, options)
         table = done.table()
         facts = {

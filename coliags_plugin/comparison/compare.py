@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from coliags_plugin.comparison.dry_run import DryRun, RunSizes, forecast
-from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
@@ -22,7 +21,7 @@ from coliags_plugin.core.errors import InputError, check_name, check_number, did
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.choice import ExecutionOptions, make_executor
-from coliags_plugin.reporting.model import Column
+from coliags_plugin.reporting.model import Column, Value
 from coliags_plugin.reporting.terminal import DisplayTable
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
@@ -91,34 +90,57 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
     """Train and evaluate methods on scenes, as far as that is not done in a folder, which is new or extended.
 
     Raises:
-        InputError: Something is not valid or not there, or the disk is too small; nothing was run.
+        InputError: Something is not valid or not there; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
     executor = make_executor(options)
     cells = _plan_cells(request, folder)
     with folder.held():
-        finished, sizes = folder.finished(), RunSizes(folder)
+        finished = folder.finished()
         missing = {cell.scene.name: cell.scene for cell in cells if finished.of(cell) is None}
         if any(not scene.is_there for scene in missing.values()):
             with progress_callback() as progress:
                 make_phantoms(list(missing.values()), progress)
             cells = make_cells(request, folder.recorded_fingerprint)
-        ahead = forecast(cells, folder, finished, sizes, executor.slots)
-        log.info("%s", ahead)
-        ahead.check_disk()
+        log.info("%s", _states(cells, folder, finished).title)
         scenes = {cell.scene.path for cell in cells if finished.of(cell) is None}
         if scenes:
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells, has_results=bool(finished))
-        failures = CellRuns(folder, executor, options, cells, finished, sizes).run()
+        failures = CellRuns(folder, executor, options, cells, finished).run()
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
 
 
-def dry_run(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> DryRun:
-    """What :func:`carry_out` would do; writes nothing."""
-    slots, cells = make_executor(options).slots, _plan_cells(request, folder)
-    return forecast(cells, folder, folder.finished(), RunSizes(folder), slots)
+def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:
+    """What :func:`carry_out` would do with each cell; writes nothing."""
+    return _states(_plan_cells(request, folder), folder, folder.finished())
+
+
+def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder, finished: FinishedCells) -> DisplayTable:
+    """Every cell with its state: done, resume, new, same (as an earlier cell), or scene to make."""
+    rows: list[dict[str, Value]] = []
+    keys: set[str] = set()
+    for cell in cells:
+        key, step, changed = "" if cell.keys is None else cell.keys.result, 0, ""
+        if finished.of(cell) is not None:
+            state = "done"
+        elif key in keys:
+            state = "same"
+        elif not cell.scene.is_there:
+            state = "scene to make"
+        else:
+            step, changed = folder.run(cell).step, finished.changes(cell)
+            state = "resume" if step else "new"
+        keys |= {key} if key else set()
+        steps = f"{step} of {cell.steps}" if step else str(cell.steps)
+        rows.append({"cell": cell.title, "state": state, "steps": steps, "changed": changed or None})
+    columns = [Column("cell"), Column("state", words=True), Column("steps")]
+    if any(row["changed"] for row in rows):
+        columns.append(Column("changed", "done before, but changed", words=True))
+    counts = Counter(row["state"] for row in rows)
+    states = ", ".join(f"{count} {state}" for state, count in counts.items())
+    return DisplayTable(f"{len(cells)} cells: {states}", columns, rows)
 
 
 def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCell]:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from coliags_plugin.comparison.dry_run import RunSizes
 from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
 from coliags_plugin.comparison.plan import ComparisonCell
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config.method_files import is_path
-from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.errors import InterruptedRunError
 from coliags_plugin.execution.choice import ExecutionOptions
 from coliags_plugin.execution.executors import Executor
 from coliags_plugin.execution.queue import Job, JobQueue, Phase
-from coliags_plugin.reporting.numbers import file_size
 from coliags_plugin.results.reading import read_result
 
 log = logging.getLogger(__name__)
@@ -36,9 +33,8 @@ class CellRuns:
         options: ExecutionOptions,
         cells: Sequence[ComparisonCell],
         finished: FinishedCells,
-        sizes: RunSizes,
     ) -> None:
-        self.folder, self.executor, self.options, self.sizes = folder, executor, options, sizes
+        self.folder, self.executor, self.options = folder, executor, options
         self.finished, self.failures = finished, list[FailureRecord]()
         self._count = len(cells)
         self._ended: dict[Phase, int] = {"done": 0, "failed": 0}
@@ -96,9 +92,6 @@ class CellJob(Job):
     def task(self) -> CellTask:
         """See :class:`Job`."""
         cell, runs = self._cell, self._runs
-        needed, free = 2 * runs.sizes.of(cell), shutil.disk_usage(runs.folder.path).free
-        if free < needed:
-            raise InputError(f"the disk is full: {file_size(free)} left, about {file_size(needed)} needed")
         runs.tell(cell, "running")
         return CellTask(
             title=cell.title,

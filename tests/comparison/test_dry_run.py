@@ -1,18 +1,15 @@
-"""Dry runs: the disk that cells take; and the lines in which a comparison tells of its cells."""
+"""Dry runs, and the lines in which a comparison tells of its cells."""
 
 from __future__ import annotations
 
 import json
 import logging
-from dataclasses import replace
 
 import pytest
 
-from coliags_plugin.comparison.compare import make_request
-from coliags_plugin.comparison.dry_run import RunSizes, forecast
+from coliags_plugin.comparison.compare import dry_run, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.plan import make_cells
-from coliags_plugin.core.errors import InputError
 from tests.comparison.small import compare_inline
 from tests.scenes import write_wall
 
@@ -27,24 +24,17 @@ def folder(tmp_path):
     return ComparisonFolder(tmp_path / "comparison")
 
 
-def test_disk_is_that_of_finished_runs_where_there_are_any(cells, folder):
-    for number, size in enumerate((1000, 3000, 8000)):
-        (folder.path / "runs/other/coliags" / f"s0-{number}" / "eval").mkdir(parents=True)
-        (folder.path / "runs/other/coliags" / f"s0-{number}" / "eval" / "file").write_bytes(bytes(size))
-    assert RunSizes(folder).of(cells[0]) == 3000
-    assert RunSizes(folder).of(cells[1]) > 1e6
-
-
-def test_the_sums_of_a_dry_run(cells, folder):
+def test_a_run_with_a_checkpoint_goes_on(cells, folder):
     checkpoint = folder.run(cells[1]).checkpoints / "step-000040"
     checkpoint.mkdir(parents=True)
     (checkpoint / "state.json").write_text("{}")
-    ahead = forecast(cells, folder, folder.finished(), RunSizes(folder), slots=2)
-    assert [(each.state, each.step) for each in ahead.cells] == [("new", 0), ("resume", 40), ("new", 0)]
-    assert ahead.size == (3 + 2) * RunSizes(folder).of(cells[0])  # two that run take twice their room
-    assert "3 cells: 2 new, 1 resume; about 350 MB of" in str(ahead)
-    with pytest.raises(InputError, match=r"the runs need about 350 MB, and the disk has"):
-        replace(ahead, free=ahead.size - 1).check_disk()
+    table = dry_run(make_request(["coliags", "3dgs", "scaffold-gs"], [cells[0].scene.path], steps=100), folder)
+    assert [(row["state"], row["steps"]) for row in table.rows] == [
+        ("new", "100"),
+        ("resume", "40 of 100"),
+        ("new", "100"),
+    ]
+    assert table.title == "3 cells: 2 new, 1 resume"
 
 
 def test_the_step_of_a_run_is_read_from_the_end_of_its_log(cells, folder):
