@@ -8,12 +8,15 @@ import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from coliags_plugin.core import files, scratch
+import pytest
 
-#: Operations that change the disk.
-COUNTED = ("mkdir", "open", "fsync", "replace", "rename", "write")
+from coliags_plugin.core import files
+
+#: Operations that change the disk: of the module ``os``, and the functions ``mkdtemp`` and ``open``.
+COUNTED = ("mkdir", "mkdtemp", "fsync", "replace", "rename", "open", "write")
 
 
 def no_space() -> None:
@@ -45,14 +48,14 @@ def largest_file(size: int) -> Iterator[None]:
 class _File:
     """A file of which one write may store half of its data and then fail."""
 
-    def __init__(self, file: Any, faulty: FaultyOs) -> None:
-        self._file, self._faulty = file, faulty
+    def __init__(self, file: Any, faults: Faults) -> None:
+        self._file, self._faults = file, faults
 
     def write(self, data: bytes) -> int:
-        if self._faulty.is_due():
+        if self._faults.is_due():
             self._file.write(data[: len(data) // 2])
             self._file.flush()
-            self._faulty.fault()
+            self._faults.fault()
         return int(self._file.write(data))
 
     def __enter__(self) -> _File:
@@ -65,8 +68,8 @@ class _File:
         return getattr(self._file, name)
 
 
-class FaultyOs:
-    """The module ``os``, of which one operation that changes the disk goes wrong.
+class Faults:
+    """File operations of the package, one of which goes wrong.
 
     Args:
         when: Which one, counted from 0 over all of :data:`COUNTED`.
@@ -86,33 +89,31 @@ class FaultyOs:
         """Whether there were so many operations."""
         return self.seen > self.when
 
-    def fdopen(self, handle: int, mode: str) -> _File:
-        return _File(os.fdopen(handle, mode), self)
+    def counted(self, operation: Callable[..., Any]) -> Callable[..., Any]:
+        """The operation, or the fault where it is due."""
 
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(os, name)
-        if name not in COUNTED:
-            return real
-
-        def counted(*args: Any, **options: Any) -> Any:
-            if name == "open" and not args[1] & os.O_CREAT:
-                return real(*args, **options)
+        def wrapped(*args: Any, **options: Any) -> Any:
             if self.is_due():
                 self.fault()
-            return real(*args, **options)
+            return operation(*args, **options)
 
-        return counted
+        return wrapped
+
+    def open(self, path: Path, mode: str) -> _File:
+        """The built-in function, whose files may fail."""
+        return _File(self.counted(open)(path, mode), self)
 
 
 @contextmanager
-def fault(when: int, kind: Callable[[], None]) -> Iterator[FaultyOs]:
+def fault(when: int, kind: Callable[[], None]) -> Iterator[Faults]:
     """Let one file operation of the package go wrong."""
-    faulty, real = FaultyOs(when, kind), os
-    files.os = scratch.os = faulty  # type: ignore[assignment]
-    try:
-        yield faulty
-    finally:
-        files.os = scratch.os = real
+    faults = Faults(when, kind)
+    counted = {name: faults.counted(operation) for name, operation in vars(os).items() if name in COUNTED}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "os", SimpleNamespace(**{**vars(os), **counted, "open": os.open}))
+        patch.setattr(files, "mkdtemp", faults.counted(files.mkdtemp))
+        patch.setattr(files, "open", faults.open, raising=False)
+        yield faults
 
 
 def content(path: Path) -> bytes | dict[str, bytes] | None:

@@ -1,6 +1,7 @@
 """Atomic writes: files and folders are written under a temporary name, forced onto the disk, and then renamed.
 
-So a target is either as it was or whole, whatever happens: an error, a full disk, a kill.
+So a target is either as it was or whole, whatever happens: an error, a full disk, a kill. Only a kill between the two
+renames that replace a folder leaves none at its place: the next write there finds it and puts it back.
 """
 
 from __future__ import annotations
@@ -8,28 +9,30 @@ from __future__ import annotations
 import errno
 import io
 import json
+import logging
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
+from glob import escape
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING
 
 from coliags_plugin.core.errors import InputError, NotWritableError
-from coliags_plugin.core.scratch import (
-    final_place,
-    is_in_scratch,
-    put_in_place,
-    scratch_file,
-    scratch_folder,
-    sweep,
-    sync,
-    sync_tree,
-)
 
 if TYPE_CHECKING:
     import numpy as np
 
+log = logging.getLogger(__name__)
+
+#: Scratch folders: of which name, and of which process.
+_SCRATCH = re.compile(r"\.(.+)\.([0-9]+)-[a-z0-9_]+\.partial")
+#: What was at the place of a folder that is being replaced, in its scratch folder.
+_OLD = ".replaced"
+#: Names of the scratch folders of this process.
+_OWN: set[str] = set()
 #: Errors of a disk, quota or size limit that is used up.
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
@@ -45,54 +48,43 @@ def refuse_overlap(output: Path, source: Path) -> None:
 
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Scratch folder that becomes ``target`` when the block ends without an error; first, killed ones are removed."""
-    durable = not is_in_scratch(target)
-    make_folder(target.parent)
-    with ExitStack() as scratches:
+    """Scratch folder that becomes ``target`` when the block ends without an error."""
+    with _scratch(target) as path:
         with reporting_unwritable(target.parent):
-            if durable:
-                sweep(target)
             if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
                 raise InputError(
                     f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite"
                 )
-            scratch = scratches.enter_context(scratch_folder(target))
+            os.mkdir(path)
         with reporting_unwritable(target.parent, only_full=True):
-            yield scratch
+            yield path
         with reporting_unwritable(target.parent):
-            if durable:
-                sync_tree(scratch)
-            put_in_place(scratch, target)
-            if durable:
-                sync(target.parent)
-
-
-def atomic_write(target: Path, data: bytes | str) -> None:
-    """Write a file under a temporary name, then rename it to ``target``."""
-    with _renamed_at_the_end(target) as file:
-        file.write(data.encode() if isinstance(data, str) else data)
+            if not _is_in_scratch(target):
+                for parent, _, files in os.walk(path):
+                    for name in (*files, ""):
+                        _sync(Path(parent, name))
+            _put_folder(path, target)
 
 
 @contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """A path of the same suffix for a library to write; it becomes ``target`` when the block ends without an error."""
-    make_folder(target.parent)
-    with ExitStack() as scratches:
-        with reporting_unwritable(target.parent):
-            sweep(target)
-            path = scratches.enter_context(scratch_folder(target)) / target.name
+    """A path of the same name for a library to write; it becomes ``target`` when the block ends without an error."""
+    with _scratch(target) as path:
         with reporting_unwritable(target.parent, only_full=True):
             yield path
         with reporting_unwritable(target.parent):
-            sync(path)
+            _sync(path)
             os.replace(path, target)
-            sync(target.parent)
+            _sync(target.parent)
 
 
-def atomic_copy(source: Path, target: Path) -> None:
-    """Copy a file under a temporary name, then rename that to ``target``."""
-    with source.open("rb") as original, _renamed_at_the_end(target) as file:
-        shutil.copyfileobj(original, file)
+def atomic_write(target: Path, data: bytes | str) -> None:
+    """Write a file under a temporary name, then rename it to ``target``."""
+    content = data.encode() if isinstance(data, str) else data
+    make_folder(target.parent)
+    with nullcontext(target) if _is_in_scratch(target) else atomic_path(target) as path:
+        with reporting_unwritable(target.parent), open(path, "wb") as file:
+            file.write(content)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
@@ -104,25 +96,84 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
-    durable, scratch = not is_in_scratch(target), None
+def _scratch(target: Path) -> Iterator[Path]:
+    """A path of the target's name in a new hidden folder beside it, which is removed at the end.
+
+    The folder, ``.NAME.PID-XXXXXXXX.partial``, names the process, so that what a killed one has left can be removed.
+    """
     make_folder(target.parent)
+    with reporting_unwritable(target.parent):
+        if not _is_in_scratch(target):
+            _sweep(target)
+        folder = Path(mkdtemp(prefix=f".{target.name}.{os.getpid()}-", suffix=".partial", dir=target.parent))
+    _OWN.add(folder.name)
     try:
-        with reporting_unwritable(target.parent):
-            if durable:
-                sweep(target)
-            handle, scratch = scratch_file(target)
-            with os.fdopen(handle, "wb") as file:
-                yield file
-                file.flush()
-                if durable:
-                    os.fsync(handle)
-                os.replace(scratch, target)
-            if durable:
-                sync(target.parent)
+        yield folder / target.name
     finally:
-        if scratch is not None:
-            scratch.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        _OWN.discard(folder.name)
+
+
+def _sweep(target: Path) -> None:
+    """Remove what killed processes have left beside ``target``; restore it if one was killed while replacing it."""
+    for path in sorted(target.parent.glob(f"{escape(f'.{target.name}.')}*.partial")):
+        found = _SCRATCH.fullmatch(path.name)
+        if found is None or found[1] != target.name or path.name in _OWN or _is_running(int(found[2])):
+            continue
+        if (path / _OLD).exists() and not os.path.lexists(target):
+            log.warning("%s was being replaced when its process was killed; restored", target)
+            os.rename(path / _OLD, target)
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_running(process: int) -> bool:
+    """Whether another process of this number is running; in containers, this one may have a killed one's number."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        pass
+    return True
+
+
+def _put_folder(path: Path, target: Path) -> None:
+    """Rename a scratch folder to ``target``; what was there goes into the scratch first, and back after an error."""
+    old = path.parent / _OLD
+    if os.path.lexists(target):
+        os.rename(target, old)
+    try:
+        os.rename(path, target)
+    except OSError:
+        if os.path.lexists(old):
+            os.rename(old, target)
+        raise
+    if not _is_in_scratch(target):
+        _sync(target.parent)
+
+
+def _is_in_scratch(path: Path) -> bool:
+    """Whether a path lies in a scratch folder, which becomes durable and gets its name as a whole."""
+    return any(_SCRATCH.fullmatch(part) for part in path.parts[:-1])
+
+
+def final_place(path: Path) -> Path:
+    """The path that one in scratch folders will have."""
+    return Path(*(part for part in path.parts if not _SCRATCH.fullmatch(part)))
+
+
+def _sync(path: Path) -> None:
+    """Force a file, or the names in a folder, onto the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF):  # folders on some file systems
+            raise
+    finally:
+        os.close(handle)
 
 
 @contextmanager

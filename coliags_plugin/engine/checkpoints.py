@@ -20,10 +20,9 @@ from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
-from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.files import atomic_folder, final_place, write_json
 from coliags_plugin.core.json_files import JsonObject, json_text, parse_json
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.scratch import final_place
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers

@@ -8,9 +8,8 @@ import stat
 import numpy as np
 import pytest
 
-from coliags_plugin.core import scratch
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_copy, atomic_folder, atomic_path, atomic_write, write_arrays, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_path, atomic_write, write_arrays, write_json
 from tests.faults import broken_disk, content, fault, killed, no_space
 
 OLD, NEW = b"old" * 5000, b"new!" * 7000
@@ -21,12 +20,6 @@ def write_folder(target):
         atomic_write(folder / "one", NEW)
         (folder / "part").mkdir()
         (folder / "part" / "two").write_bytes(NEW)
-
-
-def copy(target):
-    source = target.parent / "source"
-    source.write_bytes(NEW)
-    atomic_copy(source, target)
 
 
 def by_a_library(target):
@@ -49,20 +42,12 @@ def nothing(target):
 
 WRITERS = {
     "write": (lambda target: atomic_write(target, NEW), old_file),
-    "copy": (copy, old_file),
     "library": (by_a_library, old_file),
     "folder": (write_folder, old_folder),
 }
 cases = pytest.mark.parametrize(
     "write, before", [(write, old) for write, there in WRITERS.values() for old in (there, nothing)]
 )
-exchanges = pytest.mark.parametrize("exchange", [True, False], ids=["exchange", "two renames"])
-
-
-@pytest.fixture
-def without_exchange(monkeypatch, exchange):
-    if not exchange:
-        monkeypatch.setattr(scratch, "_renameat2", lambda: None)
 
 
 def hidden(folder):
@@ -70,9 +55,8 @@ def hidden(folder):
 
 
 @cases
-@exchanges
 @pytest.mark.parametrize("kind", [no_space, broken_disk])
-def test_every_operation_may_fail(tmp_path, write, before, kind, without_exchange):
+def test_every_operation_may_fail(tmp_path, write, before, kind):
     found = []
     for number in range(100):
         target = tmp_path / str(number) / "target"
@@ -97,9 +81,8 @@ def test_every_operation_may_fail(tmp_path, write, before, kind, without_exchang
 
 
 @cases
-@exchanges
 @pytest.mark.thorough
-def test_a_kill_at_every_operation_leaves_old_or_new_and_is_swept(tmp_path, write, before, without_exchange):
+def test_a_kill_at_every_operation_leaves_old_or_new_and_is_swept(tmp_path, write, before):
     reference = tmp_path / "reference"
     before(reference)
     old = content(reference)
@@ -118,10 +101,9 @@ def test_a_kill_at_every_operation_leaves_old_or_new_and_is_swept(tmp_path, writ
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if target.exists():
             assert content(target) in (old, new)
-        elif old is not None:
-            # Between the two renames of a system without an exchange: the next write finds it.
-            assert any(name.endswith(".replaced") for name in hidden(place))
-            scratch.sweep(target)
+        elif old is not None:  # between the two renames of a folder: the next write finds it
+            with pytest.raises(InputError, match="already exists"), atomic_folder(target):
+                pass
             assert content(target) == old
         write(target)
         assert content(target) == new
@@ -145,11 +127,12 @@ def test_scratch_of_a_living_process_is_kept(tmp_path):
 
 
 def test_other_hidden_files_are_left_alone(tmp_path):
-    for name in (".target.partial", ".target.backup.partial", ".other.01234567.partial", ".target.0123456g.partial"):
-        (tmp_path / name).write_text("mine")
-    before = hidden(tmp_path)
+    living = f".target.{os.getppid()}-abcd0123.partial"
+    names = (".target.partial", ".target.backup.partial", ".other.1234567890-abcd0123.partial", living)
+    for name in (*names, ".target.1234567890-abcd0123.partial"):
+        (tmp_path / name).mkdir()
     atomic_write(tmp_path / "target", NEW)
-    assert hidden(tmp_path) == before
+    assert hidden(tmp_path) == sorted(names)
 
 
 @pytest.mark.parametrize(

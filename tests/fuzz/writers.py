@@ -273,7 +273,7 @@ def contents(place: Path) -> dict[str, bytes]:
 
 def scratch(place: Path) -> list[str]:
     """What is being written, or was when its process ended."""
-    return [str(path.relative_to(place)) for path in place.rglob(".*") if path.suffix in (".partial", ".replaced")]
+    return [str(path.relative_to(place)) for path in place.rglob(".*") if path.suffix == ".partial"]
 
 
 def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:

@@ -109,7 +109,7 @@ def test_the_record_is_json_with_version(tmp_path):
 
 def test_what_a_kill_leaves_before_the_record_is_no_hindrance(tmp_path):
     (tmp_path / LOCK_FILE).write_text("")
-    (tmp_path / f".{RECORD_FILE}.0123abcd.partial").write_text("{")
+    (tmp_path / f".{RECORD_FILE}.1234567890-0123abcd.partial").mkdir()
     Record.of(tmp_path).write()
     assert Record.of(tmp_path).stages == {}
     assert sorted(path.name for path in tmp_path.iterdir()) == [LOCK_FILE, RECORD_FILE]

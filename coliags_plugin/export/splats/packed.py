@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_copy, atomic_write
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors, sigmoid
 
 #: Bits of a coordinate, its sign apart; and the most of them behind the binary point: 1/4096 of a scene unit.
@@ -49,7 +49,7 @@ def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "cloud.spz"
         gsply.write_spz(scratch, data, version=_CONTAINER, fractional_bits=bits)
-        atomic_copy(scratch, path)
+        atomic_write(path, scratch.read_bytes())
 
 
 def read_splat_spz(path: Path) -> SplatCloud:

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, make_folder
+from coliags_plugin.core.files import atomic_folder, final_place, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.scratch import final_place
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
 from coliags_plugin.geometry.poses.formats import Format, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
