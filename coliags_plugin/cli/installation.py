@@ -53,14 +53,12 @@ class WeightsCommand:
 
     def run(self) -> None:
         """Install what is missing, and print where the weights of each net are."""
-        from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.metrics.lpips_install import SOURCES, install
         from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
 
         nets = DEFAULT_NETS if self.net is None else tuple(SOURCES) if self.net == "all" else (self.net,)
         folder = None if self.folder is None else self.folder.expanduser().resolve()
-        with progress_callback(after=1.0) as progress:
-            written = install(nets, folder, self.from_folder, progress)
+        written = install(nets, folder, self.from_folder)
         for net in nets:
             backbone, heads = find_weights(net, folder)
             print(f"LPIPS {net}: backbone {backbone}, linear heads {heads}")

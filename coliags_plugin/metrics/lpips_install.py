@@ -1,17 +1,17 @@
-"""The published files of LPIPS weights, and their installation on this machine."""
+"""The published files of LPIPS weights, and their installation; only ``coliags weights`` downloads."""
 
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from coliags_plugin._version import __version__
 from coliags_plugin.core.checksums import file_sha256
-from coliags_plugin.core.download import download
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.core.files import atomic_copy
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.files import atomic_path
 from coliags_plugin.metrics.lpips_weights import (
     BACKBONE_FILES,
     default_folder,
@@ -23,6 +23,9 @@ from coliags_plugin.metrics.lpips_weights import (
 
 _log = logging.getLogger(__name__)
 
+#: Without any byte for so long, a connection counts as lost, seconds.
+_TIMEOUT = 30.0
+
 
 @dataclass(frozen=True)
 class Published:
@@ -32,18 +35,22 @@ class Published:
     known: Mapping[str, str]  # checksum, or the first digits of it, to path in the folder of weights; the URL's first
 
     @property
-    def sha256(self) -> str:
-        """Checksum of what the URL gives, or the first digits of it."""
-        return next(iter(self.known))
-
-    @property
     def path(self) -> str:
         """Path of what the URL gives, in the folder of weights."""
-        return self.known[self.sha256]
+        return next(iter(self.known.values()))
 
     def path_of(self, sha256: str) -> str | None:
         """Path in the folder of weights of a file with this checksum; None where it is not known."""
         return next((path for digits, path in self.known.items() if sha256.startswith(digits)), None)
+
+    def check(self, file: Path, source: object, do: str) -> str:
+        """Path in the folder of weights of a file; InputError where its checksum is not known."""
+        digest = file_sha256(file)
+        path = self.path_of(digest)
+        if path is None:
+            known = (f"{digits}{'...' if len(digits) < len(digest) else ''}" for digits in self.known)
+            raise InputError(f"{source} has the SHA-256 {digest}", " or ".join(known), do)
+        return path
 
 
 def _backbone(net: str, **copies: str) -> Published:
@@ -74,18 +81,18 @@ SOURCES: dict[str, tuple[Published, Published]] = {
 }
 
 
-def install(nets: Sequence[str], folder: Path | None, origin: Path | None, progress: Progress) -> list[Path]:
+def install(nets: Sequence[str], folder: Path | None, origin: Path | None) -> list[Path]:
     """Install the weights of some nets where they are missing, see that their networks load, and name the new files.
 
     Without a folder to look in and install to, they are looked for wherever LPIPS does, and installed where
-    ``torch.hub`` keeps downloads. Without an ``origin`` to copy from they are downloaded, with progress in MiB of each
-    file; nothing is copied unless all that are missing are in it.
+    ``torch.hub`` keeps downloads. Without an ``origin`` to copy from they are downloaded; nothing is copied unless all
+    that are missing are in it.
     """
     if origin is not None and not origin.is_dir():
         raise InputError(f"--from {origin} is not a folder", "a folder with LPIPS weights")
     missing = _missing(nets, folder)
     target = folder or default_folder()
-    written = _download(missing, target, progress) if origin is None else _copy(missing, origin, target)
+    written = _download(missing, target) if origin is None else _copy(missing, origin, target)
     for net in nets:
         try:
             load_network(net, *find_weights(net, folder))
@@ -109,13 +116,24 @@ def _missing(nets: Sequence[str], folder: Path | None) -> list[tuple[str, int]]:
     return sorted(missing, key=lambda item: -item[1])
 
 
-def _download(missing: Sequence[tuple[str, int]], target: Path, progress: Progress) -> list[Path]:
+def _download(missing: Sequence[tuple[str, int]], target: Path) -> list[Path]:
+    """Fetch files by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set."""
+    import pooch
+    import requests
+
     files = [SOURCES[net][index] for net, index in missing]
+    # Some content networks refuse a library's own name.
+    fetch = pooch.HTTPDownloader(timeout=_TIMEOUT, headers={"User-Agent": f"coliags_plugin/{__version__}"})
     for number, file in enumerate(files):
         urls = ", ".join(left.url for left in files[number:])
-        _log.info("download %s", file.url)
         otherwise = f"On a machine with a connection download {urls}, and pass --from FOLDER with them here"
-        download(file.url, target / file.path, file.sha256, progress, otherwise)
+        _log.info("download %s", file.url)
+        with atomic_path(target / file.path) as path:
+            try:
+                fetch(file.url, path, None)
+            except requests.RequestException as error:
+                raise InputError(f"cannot download {file.url}: {error}", "", otherwise) from error
+            file.check(path, file.url, f"Perhaps a proxy answered in the server's place. {otherwise}")
     return [target / file.path for file in files]
 
 
@@ -128,20 +146,12 @@ def _copy(missing: Sequence[tuple[str, int]], origin: Path, target: Path) -> lis
             "",
             f"Download {', '.join(published.url for published in lacking)} into it, or choose another --net",
         )
-    copies = [(file, target / _path(published, file)) for published, file in files if file is not None]
-    for file, path in copies:
-        atomic_copy(file, path)
-    return [path for _, path in copies]
-
-
-def _path(published: Published, file: Path) -> str:
-    """Where a published file belongs in the folder of weights."""
-    digest = file_sha256(file)
-    path = published.path_of(digest)
-    if path is None:
-        raise InputError(
-            f"{file} has the SHA-256 {digest}",
-            " or ".join(f"{digits}{'...' if len(digits) < len(digest) else ''}" for digits in published.known),
-            f"Download {published.url} again",
-        )
-    return path
+    copies = [
+        (file, target / published.check(file, file, f"Download {published.url} again"))
+        for published, file in files
+        if file is not None
+    ]
+    for file, place in copies:
+        with atomic_path(place) as path:
+            shutil.copyfile(file, path)
+    return [place for _, place in copies]

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import signal
 import socket
-import subprocess
-import sys
-import threading
-import time
 
 import pytest
 
@@ -90,7 +85,7 @@ def offline(cache, monkeypatch):
 )
 def test_offline_all_files_of_the_nets_are_named(offline, cache, capsys, choice, nets):
     message = refused(capsys, "weights", "lpips", *choice)
-    assert "no connection to raw.githubusercontent.com" in message and "--from FOLDER" in message
+    assert "cannot download https://raw.githubusercontent.com" in message and "--from FOLDER" in message
     for net, pair in SOURCES.items():
         assert all((published.url in message) == (net in nets) for published in pair)
     assert not [path for path in cache.rglob("*") if path.is_file()]
@@ -102,32 +97,3 @@ def test_bad_input(capsys, cache, tmp_path):
     assert "cannot write" in refused(capsys, "weights", "lpips", "--folder", tmp_path / "file")
     assert run("weights") == 2
     assert run("weights", "lpips", "--net", "resnet") == 2
-
-
-@pytest.mark.thorough
-def test_ctrl_c_keeps_what_arrived(server, cache):
-    server.cuts, server.go_on = [20_000_000, 1_000_000], threading.Event()
-    code = f"""
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by processes that a shell starts in the background
-from coliags_plugin.cli import main
-from coliags_plugin.metrics.lpips_install import SOURCES, Published
-SOURCES["squeeze"] = {SOURCES["squeeze"]!r}
-main(["weights", "lpips", "--net", "squeeze"])
-"""
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    part = cache / f"{NAMES[0]}.part"
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (part.is_file() and part.stat().st_size >= 900_000):
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "coliags: interrupted" in message and "Traceback" not in message
-    assert not (cache / NAMES[0]).exists()
-    kept = part.stat().st_size
-    assert 900_000 <= kept <= 1_000_000
-    assert run("weights", "lpips", "--net", "squeeze") == 0
-    assert server.requests[-1] == ("GET", f"/{NAMES[0]}", f"bytes={kept}-")
-    assert (cache / NAMES[0]).read_bytes() == server.files[f"/{NAMES[0]}"]
-    assert not part.exists()

@@ -60,6 +60,6 @@ def test_no_module_needs_fcntl():
         import sys
         import torch, filelock
         sys.modules["fcntl"] = None
-        import coliags_plugin.comparison.compare, coliags_plugin.core.download, coliags_plugin.pipeline.reconstruct
+        import coliags_plugin.comparison.compare, coliags_plugin.pipeline.reconstruct
     """
     subprocess.run([sys.executable, "-c", code], check=True)
