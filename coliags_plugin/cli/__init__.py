@@ -14,7 +14,6 @@ from coliags_plugin._version import __version__
 from coliags_plugin.cli.arguments import Runnable
 from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
 from coliags_plugin.cli.depth import DepthCommand
-from coliags_plugin.cli.frames import FramesCommand
 from coliags_plugin.cli.hints import hint
 from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
 from coliags_plugin.cli.making_runs import EvaluateCommand, ImportCommand, TrainCommand
@@ -43,7 +42,6 @@ Command = (
     | Annotated[ReportCommand, tyro.conf.subcommand("report")]
     | Annotated[ResultsCommand, tyro.conf.subcommand("results")]
     | Annotated[PosesCommand, tyro.conf.subcommand("poses")]
-    | Annotated[FramesCommand, tyro.conf.subcommand("frames")]
     | Annotated[ListCommand, tyro.conf.subcommand("list")]
     | Annotated[ConfigCommand, tyro.conf.subcommand("config")]
     | Annotated[DataCommand, tyro.conf.subcommand("data")]

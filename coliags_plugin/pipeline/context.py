@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.pipeline.frames import check_stored, read_blurred
+from coliags_plugin.pipeline.frames import read_blurred
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps
 
@@ -75,7 +75,6 @@ class StageContext:
         """The posed scene at the working size without blurred frames, its images read when they are needed."""
         from coliags_plugin.engine.data_formats import open_scene
 
-        check_stored(self.frames)
         size = self.settings.size
         options = ["initial_points=none", "keep_pixels=false", *self.model_options]
         options += [] if size is None else [f"width={size[0]}", f"height={size[1]}"]

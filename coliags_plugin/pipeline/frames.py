@@ -31,8 +31,8 @@ from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
-#: Names within the folder; the last is that of a list of frames that were removed, as the video has them.
-IMAGES, MASK, RECORD, REMOVED = "images", "mask.png", "frames.json", "removed.json"
+#: Names within the folder.
+IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
 MADE = "what `coliags reconstruct` wrote"
 #: Name of a frame's file without its suffix, within its folder.
 FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
@@ -165,16 +165,6 @@ def read_blurred(folder: Path) -> set[str]:
     """Names of the written frames that are blurred; none where there is no record."""
     record = FramesRecord.read(folder)
     return set() if record is None else {frame.name for frame in record.kept if frame.blurred}
-
-
-def check_stored(folder: Path) -> None:
-    """Refuse the folder of frames that were removed: InputError, which tells how to restore them."""
-    if (folder / REMOVED).is_file():
-        raise InputError(
-            f"the frames in {folder} were removed",
-            "frames",
-            "Decode them again with `coliags frames restore OUT VIDEO`",
-        )
 
 
 class FrameSurvey:

@@ -105,18 +105,6 @@ WRITERS: dict[str, Writer] = {
             *("--camera", "PINHOLE", "--params", (i / "params.txt").read_text()),
         )
     ),
-    "frames remove": Writer(
-        lambda i, o: ("frames", "remove", o / "stored", i / "film"),
-        again=(),
-        prepare=lambda i, o: shutil.copytree(i / "stored", o / "stored"),
-        goes_on=True,
-    ),
-    "frames restore": Writer(
-        lambda i, o: ("frames", "restore", o / "removed", i / "film"),
-        again=(),
-        prepare=lambda i, o: shutil.copytree(i / "removed", o / "removed"),
-        goes_on=True,
-    ),
     "depth estimate": Writer(
         lambda i, o: ("depth", "estimate", i / "tube", "--output", o / "depth", "--jobs", 1), goes_on=True
     ),
@@ -137,14 +125,8 @@ WRITERS: dict[str, Writer] = {
 
 def make_inputs(folder: Path) -> None:
     """Make what the commands read."""
-
     from coliags_plugin.export.splats.files import write_splats
-    from coliags_plugin.pipeline.frame_sources import frame_source
-    from coliags_plugin.pipeline.frame_storage import remove_frames
-    from coliags_plugin.pipeline.frames import write_frames
-    from coliags_plugin.pipeline.settings import FrameSettings
     from tests.export.splats.clouds import random_cloud
-    from tests.pipeline.films import film, write_images
     from tests.pipeline.procedures import write_procedure
     from tests.textured_tube import INTRINSICS, write_tube
 
@@ -172,11 +154,6 @@ def make_inputs(folder: Path) -> None:
     _done("import", folder / "wall.ply", "--data", folder / "scene", "--output", folder / "opaque")
     write_tube(folder / "tube", 9)
     write_procedure(folder / "procedure")
-    source = frame_source(write_images(folder / "film", film(range(0, 72, 6))))
-    for name in ("stored", "removed"):
-        write_frames(source, folder / name / "frames", FrameSettings(least_motion=0.0))
-        shutil.copytree(folder / name / "frames" / "images", folder / name / "poses" / "images")
-    remove_frames(folder / "removed", folder / "film")
     (folder / "params.txt").write_text(",".join(map(str, INTRINSICS)))
 
 

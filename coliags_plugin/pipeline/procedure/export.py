@@ -14,7 +14,6 @@ from coliags_plugin.core.files import atomic_folder, link_or_copy, make_folder, 
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.pipeline.frames import check_stored
 from coliags_plugin.pipeline.procedure.contents import ProcedureContents, ProcedureSubmap, common_frames, read_procedure
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES
 
@@ -79,7 +78,6 @@ def _write_submap(
 ) -> bool:
     """Write the files of one sub-map, images by ``copy``; returns whether there is dense depth."""
     segment = procedure.folder / submap.segment
-    check_stored(segment / "frames")
     scene, model = segment / "poses", segment / "poses" / submap.model
     poses = colmap.read(model)
     numbers = {name: number for number, name in submap.names.items()}
