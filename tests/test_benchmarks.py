@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib import import_module
@@ -120,6 +121,33 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_pat
     height, width = 2 * recorded.shape[0], 2 * recorded.shape[1]
     assert drawn.shape == (3 * (24 + height) + 24 + 52, max(2 * width + 8, 480), 3), "three rows, and a scale"
     assert np.abs(cv2.resize(drawn[48 : 48 + height, :width], None, fx=0.5, fy=0.5) - recorded.astype(float)).mean() < 8
+
+
+def test_a_factor_of_depth_is_measured_exactly(run, tmp_path):
+    truth = write_wall(tmp_path / "truth")
+    estimate = Path(shutil.copytree(truth, tmp_path / "estimate"))
+    for path in (estimate / "depths").iterdir():
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.rint(stored * 0.9).astype(np.uint16))
+    run("depth_check", estimate, truth, "--json", tmp_path / "rows.json")
+    plain, scaled = json.loads((tmp_path / "rows.json").read_text())
+    assert plain["median %"] == pytest.approx(10.0, abs=0.01) and plain["bias %"] == pytest.approx(-10.0, abs=0.01)
+    assert plain["of truth %"] == 100.0 and plain["within 5 %"] == 0.0
+    assert scaled["pixels"] == "all, times 1.111"
+    assert scaled["90th %"] < 0.01 and scaled["within 5 %"] == 100.0
+
+
+def test_errors_of_depth_by_confidence(monkeypatch):
+    """A hundredth of a bin's pixels for each hundredth of its confidence is good, and one pixel has no estimate."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    stated = np.repeat([0.25, 0.75], 100)
+    good = np.concatenate([np.arange(100) < 25, np.arange(100) < 75])
+    found = np.stack([np.where(good, 20.0, 30.0), np.full(200, 20.0), stated], axis=1)
+    found[-1, 0] = np.nan
+    _, _, low, high = import_module("depth_check").rows_of(found)
+    assert [row["pixels"] for row in (low, high)] == ["confidence 0.2 to 0.3", "confidence 0.7 to 0.8"]
+    assert low["within 5 %"] == low["stated %"] == 25.0
+    assert high["within 5 %"] == pytest.approx(100 * 75 / 99) and high["stated %"] == 75.0
 
 
 def test_the_training_step_by_stages(run):

@@ -150,12 +150,11 @@ def _methods(folder: Path) -> None:
 
 def _depth_maps(folder: Path, scene: Path) -> None:
     """Depth maps by others, beside images that they belong to."""
-    for part in ("npy", "png", "tiff"):
+    for part in ("npy", "png"):
         (folder / part).mkdir(parents=True)
     for path in sorted((scene / "depths").iterdir())[:3]:
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(folder / f"png/{path.stem[:4]}.png"), depth)
-        cv2.imwrite(str(folder / f"tiff/{path.stem[:4]}.tiff"), depth.astype(np.float32))
         np.save(folder / f"npy/{path.stem[:4]}.npy", depth.astype(np.float32))
 
 

@@ -161,13 +161,6 @@ def _ablation(folder: Path) -> None:
     load_ablation(str(folder / "ablation.yaml"))
 
 
-def _depth_maps(part: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        _command("depth", "check", folder / part, folder / ("npy" if part == "tiff" else "tiff"))
-
-    return read
-
-
 def _prior(folder: Path) -> None:
     import torch
 
@@ -251,8 +244,6 @@ TARGETS: dict[str, Target] = {
     "method": Target("methods", ("coliags.yaml", "3dgs.yaml", "reim-nerf.yaml", "pr-endo.yaml"), _method),
     "benchmark": Target("methods", ("benchmark.yaml",), _benchmark),
     "ablation": Target("methods", ("ablation.yaml",), _ablation),
-    "depth-check-npy": Target("depth-maps", ("npy/*",), _depth_maps("npy")),
-    "depth-check-tiff": Target("depth-maps", ("tiff/*",), _depth_maps("tiff")),
     "prior": Target("depth-maps", ("npy/*", "png/*"), _prior),
     "video": Target("video", ("*",), _video),
     "procedure-page": Target(

@@ -108,9 +108,6 @@ WRITERS: dict[str, Writer] = {
     "depth estimate": Writer(
         lambda i, o: ("depth", "estimate", i / "tube", "--output", o / "depth", "--jobs", 1), goes_on=True
     ),
-    "depth check": Writer(
-        lambda i, o: ("depth", "check", i / "scene", i / "scene", "--html", o / "depth.html"), again=()
-    ),
     "data check": Writer(lambda i, o: ("data", "check", i / "scene", "--html", o / "data.html"), again=()),
     "reconstruct": Writer(
         lambda i, o: (

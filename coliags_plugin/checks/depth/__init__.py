@@ -1,1 +1,0 @@
-"""Comparison of estimated with true depth: ``coliags depth check``."""
