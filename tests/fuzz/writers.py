@@ -92,12 +92,6 @@ WRITERS: dict[str, Writer] = {
     "poses convert (COLMAP)": Writer(
         lambda i, o: ("poses", "convert", i / "poses.json", "-o", o / "model", "--to", "colmap")
     ),
-    "poses align": Writer(
-        lambda i, o: (
-            *("poses", "align", i / "poses.txt", i / "poses.json", "--match", "index"),
-            *("--plot", o / "errors.png"),
-        )
-    ),
     "poses export": Writer(lambda i, o: ("poses", "export", i / "procedure", "--output", o / "exported")),
     "poses sfm": Writer(
         lambda i, o: (

@@ -139,13 +139,10 @@ class PosesAlignCommand:
     """Largest difference of matched timestamps, s."""
     unit: arguments.OptionalText = None
     """Name of the reference's unit of length; default: mm where its format is metric."""
-    plot: arguments.OptionalPath = None
-    """PNG to write: both trajectories from above and from the side, and the errors over frames."""
     estimate_format: OptionalFormat = None
     """Format of the estimate; default: recognised from its content."""
     reference_format: OptionalFormat = None
     """Format of the reference; default: recognised from its content."""
-    overwrite: arguments.Overwrite = False
     json: arguments.AsJson = False
 
     def run(self) -> None:
@@ -153,12 +150,6 @@ class PosesAlignCommand:
         from coliags_plugin.geometry.poses.alignment import align
         from coliags_plugin.geometry.poses.association import associate
 
-        if self.plot is not None and self.plot.suffix.lower() != ".png":
-            raise InputError(f"--plot {self.plot}", "a file name that ends in .png")
-        if self.plot is not None and self.plot.exists() and not self.overwrite:
-            raise InputError(f"{self.plot} already exists", "a new file", "Choose another, or pass --overwrite")
-        if self.plot is not None and (self.plot.is_dir() or self.plot in (self.estimate, self.reference)):
-            raise InputError(f"{self.plot} is a folder or one of the inputs", "another file")
         _, estimate = read_and_log(self.estimate, self.estimate_format)
         kind, reference = read_and_log(self.reference, self.reference_format)
         unit = self.unit or kind.unit
@@ -175,13 +166,7 @@ class PosesAlignCommand:
         worlds = result.world_rotation
         if worlds.reason:
             _LOG.warning("%s: for the rotation error, the rotation is that by %s", worlds.reason, worlds.by)
-        if self.plot is not None:
-            from coliags_plugin.outputs.image_files import write_png
-            from coliags_plugin.outputs.trajectory_plot import plot_trajectory
-
-            write_png(self.plot, plot_trajectory(result, unit))
-        written = [] if self.plot is None else [self.plot]
-        print_summary(text, result.to_json(unit), written=written, as_json=self.json)
+        print_summary(text, result.to_json(unit), as_json=self.json)
 
 
 def _described(result: Alignment, unit: str) -> str:
