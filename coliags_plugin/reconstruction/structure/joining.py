@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.alignment import Similarity
-from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error
+from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error, median_of_points
 from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, adjusted
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
