@@ -1,4 +1,4 @@
-"""Phantoms in every layout, generated once for all tests of data managers."""
+"""The wall in every kind of layout, written once for all tests of data managers."""
 
 from __future__ import annotations
 
@@ -8,16 +8,30 @@ from pathlib import Path
 
 import pytest
 
-from tests.datamanagers.spoiling import KINDS, write_all
+from tests.datamanagers.kinds import KINDS, write_kind
 
 
 @pytest.fixture(scope="session")
-def phantoms(tmp_path_factory) -> dict[str, Path]:
-    """Folder of the phantom by kind; never changed. The scene is in its sub-folder ``KINDS[name].scene``."""
-    return write_all(tmp_path_factory.mktemp("phantoms"))
+def walls(tmp_path_factory) -> Callable[[str], Path]:
+    """The scene's folder by kind, written when first asked for; never changed."""
+    made: dict[str, Path] = {}
+
+    def wall(name: str) -> Path:
+        if name not in made:
+            made[name] = write_kind(tmp_path_factory.mktemp("walls") / name, name)
+        return made[name]
+
+    return wall
 
 
 @pytest.fixture
-def copied(phantoms, tmp_path) -> Callable[[str], Path]:
+def copied(walls, tmp_path) -> Callable[[str], Path]:
     """A copy of the scene of a kind, to be spoilt."""
-    return lambda name: Path(shutil.copytree(phantoms[name], tmp_path / "data")) / KINDS[name].scene
+
+    def copy(name: str) -> Path:
+        whole = walls(name)
+        for _ in Path(KINDS[name].scene).parts:
+            whole = whole.parent
+        return Path(shutil.copytree(whole, tmp_path / "data")) / KINDS[name].scene
+
+    return copy

@@ -1,9 +1,10 @@
-"""The c3vd data manager, from files to scene."""
+"""What is particular to C3VD and C3VDv2: lenses, the octagon, depth, lens files; and options that all formats share."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -14,21 +15,32 @@ import torch
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
+from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.scenes import PointCloud, Scene
+from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
+from coliags_plugin.datamanagers.c3vd.writer import depth_steps
+from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
-from tests.datamanagers.wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
+from tests.datamanagers.kinds import write
+from tests.datamanagers.wall_scenes import (
+    PINHOLE,
+    colors,
+    manager,
+    names,
+    off_wall,
+    video,
+    worst_off_wall,
+    write_undistorted,
+    write_wall,
+)
 
-LENS_NAMES = sorted(LENSES)
+OMNIDIRECTIONAL = LENSES["omnidirectional"]
 
 
-def load(folder: Path, **options) -> Scene:
-    return C3VDDataManager(C3VDSettings(**options)).load(folder)
-
-
-def small(folder: Path, **options) -> Scene:
-    return load(folder, **{"width": 64, "height": 48, **options})
+def load(folder: Path, name: str = "c3vd", **options) -> Scene:
+    return manager(name, **options).load(folder)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +50,7 @@ def undistorted(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory):
-    return write_raw(tmp_path_factory.mktemp("raw") / "wall")
+    return write_wall(tmp_path_factory.mktemp("raw") / "wall", "c3vd-raw", 3, 90, 72)
 
 
 @pytest.fixture
@@ -47,266 +59,253 @@ def mine(undistorted, tmp_path):
     return Path(shutil.copytree(undistorted, tmp_path / "wall"))
 
 
-@pytest.fixture
-def my_raw(raw, tmp_path):
-    return Path(shutil.copytree(raw, tmp_path / "raw_wall"))
+# Depth
 
 
-def names(frames):
-    return [frame.name for frame in frames]
+def test_depth_is_100_mm_in_16_bits():
+    steps = np.array([[0, 1, 32768, 65534, 65535]], np.uint16)
+    depth = C3VD_DEPTH.z_depth(steps)
+    np.testing.assert_array_equal(np.isnan(depth), [[True, False, False, False, True]])
+    np.testing.assert_allclose(depth[0, 1:4], [100 / 65535, 32768 * 100 / 65535, 65534 * 100 / 65535], rtol=1e-6)
+    depth = np.array([[1e-6, 0.5, 42.0, 99.999]])
+    np.testing.assert_allclose(C3VD_DEPTH.z_depth(depth_steps(depth)), depth, atol=100 / 65535)
+    unknown = np.array([[np.nan, 0.0, -3.0, 100.0, np.inf, 250.0]])
+    assert np.isnan(C3VD_DEPTH.z_depth(depth_steps(unknown))).all()
 
 
-def worst_off_wall(frame: Frame) -> float:
-    points = frame.camera.unproject(frame.depth).reshape(-1, 3).double().numpy()
-    return off_wall(points[np.isfinite(points).all(1)]).max()
+def test_simcol_depth_is_read_whole(shared_data):
+    steps = C3VD_DEPTH.read(shared_data / "simcol3d_frames" / "Depth_0000.png")
+    assert steps.shape == (475, 475)
+    assert (steps.min(), steps.max()) == (2048, 43520)
 
 
-def color_errors(frame: Frame) -> np.ndarray:
-    """How far the image is from the wall's pattern at the points that its depth gives."""
-    points = frame.camera.unproject(frame.depth).double().numpy()
-    keep = np.isfinite(points).all(-1)
-    return np.abs(frame.image.numpy()[keep].astype(int) - colors(points)[keep])
+def test_depth_beyond_its_range_is_unknown_and_bounded(mine):
+    for index in range(9):
+        steps = np.full((48, 64), 65535, np.uint16)
+        steps[:, :32], steps[:, :8] = 30000, 0
+        cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), steps)
+    scene = load(mine)
+    depth, bound = scene.train[0].depth, scene.train[0].depth_at_least
+    assert torch.isnan(depth[:, :8]).all() and torch.isnan(depth[:, 32:]).all() and torch.isnan(bound[:, :32]).all()
+    torch.testing.assert_close(depth[:, 8:32], torch.full((48, 24), 30000 * 100 / 65535))
+    torch.testing.assert_close(bound[:, 32:], torch.full((48, 32), 100.0))
+    assert scene.provenance["invalid_depth_share"] == pytest.approx(0.625)
 
 
-class TestScene:
-    def test_frames_are_what_was_written(self, undistorted):
-        scene = small(undistorted)
-        assert scene.name == "wall"
-        assert names(scene.test_sets["test"]) == ["0000_color", "0008_color"]
-        assert names(scene.train) == [f"{index:04d}_color" for index in range(1, 8)]
-        frame = scene.train[2]
-        assert frame.index == 3
-        camera = frame.camera
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (61.0, 55.0, 33.5, 21.5)
-        np.testing.assert_allclose(camera.camera_to_world, poses(9)[3], atol=1e-6)
-        assert frame.image.dtype == torch.uint8
-        assert frame.depth.dtype == torch.float32
-        assert frame.mask is None
-        assert frame.seen is None
-        assert worst_off_wall(frame) < 0.002
-        assert color_errors(frame).max() <= 1
-
-    def test_initial_points_lie_on_the_wall_and_carry_its_colours(self, undistorted):
-        points = small(undistorted).points
-        assert len(points) == 7 * 64 * 48
-        assert off_wall(points.positions.double().numpy()).max() < 0.002
-        assert np.abs(points.colors.numpy().astype(int) - colors(points.positions.double().numpy())).max() <= 1
-
-    def test_test_frames_leave_no_points(self, undistorted, tmp_path):
-        folder = Path(shutil.copytree(undistorted, tmp_path / "wall"))
-        for index in range(9):
-            if index % 8:
-                cv2.imwrite(str(folder / f"depths/{index:04d}_depth.png"), np.zeros((48, 64), np.uint16))
-        with pytest.raises(InputError, match="none of the 7 training frames has a valid depth"):
-            small(folder)
-
-    def test_points_count_and_seed(self, undistorted):
-        first, again = (small(undistorted, points_count=500).points.positions for _ in range(2))
-        assert len(first) == 500
-        assert torch.equal(first, again)
-        assert not torch.equal(first, small(undistorted, points_count=500, seed=1).points.positions)
-
-    @pytest.mark.parametrize("size", [(32, 24), (50, 30), (128, 96)])
-    def test_other_sizes_keep_the_geometry(self, undistorted, size):
-        scene = load(undistorted, width=size[0], height=size[1])
-        frame = scene.train[4]
-        assert frame.image.shape == (size[1], size[0], 3)
-        assert frame.depth.shape == (size[1], size[0])
-        assert frame.camera.cx == pytest.approx(33.5 * size[0] / 64)
-        # Nearest depth lies up to half a stored pixel beside its ray: on this slope a few tenths of a millimetre.
-        assert worst_off_wall(frame) < 0.3
-        assert color_errors(frame).max() < 12
-
-    @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files through /proc")
-    def test_no_file_stays_open(self, undistorted):
-        small(undistorted)
-        before = len(os.listdir("/proc/self/fd"))
-        small(undistorted)
-        assert len(os.listdir("/proc/self/fd")) <= before
+# Lenses
 
 
-class TestRaw:
-    @pytest.mark.parametrize("name", LENS_NAMES)
-    def test_undistorted_geometry_is_right_through_every_lens(self, tmp_path, name):
-        folder = write_raw(tmp_path / "wall", LENSES[name].resized(270, 216), count=2)
-        scene = load(folder, width=90, height=72, lens=name)
-        frame = scene.train[0]
-        k = LENSES[name].resized(90, 72).pinhole
-        camera = frame.camera
-        assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
-        assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy))
-        assert worst_off_wall(frame) < 0.2
-        assert color_errors(frame).max() < 12
-        assert off_wall(scene.points.positions.double().numpy()).max() < 0.2
-        assert scene.provenance["lens"] == name
-
-    def test_the_wrong_lens_shows(self, tmp_path):
-        folder = write_raw(tmp_path / "wall", LENSES["omnidirectional"].resized(270, 216), count=2)
-        assert worst_off_wall(load(folder, width=90, height=72, lens="legacy-pinhole").train[0]) > 0.3
-
-    def test_the_wide_view_has_a_mask(self, raw):
-        frame = load(raw, width=90, height=72, focal_scale=0.4).train[0]
-        assert 0.5 < frame.mask.float().mean() < 0.99
-        assert torch.isnan(frame.depth[~frame.mask]).all()
-        assert frame.image[frame.mask].amax(dim=-1).min() > 0
-        assert color_errors(frame).mean() < 3.0
-        assert load(raw, width=90, height=72).train[0].mask is None
-
-    def test_the_octagon_can_be_left_in(self, raw):
-        masked, whole = (load(raw, width=90, height=72, focal_scale=0.4, mask=mask).train[0] for mask in (True, False))
-        assert whole.mask.sum() > masked.mask.sum()
-
-    def test_depth_beyond_its_range_is_unknown(self, my_raw):
-        steps = np.full((216, 270), 65535, np.uint16)
-        steps[:, :135] = 30000
-        cv2.imwrite(str(my_raw / "0001_depth.tiff"), steps)
-        frame = load(my_raw, width=90, height=72).train[0]
-        depth, bound = frame.depth, frame.depth_at_least
-        assert torch.isnan(depth[:, 60:]).all()
-        assert torch.isnan(bound[:, :30]).all()
-        torch.testing.assert_close(bound[:, 60:], torch.full((72, 30), 100.0))
-        torch.testing.assert_close(depth[:, :30], torch.full((72, 30), 30000 * 100 / 65535))
-
-    def test_other_files_of_the_release_are_left_alone(self, my_raw):
-        for name in ("0001_flow.tiff", "0000_normals.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png"):
-            (my_raw / name).write_bytes(b"")
-        assert len(load(my_raw, width=45, height=36).train) == 7
+@pytest.mark.parametrize("name", LENSES)
+def test_undistorted_geometry_is_right_through_every_lens_and_no_other(tmp_path, name):
+    folder = write_wall(tmp_path / "wall", "c3vd-raw", 2, 270, 216, lens=LENSES[name].resized(270, 216))
+    scene = load(folder, width=90, height=72, lens=name)
+    k, camera = LENSES[name].resized(90, 72).pinhole, scene.train[0].camera
+    assert vars(camera.intrinsics) == pytest.approx(vars(k))
+    assert worst_off_wall(scene.train[0]) < 0.2 and scene.provenance["lens"] == name
+    points = scene.points.positions.double().numpy()
+    assert np.abs(scene.points.colors.numpy().astype(int) - colors(points)).max() < 12
+    other = "omnidirectional" if name == "legacy-pinhole" else "legacy-pinhole"
+    assert worst_off_wall(load(folder, width=90, height=72, lens=other).train[0]) > 0.3
 
 
-class TestSplit:
-    def test_block(self, undistorted):
-        scene = small(undistorted, split="block", block=(0.5, 0.8))
-        assert [frame.index for frame in scene.test_sets["test"]] == [4, 5, 6]
-        assert scene.provenance["split"]["block"] == [0.5, 0.8]
-
-    def test_subsampling_comes_before_the_split(self, undistorted):
-        scene = small(undistorted, frame_step=2, max_frames=4)
-        assert [frame.index for frame in scene.test_sets["test"]] == [0]
-        assert [frame.index for frame in scene.train] == [2, 4, 6]
-
-    def test_no_training_frame_left(self, undistorted):
-        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves no training frames"):
-            small(undistorted, max_frames=1)
-
-    @pytest.mark.parametrize("options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}])
-    def test_settings_that_make_no_sense(self, options):
-        with pytest.raises(ValidationError):
-            C3VDSettings(**options)
+def test_a_wide_view_is_masked_outside_the_octagon(raw):
+    assert load(raw).train[0].mask is None
+    frame, whole = (load(raw, focal_scale=0.4, mask=mask).train[0] for mask in (True, False))
+    assert 0.5 < frame.mask.float().mean() < whole.mask.float().mean() < 0.99
+    assert torch.isnan(frame.depth[~frame.mask]).all()
+    assert frame.image[frame.mask].amax(dim=-1).min() > 0
 
 
-class TestExtras:
-    @pytest.fixture
-    def with_rotation(self, mine):
-        write_undistorted(mine / "rotation", count=3)
-        (mine / "rotation" / "seen").mkdir()
-        seen = np.zeros((48, 64), np.uint8)
-        seen[:, 32:] = 255
-        cv2.imwrite(str(mine / "rotation" / "seen" / "0001_seen.png"), seen)
-        return mine
-
-    def test_rotation_is_a_test_set(self, with_rotation):
-        scene = load(with_rotation, width=32, height=24)
-        rotation = scene.test_sets["rotation"]
-        assert names(rotation) == ["rotation-0000_color", "rotation-0001_color", "rotation-0002_color"]
-        assert rotation[0].seen is None
-        assert rotation[1].seen[:, 16:].all()
-        assert not rotation[1].seen[:, :16].any()
-        everything = [frame for frames in (scene.train, *scene.test_sets.values()) for frame in frames]
-        assert len(set(names(everything))) == len(everything)
-        assert scene.provenance["frames"] == {"in_sequence": 9, "train": 7, "test": 2, "rotation": 3}
-        assert scene.provenance["rotation"]["layout"] == "undistorted"
-
-    def test_marks_of_frames_that_do_not_exist(self, with_rotation):
-        shutil.copy(with_rotation / "rotation/seen/0001_seen.png", with_rotation / "rotation/seen/0007_seen.png")
-        with pytest.raises(InputError, match=r"0007_seen.png, but there are 3 frames"):
-            small(with_rotation)
-
-    def test_a_spoilt_rotation_set_is_an_error_of_its_own(self, with_rotation):
-        (with_rotation / "rotation" / "camera.json").unlink()
-        with pytest.raises(InputError, match=r"rotation has images but no camera.json"):
-            small(with_rotation)
+@pytest.mark.parametrize(("layout", "name"), [("c3vd-raw", "c3vd"), ("c3vd-v2", "c3vd-v2")])
+def test_other_files_of_the_release_are_left_alone(tmp_path, layout, name):
+    folder = write_wall(tmp_path, layout, 3, 45, 36)
+    for other in ("0001_flow.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png", "diffuse/0000_x.tiff"):
+        (folder / other).parent.mkdir(exist_ok=True)
+        (folder / other).write_bytes(b"")
+    assert len(video(load(folder, name))) == 3
 
 
-class TestWithoutDepth:
-    @pytest.fixture
-    def points(self):
-        return PointCloud(torch.rand(50, 3), torch.randint(0, 256, (50, 3), dtype=torch.uint8))
-
-    def test_points_come_from_the_scenes_ply(self, tmp_path, points):
-        scene = small(write_undistorted(tmp_path / "wall", depths=None, points=points))
-        assert all(frame.depth is None for frame in scene.train)
-        torch.testing.assert_close(scene.points.positions, points.positions)
-        assert torch.equal(scene.points.colors, points.colors)
-        assert scene.provenance["points"]["source"] == "points3D.ply"
-        assert scene.provenance["invalid_depth_share"] is None
-
-    def test_points_without_colour(self, tmp_path):
-        folder = write_undistorted(tmp_path / "wall", depths=None, points=PointCloud(torch.rand(5, 3)))
-        assert small(folder).points.colors is None
-
-    def test_points_from_a_named_file(self, mine, points, tmp_path):
-        np.savez(mine / "cloud.npz", positions=points.positions.numpy())
-        scene = small(mine, initial_points="file", points_file="cloud.npz")
-        torch.testing.assert_close(scene.points.positions, points.positions)
-        assert scene.train[0].depth is not None
-        elsewhere = (mine / "cloud.npz").rename(tmp_path / "elsewhere.npz")
-        other = small(mine, initial_points="file", points_file=str(elsewhere), points_count=7)
-        assert len(other.points) == 7
-        assert other.provenance["points"]["source"] == "elsewhere.npz"
-
-    def test_a_missing_file(self, mine):
-        with pytest.raises(InputError, match=r"no file .*nothing.ply"):
-            small(mine, initial_points="file", points_file="nothing.ply")
+def test_both_reading_orders_of_the_poses_are_known(walls):
+    for kind, order in (("c3vd-raw", "column-major"), ("c3vd-raw-old", "row-major")):
+        assert load(walls(kind)).provenance["pose_convention"]["order"] == order
 
 
-class TestProvenance:
-    def test_says_where_everything_came_from(self, raw):
-        scene = load(raw, width=90, height=72)
-        said = scene.provenance
-        json.dumps(said, allow_nan=False)
-        assert said["dataset"] == "c3vd"
-        assert said["layout"] == "raw"
-        assert said["lens"] == "omnidirectional"
-        assert said["stored_size"] == [270, 216]
-        assert said["split"]["name"] == "every-8th"
-        assert said["split"]["train"] == names(scene.train)
-        assert said["split"]["test_sets"] == {"test": ["0000_color", "0008_color"]}
-        assert said["frames"] == {"in_sequence": 9, "train": 7, "test": 2}
-        assert said["intrinsics"]["cx"] == scene.train[0].camera.cx
-        assert said["points"] == {"source": "depth of the training frames", "count": len(scene.points), "seed": 0}
-        assert said["invalid_depth_share"] == 0.0
+# C3VDv2's lens
 
-    def test_share_of_unknown_depth(self, mine):
-        for index in range(9):
-            steps = np.full((48, 64), 30000, np.uint16)
-            steps[:12] = 65535
-            cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), steps)
-        assert small(mine).provenance["invalid_depth_share"] == pytest.approx(0.25)
+#: As its file has it: pixel centres at integers.
+CANDIDATE = {**vars(CANDIDATE_LENS), "cx": CANDIDATE_LENS.cx - 0.5, "cy": CANDIDATE_LENS.cy - 0.5, "a1": 0.0}
 
-    def test_fingerprint_changes_with_the_data_only(self, undistorted, mine):
-        def fingerprint(folder):
-            return small(folder).provenance["fingerprint"]
 
-        original = fingerprint(undistorted)
-        assert fingerprint(mine) == original
-        (mine / "notes.txt").write_text("hello")
-        assert fingerprint(mine) == original
-        cv2.imwrite(str(mine / "images/0003_color.png"), np.zeros((48, 64, 3), np.uint8))
-        changed = fingerprint(mine)
-        assert changed != original
-        text = (mine / "camera_pose.txt").read_text()
-        (mine / "camera_pose.txt").write_text(text + "\n")
-        assert fingerprint(mine) not in (original, changed)
+def as_text(form: str = "{} = {!r}", **changes: float) -> str:
+    values = {**CANDIDATE, **changes}
+    return "\n".join(form.format(name, values[name]) for name in ORDER)
+
+
+@pytest.mark.parametrize(
+    ("lens", "has_file", "source"),
+    [
+        ("file", False, "candidate calibration, unverified"),
+        ("file", True, "camera_intrinsics.txt"),
+        ("v2", True, "candidate calibration, unverified"),
+        ("v1", True, "C3VD's omnidirectional calibration"),
+    ],
+)
+def test_the_option_and_the_file_decide_on_the_lens(tmp_path, caplog, lens, has_file, source):
+    used = OMNIDIRECTIONAL if lens == "v1" else CANDIDATE_LENS
+    folder = write_wall(tmp_path / "c1/wall", "c3vd-v2", 3, 90, 72, lens=used.resized(90, 72))
+    (folder / "camera_intrinsics.txt").unlink()
+    if lens == "v2":
+        (folder / "camera_intrinsics.txt").write_text("nobody knows")
+    elif has_file:  # up to two folders up
+        (tmp_path / "camera_intrinsics.txt").write_text(as_text())
+    scene = load(folder, "c3vd-v2", lens=lens)
+    assert worst_off_wall(scene.train[0]) < 0.5
+    assert scene.provenance["lens_source"].endswith(source)
+    assert ("unverified" in caplog.text) == (not has_file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        as_text(),
+        as_text("{}: {!r}"),
+        as_text("{}\t{!r}").upper(),
+        "# calibration\n" + as_text() + "  # the last one",
+        json.dumps({name: CANDIDATE[name] for name in ORDER}),
+        "\n".join(line for line in as_text().splitlines() if line[:2] not in ("wi", "he", "a1", "c ", "d ", "e ")),
+        as_text("{1!r}"),
+        "\n".join(as_text("{1!r}").splitlines()[2:]),
+    ],
+    ids=["equals", "colons", "tabs", "comments", "json", "only what is needed", "twelve numbers", "ten numbers"],
+)
+def test_unmistakable_lens_files(tmp_path, text):
+    (tmp_path / "camera_intrinsics.txt").write_text(text)
+    assert read_camera_intrinsics(tmp_path / "camera_intrinsics.txt") == CANDIDATE_LENS
+
+
+@pytest.mark.parametrize(
+    ("text", "seen"),
+    [
+        ("see the paper", "text without names"),
+        ("767.7 0 677.7 0 767.7 543.1 0 0 1", "9 numbers without names"),
+        (as_text().replace("a2 = ", "k2 = "), "no a2; unknown k2"),
+        (as_text() + "\ncx = 1", "twice cx"),
+        (as_text(cx=337.0), "a centre (337, 543.058) far from the middle of 1350 x 1080"),
+        (as_text(a0=4.0), "a focal length a0 = 4"),
+        (as_text(a1=0.5), "a1 = 0.5"),
+        (as_text(c=0.0, d=1.0), "c, d, e = 0, 1, 0"),
+        (as_text(width=1350.5), "1350.5 x 1080 pixels"),
+        (as_text(a3=float("inf")), "no a3"),
+        ("\n".join(as_text("{1!r}").splitlines()[::-1]), "an image of"),
+    ],
+)
+def test_whatever_else_is_refused_and_the_way_out_named(tmp_path, text, seen):
+    (tmp_path / "camera_intrinsics.txt").write_text(text)
+    with pytest.raises(InputError, match="is ambiguous or implausible") as refused:
+        read_camera_intrinsics(tmp_path / "camera_intrinsics.txt")
+    assert seen in str(refused.value)
+    assert re.search(r"camera_intrinsics\.txt .*datamanager.lens=v2.*or v1", str(refused.value))
+
+
+# Splits, rotation views, points and provenance, which all formats share
+
+
+@pytest.mark.parametrize(
+    ("options", "train", "test"),
+    [
+        ({"split": "block", "block": (0.5, 0.8)}, [0, 1, 2, 3, 7, 8], [4, 5, 6]),
+        ({"frame_step": 2, "max_frames": 4}, [2, 4, 6], [0]),
+        ({"split": "all-train"}, [*range(9)], []),
+    ],
+)
+def test_options_choose_the_split(undistorted, options, train, test):
+    scene = load(undistorted, **options)
+    assert [frame.index for frame in scene.train] == train
+    assert [frame.index for frame in scene.test_sets.get("test", [])] == test
+    split = scene.provenance["split"]
+    assert split["name"] == options.get("split", "every-8th")
+    assert split["train"] == names(scene.train) and split.get("block", [0.5, 0.8]) == [0.5, 0.8]
+    assert split["test_sets"] == {name: names(frames) for name, frames in scene.test_sets.items()}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_frames": 1}, r"split 'every-8th' of 1 frames .* leaves no training frames"),
+        ({"split": "own"}, "does not specify its test frames"),
+        ({"initial_points": "file", "points_file": "nothing.ply"}, r"no file .*nothing\.ply"),
+    ],
+)
+def test_options_that_the_scene_does_not_allow(undistorted, options, message):
+    with pytest.raises(InputError, match=message):
+        load(undistorted, **options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}, {"width": 5}]
+)
+def test_settings_that_make_no_sense(options):
+    with pytest.raises(ValidationError):
+        C3VDSettings(**options)
+
+
+def test_rotation_views_are_a_test_set_of_their_own(walls):
+    scene = load(walls("c3vd"))
+    assert names(scene.test_sets["rotation"]) == ["rotation-0000_color", "rotation-0001_color"]
+    assert worst_off_wall(scene.test_sets["rotation"][1]) < 0.002
+    assert scene.provenance["frames"] == {"in_sequence": 11, "train": 9, "test": 2, "rotation": 2}
+    assert scene.provenance["rotation"]["layout"] == "undistorted"
+    assert scene.provenance["intrinsics"]["cx"] == scene.train[0].camera.cx
+    assert scene.provenance["points"] == {"source": "depth of the training frames", "count": 11520, "seed": 0}
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_points_come_from_the_scenes_ply_where_there_is_no_depth(tmp_path, colored):
+    points = PointCloud(torch.rand(50, 3), torch.randint(0, 256, (50, 3), dtype=torch.uint8) if colored else None)
+    scene = load(write_undistorted(tmp_path / "wall", depths=None, points=points))
+    assert all(frame.depth is None for frame in scene.train)
+    torch.testing.assert_close(scene.points.positions, points.positions)
+    assert torch.equal(scene.points.colors, points.colors) if colored else scene.points.colors is None
+    assert scene.provenance["points"]["source"] == "points3D.ply" and "sha256" in scene.provenance["points"]
+    assert scene.provenance["invalid_depth_share"] is None
+
+
+def test_points_come_from_a_named_file(mine, tmp_path):
+    positions = np.random.default_rng(0).random((50, 3))
+    np.savez(mine / "cloud.npz", positions=positions)
+    scene = load(mine, initial_points="file", points_file="cloud.npz")
+    np.testing.assert_allclose(scene.points.positions, positions, atol=1e-7)
+    elsewhere = (mine / "cloud.npz").rename(tmp_path / "elsewhere.npz")
+    other = load(mine, initial_points="file", points_file=str(elsewhere), points_count=7)
+    assert len(other.points) == 7 and other.provenance["points"]["source"] == "elsewhere.npz"
+    write_ply(mine / "points3D.ply", point_properties(positions))
+    assert len(load(mine, initial_points="data").points) == 50
+    assert len(load(mine, initial_points="none").points) == 0
+
+
+def test_test_frames_leave_no_points(mine):
+    for index in range(1, 8):
+        cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), np.zeros((48, 64), np.uint16))
+    with pytest.raises(InputError, match="none of the 7 training frames has a valid depth"):
+        load(mine)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files through /proc")
+def test_no_file_stays_open(undistorted):
+    load(undistorted)
+    before = len(os.listdir("/proc/self/fd"))
+    load(undistorted)
+    assert len(os.listdir("/proc/self/fd")) <= before
 
 
 def test_a_folder_of_something_else(tmp_path):
     for index in range(9):
-        (tmp_path / f"{index}.txt").touch()
+        write(f"{index}.txt", "")(tmp_path)
     with pytest.raises(InputError, match=r"holds 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 4 more"):
-        small(tmp_path)
+        load(tmp_path)
 
 
-def test_what_the_writer_refuses(tmp_path):
+def test_what_the_writer_refuses(tmp_path, undistorted):
     with pytest.raises(InputError, match="9 images, 9 poses and 1 depths"):
         write_undistorted(tmp_path / "wall", depths=[np.ones((48, 64))])
     assert not (tmp_path / "wall").exists()
@@ -315,7 +314,5 @@ def test_what_the_writer_refuses(tmp_path):
         write_undistorted(tmp_path / "wall", count=2)
     write_undistorted(tmp_path / "wall", count=3, overwrite=True)
     assert len(list((tmp_path / "wall" / "images").iterdir())) == 3
-
-
-def test_the_writers_intrinsics_are_opencvs(undistorted):
     assert read_intrinsics(undistorted / "camera.json") == PINHOLE
+    assert off_wall(load(undistorted).points.positions.numpy()).max() < 0.002

@@ -83,24 +83,24 @@ def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
     assert "1 of 4 points" in caplog.text
 
 
-def test_files_that_hold_no_points(tmp_path):
-    with pytest.raises(InputError, match="no file"):
-        read_points(tmp_path / "none.ply", 10, rng())
-    (tmp_path / "bad.ply").write_text("not a ply")
-    with pytest.raises(InputError, match="no PLY header"):
-        read_points(tmp_path / "bad.ply", 10, rng())
-    (tmp_path / "bad.npz").write_text("not an npz")
-    with pytest.raises(InputError, match="cannot read"):
-        read_points(tmp_path / "bad.npz", 10, rng())
-    np.savez(tmp_path / "other.npz", xyz=np.ones((2, 3)))
-    with pytest.raises(InputError, match="positions"):
-        read_points(tmp_path / "other.npz", 10, rng())
-    np.savez(tmp_path / "flat.npz", positions=np.ones((2, 2)))
-    with pytest.raises(InputError, match="shape"):
-        read_points(tmp_path / "flat.npz", 10, rng())
-    np.savez(tmp_path / "float.npz", positions=np.ones((2, 3)), colors=np.ones((2, 3)))
-    with pytest.raises(InputError, match="uint8"):
-        read_points(tmp_path / "float.npz", 10, rng())
-    (tmp_path / "p.obj").write_text("v 0 0 0")
-    with pytest.raises(InputError, match="neither"):
-        read_points(tmp_path / "p.obj", 10, rng())
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.ply", None, "no file"),
+        ("bad.ply", "not a ply", "no PLY header"),
+        ("bad.npz", "not an npz", "cannot read"),
+        ("other.npz", {"xyz": np.ones((2, 3))}, "positions"),
+        ("flat.npz", {"positions": np.ones((2, 2))}, "shape"),
+        ("words.npz", {"positions": np.full((2, 3), "a")}, "numbers"),
+        ("float.npz", {"positions": np.ones((2, 3)), "colors": np.ones((2, 3))}, "uint8"),
+        ("nan.npz", {"positions": np.full((2, 3), np.nan)}, "holds no points"),
+        ("p.obj", "v 0 0 0", "neither"),
+    ],
+)
+def test_files_that_hold_no_points(tmp_path, name, content, message):
+    if isinstance(content, dict):
+        np.savez(tmp_path / name, **content)
+    elif content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_points(tmp_path / name, 10, rng())

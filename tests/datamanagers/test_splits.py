@@ -1,13 +1,17 @@
-"""Which frames are held out."""
+"""Which frames are held out, and the unit of length that a scene states."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.splits import held_out, split_options
+from coliags_plugin.datamanagers.units import read_unit, write_unit
 
 
 @pytest.mark.parametrize(
@@ -24,15 +28,6 @@ from coliags_plugin.datamanagers.splits import held_out, split_options
 )
 def test_frames_that_are_held_out(arguments, test):
     assert np.flatnonzero(held_out(*arguments)).tolist() == test
-
-
-@pytest.mark.parametrize(
-    # docs/layouts/c3vd.md 6: frames and test frames of the official sequences
-    ("frames", "test"),
-    [(276, 35), (765, 96), (370, 47), (1142, 143), (595, 75), (730, 92), (61, 8), (194, 25), (103, 13), (597, 75)],
-)
-def test_counts_of_the_official_sequences(frames, test):
-    assert held_out("every-8th", frames).sum() == test
 
 
 @given(count=st.integers(1, 300), start=st.floats(0, 0.9), length=st.floats(0.05, 0.5))
@@ -52,3 +47,14 @@ def test_a_block_is_one_stretch_of_about_its_share(count, start, length):
 )
 def test_options_choose_a_split(arguments, options):
     assert split_options(*arguments) == options
+
+
+def test_a_stated_unit_is_read_back_and_else_that_of_the_format(tmp_path: Path) -> None:
+    assert read_unit(tmp_path, otherwise="mm") == "mm"
+    assert read_unit(tmp_path) == "unknown"
+    for unit in ("mm", "cm", "m", "unknown"):
+        write_unit(tmp_path, unit)  # type: ignore[arg-type]
+        assert read_unit(tmp_path, otherwise="mm") == unit
+    (tmp_path / "unit.txt").write_text("inches\n")
+    with pytest.raises(InputError, match="inches"):
+        read_unit(tmp_path)

@@ -1,4 +1,4 @@
-"""A tilted wall with a printed pattern, written in C3VD's layouts: every depth and colour has a closed form."""
+"""A tilted wall with a printed pattern, in every format: each depth, colour and pose has a closed form."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import tests.layouts  # noqa: F401  (registers them)
+from coliags_plugin.config.registry import datamanagers, phantom_layouts
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.datamanagers.c3vd.writer import depth_steps, write_c3vd_scene
-from coliags_plugin.geometry.lenses.models import LENSES, Lens, PinholeLens, octagon_mask
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.phantom.layouts.base import Layout, PhantomFrame, WallPoints
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])
 OFFSET = 40.0
 #: Off-centre and not square, so that whoever confuses something is caught.
 PINHOLE = Intrinsics(61.0, 55.0, 33.5, 21.5, 64, 48)
+#: Of the scenes in every format.
+WIDTH, HEIGHT, FRAMES = 40, 32, 11
+#: z-depth from which the wall counts as absent, mm: below the range of every format.
+FAR = 99.0
 
 
 def poses(count: int) -> np.ndarray:
@@ -44,8 +53,9 @@ def colors(points: np.ndarray) -> np.ndarray:
 
 
 def off_wall(points: np.ndarray) -> np.ndarray:
-    """Distance from the wall, mm. [N, 3] -> [N]"""
-    return np.abs(points @ NORMAL - OFFSET) / np.linalg.norm(NORMAL)
+    """Distance of points that are not NaN from the wall, mm. [N, 3] -> [K]"""
+    distance = np.abs(np.asarray(points, np.float64).reshape(-1, 3) @ NORMAL - OFFSET) / np.linalg.norm(NORMAL)
+    return distance[np.isfinite(distance)]
 
 
 def rays(camera: Lens | Intrinsics) -> np.ndarray:
@@ -55,31 +65,86 @@ def rays(camera: Lens | Intrinsics) -> np.ndarray:
     return lens.unproject(np.stack([columns.ravel(), rows.ravel()], 1)).reshape(lens.height, lens.width, 3)
 
 
+def seen_from(frame: Frame, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and colours that a frame should have at a pose. [H, W], [H, W, 3]"""
+    return look(pose, rays(frame.camera.intrinsics))
+
+
+def worst_off_wall(frame: Frame) -> float:
+    """Largest distance of a frame's depth from the wall, mm."""
+    return off_wall(frame.camera.unproject(frame.depth).numpy()).max()
+
+
+def video(scene: Scene) -> list[Frame]:
+    """Training and test frames in the order of the video."""
+    return scene.video
+
+
+def names(frames: list[Frame]) -> list[str]:
+    return [frame.name for frame in frames]
+
+
+def manager(name: str, **options) -> RecordedDataManager:
+    """The data manager of a format."""
+    kind = datamanagers.get(name)
+    return kind(kind.Settings(**options))
+
+
 def write_undistorted(folder: Path, count: int = 9, width: int = 64, height: int = 48, **options) -> Path:
-    """The wall in the undistorted layout."""
+    """The wall in C3VD's undistorted layout, through :data:`PINHOLE`."""
     intrinsics = replace(PINHOLE, width=width, height=height)
-    directions = rays(intrinsics)
-    views = [look(pose, directions) for pose in poses(count)]
+    views = [look(pose, rays(intrinsics)) for pose in poses(count)]
     depths = options.pop("depths", [depth for depth, _ in views])
     write_c3vd_scene(folder, [color for _, color in views], poses(count), intrinsics, depths=depths, **options)
     return folder
 
 
-def write_raw(
-    folder: Path, lens: Lens | None = None, count: int = 9, row_major: bool = False, padded: bool = True
+def layout_of(name: str) -> Layout:
+    """The writer of a layout."""
+    return phantom_layouts.get(name)()
+
+
+def write_wall(
+    folder: Path, layout: str, frames: int = FRAMES, width: int = WIDTH, height: int = HEIGHT, lens: Lens | None = None
 ) -> Path:
-    """The wall in the raw layout, dark outside the octagon."""
-    lens = lens or LENSES["omnidirectional"].resized(270, 216)
-    directions = rays(lens)
-    octagon = octagon_mask(lens.width, lens.height)
-    folder.mkdir(parents=True)
-    for index, pose in enumerate(poses(count)):
-        depth, color = look(pose, directions)
-        number = f"{index:04d}" if padded else str(index)
-        cv2.imwrite(str(folder / f"{number}_color.png"), np.where(octagon[..., None], color, 0)[..., ::-1])
-        steps = np.where(octagon, depth_steps(depth), 0).astype(np.uint16)
-        cv2.imwrite(str(folder / f"{index:04d}_depth.tiff"), steps)
-    matrices = poses(count) if row_major else poses(count).transpose(0, 2, 1)
-    lines = [",".join(f"{number:.9g}" for number in matrix.ravel()) for matrix in matrices]
-    (folder / "pose.txt").write_text("\n".join(lines) + "\n")
+    """The wall in a layout: turned views and points, if it has any, and seen masks whose left half is white."""
+    writer = layout_of(layout)
+    nominal, lit = writer.lens(width, height)
+    lens = lens or nominal
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
+    parts = {"video": poses(frames)} | (
+        {"rotation": poses(frames)[[2 % frames, 6 % frames]] @ turn} if writer.has_rotation else {}
+    )
+    directions, seen = rays(lens), np.zeros((height, width), np.uint8)
+    seen[:, : width // 2] = 255
+    for part, matrices in parts.items():
+        for index, matrix in enumerate(matrices):
+            depth, color = look(matrix, directions)
+            depth = np.where(lit & (depth > 0.0) & (depth < FAR), depth, 0.0)
+            color = np.where(lit[..., None], color, 0).astype(np.uint8)
+            writer.write_frame(folder, PhantomFrame(part, index, color, depth))
+            if part == "rotation" or writer.is_test(index):
+                path = writer.seen_mask(folder, part, index)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(path), seen)
+    for part, matrices in parts.items():
+        writer.write_sequence(folder, part, matrices, lens)
+    if writer.has_points:
+        writer.write_points(folder, _points(lens, frames), poses(frames), lens)
     return folder
+
+
+def _points(lens: Lens, frames: int) -> WallPoints:
+    """Points of the wall in the first view, and in which views they are."""
+    pixels = np.random.default_rng(0).uniform(2, [lens.width - 2, lens.height - 2], (200, 2))
+    directions, first = lens.unproject(pixels), poses(1)[0]
+    depth, color = look(first, directions)
+    positions = first[:3, 3] + depth[:, None] * directions @ first[:3, :3].T
+
+    def seen_in(index: int) -> np.ndarray:
+        pose = poses(frames)[index]
+        pixels = lens.project((positions - pose[:3, 3]) @ pose[:3, :3])
+        return ((pixels > 0) & (pixels < (lens.width, lens.height))).all(axis=1)
+
+    return WallPoints(positions, color, seen_in)

@@ -21,8 +21,9 @@ from coliags_plugin.geometry.poses.formats import format_named, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from tests.comparison.small import TINY
-from tests.datamanagers.spoiling import KINDS, write_all
+from tests.datamanagers.kinds import KINDS, write_kind
 from tests.export.splats.clouds import random_cloud
+from tests.phantom.phantom_layouts import write_phantom
 from tests.pipeline.procedures import write_procedure
 
 FRAMES = 9
@@ -32,31 +33,27 @@ METHOD = "coliags"
 def make_seeds(folder: Path) -> None:
     """Make a folder of seeds for each target (:mod:`tests.fuzz.targets`)."""
     work = folder / "work"
-    made = write_all(work, FRAMES)
-    for name, scene in made.items():
-        place = folder / name
-        shutil.copytree(scene, place)
-        truth = place / "truth"
-        for file in truth.glob("albedo.npz"):
-            file.unlink()
-    poses = np.load(made["c3vd"] / "truth/camera_to_world.npy")
-    surface = read_mesh(made["c3vd"] / "truth/mesh.ply")
-    _rich_transforms(folder / "nerfstudio", folder / "nerfstudio-rich")
+    for name in KINDS:
+        write_kind(folder / name, name, FRAMES)
+    phantom = write_phantom(work / "phantom", "c3vd", frames=FRAMES, mesh_spacing=3.0, texture_spacing=1.0)
+    poses = np.load(phantom / "truth/camera_to_world.npy")
+    surface = read_mesh(phantom / "truth/mesh.ply")
+    _rich_transforms(folder / "nerfstudio", folder / "nerfstudio-rich", surface)
     _trajectories(folder / "poses", poses)
     _meshes(folder / "meshes", surface)
     _splats(folder / "splats", folder / "c3vd")
     _runs(folder, work)
     _methods(folder / "methods")
-    _depth_maps(folder / "depth-maps", made["c3vd"])
+    _depth_maps(folder / "depth-maps", phantom)
     _points(folder / "points", folder / "c3vd")
     (folder / "video").mkdir()
-    frames = [cv2.imread(str(path))[..., ::-1] for path in sorted((made["c3vd"] / "images").iterdir())]
+    frames = [cv2.imread(str(path))[..., ::-1] for path in sorted((phantom / "images").iterdir())]
     write_video(np.stack(frames), folder / "video/film.mp4", 10.0)
     write_procedure(folder / "procedure")
     shutil.rmtree(work)
 
 
-def _rich_transforms(scene: Path, target: Path) -> None:
+def _rich_transforms(scene: Path, target: Path, surface: TriangleMesh) -> None:
     """A scene with everything that a transforms.json can say."""
     shutil.copytree(scene, target)
     file = target / "transforms.json"
@@ -65,8 +62,7 @@ def _rich_transforms(scene: Path, target: Path) -> None:
     content.update(applied_transform=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], ply_file_path="cloud.ply")
     names = [frame["file_path"] for frame in content["frames"]]
     content.update(train_filenames=names[1:], test_filenames=names[:1])
-    mesh = open3d.io.read_triangle_mesh(str(target / "truth/mesh.ply"))
-    cloud = open3d.geometry.PointCloud(mesh.vertices)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(surface.vertices.astype(np.float64)))
     open3d.io.write_point_cloud(str(target / "cloud.ply"), cloud)
     for part, value in (("masks", 255), ("confidence", 200)):
         (target / part).mkdir()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.datamanagers.spoiling import KINDS
+from tests.datamanagers.kinds import KINDS
 from tests.fuzz import geometry
 from tests.fuzz.seeds import METHOD
 

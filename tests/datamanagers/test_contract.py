@@ -1,0 +1,395 @@
+"""What every data manager does alike: each kind of layout is read exactly, left as it is, and every fault is told."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.config.registry import datamanagers
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.datamanagers.recognition import find_format, formats, recognised
+from tests.datamanagers.faults import GROUPS, REFUSED, WARNED
+from tests.datamanagers.kinds import (
+    KINDS,
+    Spoil,
+    change_frames,
+    change_json,
+    change_npz,
+    edit,
+    files,
+    remove,
+    renumber,
+    repaint,
+)
+from tests.datamanagers.wall_scenes import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    layout_of,
+    manager,
+    names,
+    off_wall,
+    poses,
+    seen_from,
+    video,
+)
+
+ROOT = Path(__file__).parents[2]
+#: Test frames by the default split, and the split that seen masks are for.
+SPLITS = {"c3vd-endogslam": ([7], "endogslam"), "rotatecolon": ([], "all-train")}
+SPLITS |= {"reim-nerf": ([1, 2, 3, 4, 6, 7, 8, 9], "own")}
+ROTATED = ("c3vd", "c3vd-raw", "c3vd-v2", "c3vd-endogslam", "rotatecolon")
+
+
+def load(folder: Path, name: str, **options) -> Scene:
+    return manager(KINDS[name].format, **options).load(folder)
+
+
+def in_order(scene: Scene, name: str) -> list[Frame]:
+    """Frames of the video: RotateColon's test frames are of another."""
+    return scene.train if name == "rotatecolon" else video(scene)
+
+
+def to_true_world(name: str) -> np.ndarray:
+    """From the world of the scene that is read: EndoGSLAM's is that of the first camera. [4, 4]"""
+    return poses(1)[0] if KINDS[name].params else np.eye(4)
+
+
+def equal(one: Frame, other: Frame) -> bool:
+    """Whether the pixels and poses of two frames are equal to the bit."""
+    pairs = [(getattr(one, part), getattr(other, part)) for part in ("image", "depth", "mask", "seen")]
+    pairs.append((one.camera.camera_to_world, other.camera.camera_to_world))
+    return one.index == other.index and all(
+        (a is None and b is None) or torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in pairs
+    )
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
+    folder, kind, world = walls(name), KINDS[name], to_true_world(name)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert list(recognised(folder)) == [kind.format]
+    with caplog.at_level(logging.WARNING):
+        scene = load(folder, name)
+    assert caplog.records == []
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+    test, _ = SPLITS.get(kind.format, ([0, 8], ""))
+    frames, held_out = in_order(scene, name), [frame for frame in scene.test_sets["test"] if name != "rotatecolon"]
+    assert [frame.index for frame in frames] == list(range(FRAMES))
+    assert [frame.index for frame in held_out] == test
+    assert len(set(names([*scene.train, *(frame for part in scene.test_sets.values() for frame in part)]))) == sum(
+        scene.provenance["frames"][part] for part in ("train", *scene.test_sets)
+    )
+    pinhole = layout_of(kind.layout).lens(WIDTH, HEIGHT)[0].pinhole
+    for frame in frames:
+        assert vars(frame.camera.intrinsics) == pytest.approx(vars(pinhole), rel=1e-6)
+        pose, valid = poses(FRAMES)[frame.index], frame.valid.numpy()
+        np.testing.assert_allclose(world @ frame.camera.camera_to_world.double().numpy(), pose, atol=1e-4)
+        depth, color = seen_from(frame, pose)
+        assert frame.image.dtype == torch.uint8 and valid.all()
+        off = np.abs(frame.image.numpy().astype(int) - color)
+        assert off.max() <= (14 if kind.is_undistorted else 0) and off.mean() < 1.2
+        assert (frame.depth is not None) == bool(kind.depths)
+        if frame.depth is not None:
+            assert frame.depth.dtype == torch.float32
+            difference = np.abs(frame.depth.numpy() - depth)
+            assert difference.max() < kind.accuracy and np.median(difference) < max(0.12, 0.6 * kind.accuracy)
+    points = scene.points.positions.double().numpy() @ world[:3, :3].T + world[:3, 3]
+    assert len(points) > 100 and off_wall(points).max() < 1e-3 + kind.accuracy
+    said = json.loads(json.dumps(scene.provenance, allow_nan=False))
+    assert said["dataset"] == kind.format and said["stored_size"] == said["size"] == [WIDTH, HEIGHT]
+    assert said["unit"] == "mm"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_scene_is_the_same_again_read_from_disk_each_time_or_at_once(walls, name):
+    scene = load(walls(name), name, points_count=150)
+    for again in (load(walls(name), name, points_count=150, keep_pixels=keep) for keep in (True, False)):
+        assert torch.equal(scene.points.positions, again.points.positions)
+        assert all(equal(*pair) for pair in zip(in_order(scene, name), in_order(again, name), strict=True))
+        assert again.provenance == scene.provenance | {"invalid_depth_share": again.provenance["invalid_depth_share"]}
+    other = load(walls(name), name, points_count=150, seed=1).points.positions
+    assert len(other) == 150 and not torch.equal(other, scene.points.positions)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_fingerprint_is_that_of_the_files(walls, copied, name):
+    kind, folder = KINDS[name], copied(name)
+    reader = manager(kind.format)
+    found = [reader.fingerprint(walls(name)), reader.fingerprint(folder)]
+    (folder / "notes.txt").write_text("hello")
+    assert {*found, reader.fingerprint(folder)} == {found[0]}
+    (folder / kind.poses).open("ab").write(b"\n") if kind.poses else None
+    found.append(reader.fingerprint(folder))
+    repaint(kind.images, 3, lambda pixels: 0 * pixels)(folder)
+    found.append(reader.fingerprint(folder))
+    assert len(set(found)) == (3 if kind.poses else 2)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_another_size_keeps_the_geometry(walls, name):
+    """Nearest depth lies up to half a stored pixel beside its ray."""
+    kind = KINDS[name]
+    scene = load(walls(name), name, width=23, height=15)
+    pinhole = layout_of(kind.layout).lens(WIDTH, HEIGHT)[0].pinhole.resized(23, 15)
+    for frame in in_order(scene, name):
+        assert vars(frame.camera.intrinsics) == pytest.approx(vars(pinhole), rel=1e-6)
+        depth, color = seen_from(frame, poses(FRAMES)[frame.index])
+        assert np.abs(frame.image.numpy().astype(int) - color).mean() < 5.0
+        assert frame.depth is None or np.abs(frame.depth.numpy() - depth).max() < 2.5
+
+
+# Seen masks
+
+
+def seen_warnings(caplog) -> list[str]:
+    return [record.getMessage() for record in caplog.records if "seen masks" in record.getMessage()]
+
+
+def apart(scene: Scene) -> list[Frame]:
+    """Frames of the video that are held out, and rotation views."""
+    return [frame for frames in scene.test_sets.values() for frame in frames]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_seen_masks_are_read_for_the_training_frames_that_they_are_for(walls, caplog, name):
+    kind, folder = KINDS[name], walls(name)
+    scene = load(folder, name)
+    assert len(scene.test_sets.get("rotation", ())) == (2 if kind.layout in {"endogslam", *ROTATED[:3]} else 0)
+    for frame in apart(scene):
+        seen = frame.seen.numpy()
+        assert seen[:, : WIDTH // 2 - 1].all() and not seen[:, WIDTH // 2 + 1 :].any()
+    assert all(frame.seen is None for frame in scene.train)
+    for options in ({"max_frames": 6}, {"frame_step": 2}, {"split": "block"}):
+        caplog.clear()
+        scene = load(folder, name, initial_points="none", **options)
+        assert all(frame.seen is None for frame in (*scene.train, *apart(scene)))
+        assert seen_warnings(caplog) == [
+            f"{folder}: seen masks are for split '{SPLITS.get(kind.format, (0, 'every-8th'))[1]}' of all frames; this "
+            "run trains on other frames, so metrics on seen pixels are unavailable"
+        ] * bool(apart(scene))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        # All frames; those that are left out, the last one, is trained on by none.
+        ("c3vd", {"max_frames": FRAMES}),
+        ("rotatecolon", {"split": "own", "max_frames": 100}),
+        # Frame 7 alone.
+        ("c3vd-endogslam", {"split": "block", "block": (7 / FRAMES, 8 / FRAMES)}),
+    ],
+)
+def test_other_options_with_the_same_training_frames_keep_seen_masks(walls, caplog, name, options):
+    assert all(frame.seen is not None for frame in apart(load(walls(name), name, **options)))
+    assert not seen_warnings(caplog)
+
+
+@pytest.mark.parametrize("name", ["colmap", "nerfstudio", "rotatecolon"])
+def test_images_without_a_pose_put_seen_masks_out_of_step(copied, caplog, name):
+    folder = copied(name)
+    WARNED["an image without a pose", name][0](folder)
+    assert all(frame.seen is None for frame in apart(load(folder, name)))
+    assert len(seen_warnings(caplog)) == 1 and "are for all images, but some are left out" in caplog.text
+    remove("truth/seen/*")(folder)
+    caplog.clear()
+    load(folder, name, split="all-train")
+
+
+# Faults
+
+
+@pytest.mark.parametrize("row", REFUSED, ids=" of ".join)
+def test_a_fault_is_one_clear_error(copied, row):
+    spoil, pattern = REFUSED[row]
+    folder = copied(row[1])
+    spoil(folder)
+    # Whatever is in the folder, looking which format it is does not fail.
+    recognised(folder)
+    with pytest.raises(InputError) as caught:
+        load(folder, row[1])
+    message = str(caught.value)
+    assert caught.value.expected and "\n" not in message
+    assert re.search(pattern, message), message
+
+
+@pytest.mark.parametrize("row", WARNED, ids=" of ".join)
+def test_what_may_be_wrong_is_one_warning(copied, caplog, row):
+    spoil, pattern = WARNED[row]
+    folder = copied(row[1])
+    spoil(folder)
+    load(folder, row[1])
+    (warning,) = [record.getMessage() for record in caplog.records if re.search(pattern, record.getMessage())]
+    assert str(folder) in warning
+
+
+@pytest.mark.parametrize("format", formats())
+def test_a_folder_that_is_not_there(tmp_path, format):
+    with pytest.raises(InputError, match=r"no (folder|file) .*nowhere"):
+        manager(format).load(tmp_path / "nowhere")
+    assert datamanagers.get(format).recognise(tmp_path / "nowhere") is None
+
+
+def test_every_fault_meets_every_layout_that_it_can_befall():
+    befallen: dict[str, set[str]] = {}
+    for fault, name in REFUSED:
+        befallen.setdefault(fault, set()).add(name)
+    for fault in ("an image of another size", "an image cut short", "an empty folder", "no images"):
+        assert befallen[fault] == set(KINDS), fault
+    for fault in ("a number that is none", "a rotation that is none", "poses cut short"):
+        # EndoGSLAM's poses are in its result.
+        assert befallen[fault] == set(KINDS) - {"pr-endo"}, fault
+    for fault in ("depth cut short", "depth of another size"):
+        assert befallen[fault] == set(GROUPS["depth"]), fault
+    # By time, there may be more poses than images, and what has no depth is left out with a warning.
+    assert befallen["an image that is gone"] == set(KINDS) - {"rgbd"}
+    assert befallen["depth missing for a frame"] == set(GROUPS["depth"]) - {"rgbd"}
+    assert {kind.format for kind in KINDS.values()} == set(formats())
+
+
+def table(page: str, header: str) -> list[list[str]]:
+    """Cells of a table in the documentation."""
+    rows = (ROOT / "docs" / page).read_text().split(header)[1].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip().replace("`", "") for cell in row.strip("|").split("|")] for row in rows]
+
+
+@pytest.mark.parametrize("page", ["colmap", "nerfstudio"])
+def test_the_pages_examples_are_what_is_said(walls, tmp_path, page):
+    """Bytes and the numbers of points are those of another scene."""
+    said = []
+    for (fault, name), (spoil, _) in REFUSED.items():
+        if KINDS[name].format == page:
+            folder = Path(shutil.copytree(walls(name), tmp_path / fault / name))
+            spoil(folder)
+            with pytest.raises(InputError) as caught:
+                load(folder, name)
+            said.append(re.sub(r"\d+", "1", str(caught.value).replace(f"{folder}/", "")))
+    for _, example in table(f"layouts/{page}.md", "| found | example of the message |"):
+        assert any(re.sub(r"\d+", "1", example) in message for message in said), example
+
+
+def test_a_file_in_the_place_of_a_folder(copied, tmp_path):
+    folder = copied("nerfstudio")
+    (folder / "a clip.MP4").touch()
+    (tmp_path / "notes.txt").touch()
+    for path, message in (
+        (folder / "transforms.json", rf"transforms.json is a file of a scene. .* Give {folder}\.$"),
+        (folder / "a clip.MP4", rf"is a video\. .* coliags reconstruct '{folder}/a clip.MP4' --output FOLDER"),
+        (tmp_path / "notes.txt", r"notes.txt is a file\. Expected a scene's folder, as docs/data.md describes\.$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_format(path)
+
+
+# What is unusual, and no fault
+
+
+def _unpadded(pattern: str, *globs: str) -> Spoil:
+    """Take zeros out of the names of files and of their mentions in JSON."""
+
+    def change(index: int, frame: dict) -> None:
+        for key in {"file_path", "depth_file_path", "distmap_path"} & frame.keys():
+            frame[key] = re.sub(r"0*(\d+)", r"\1", frame[key], count=1)
+
+    return lambda folder: [renumber(*globs)(folder), change_frames(pattern, change)(folder)]
+
+
+UNPADDED = {
+    **{name: renumber(KINDS[name].images, KINDS[name].depths) for name in (*GROUPS["paired"], "rotatecolon")},
+    "endomapper": renumber("rgb/*.png", "depth/*.png", "mask/*.png"),
+    "rgbd-by-order": lambda folder: None,
+    "colmap-text": lambda folder: [
+        renumber("images/*.png")(folder),
+        edit("sparse/0/images.txt", r"\b0*(\d+)\.png", r"\1.png")(folder),
+    ],
+    "nerfstudio": _unpadded("transforms.json", "images/*.png", "depth/*.png"),
+    # Its preprocessing writes names that are not padded like those in the JSON files, and a mask of three channels.
+    "reim-nerf": lambda folder: [
+        renumber("images/*.png", "distmaps/*.png")(folder),
+        repaint("rgb_mask.png", 0, lambda mask: np.dstack([mask] * 3))(folder),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", UNPADDED)
+def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, walls, name):
+    folder = copied(name)
+    UNPADDED[name](folder)
+    assert sorted(images := files(folder, KINDS[name].images)) != images, "the names' own order is another one"
+    frames, expected = (in_order(load(place, name), name) for place in (folder, walls(name)))
+    assert all(equal(*pair) for pair in zip(frames, expected, strict=True))
+
+
+def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, walls):
+    folder = copied("rgbd")
+    remove("rgb/*.png", 3)(folder)
+    found, expected = video(load(folder, "rgbd")), video(load(walls("rgbd"), "rgbd"))
+    for frame, other in zip(found, [*expected[:3], *expected[4:]], strict=True):
+        assert frame.name == other.name
+        assert torch.equal(frame.camera.camera_to_world, other.camera.camera_to_world)
+        assert torch.equal(frame.depth, other.depth)
+        # Seen masks are numbered by image and would now be those of others.
+        assert frame.seen is None
+
+
+@pytest.mark.parametrize("name", GROUPS["params"])
+def test_endogslams_quaternions_may_be_of_any_length(copied, walls, name):
+    folder = copied(name)
+    change_npz(KINDS[name].params, lambda arrays: arrays.update(cam_unnorm_rots=3.0 * arrays["cam_unnorm_rots"]))(
+        folder
+    )
+    for frame, other in zip(video(load(folder, name)), video(load(walls(name), name)), strict=True):
+        torch.testing.assert_close(frame.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
+
+
+# The size that images have by default
+
+
+RAW, PREPARED, PAPER, FIFTH = (1350, 1080), (675, 540), (338, 270), (270, 216)
+
+
+@pytest.mark.parametrize("format", formats())
+def test_the_default_size_is_the_one_published_as_the_page_says(format):
+    kind = datamanagers.get(format)
+    assert kind.seen_split == kind.Settings().split
+    fits = {
+        name: size
+        for formats, size, _ in table("data.md", "| format | default size | published by |")
+        for name in formats.split(", ")
+    }
+    size = fits.get(format, fits["others"])
+    assert size.split(",")[0] == ("as stored" if kind.fits is None else "x".join(map(str, kind.fits)))
+    stored = [RAW, PREPARED, PAPER, FIFTH, (1920, 1080), (169, 135)]
+    expected = {None: stored, FIFTH: [FIFTH] * 4 + [(270, 152), (169, 135)]}.get(
+        kind.fits, [PAPER] * 3 + [FIFTH, (338, 190), (169, 135)]
+    )
+    assert [manager(format).working_size(*each) for each in stored] == expected
+    assert manager(format, width=338, height=270).working_size(1, 1) == PAPER
+
+
+def test_smaller_images_are_told_once_where_no_size_is_set(copied, caplog):
+    folder = copied("rgbd")
+    remove("truth/seen/*")(folder)
+    for place in range(FRAMES):
+        for part in ("rgb", "depth"):
+            repaint(f"{part}/*.png", place, lambda pixels: cv2.resize(pixels, (400, 320)))(folder)
+    change_json("camera.json", w=400, h=320, cx=199, cy=159)(folder)
+
+    def told(**options) -> list[str]:
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            load(folder, "rgbd", **options)
+        return [record.getMessage() for record in caplog.records if "stored at" in record.getMessage()]
+
+    change = "--set datamanager.width=W --set datamanager.height=H sets another size"
+    assert told() == [f"{folder}: images stored at 400 x 320 are used at 338 x 270; {change}"]
+    assert told(width=200, height=150) == []
