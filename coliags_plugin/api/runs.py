@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.export.baking.exporting import Exported
+    from coliags_plugin.export.viewer.live import Viewer
     from coliags_plugin.export.viewer.saving import ScenePage
-    from coliags_plugin.export.viewer.serving import Viewer
     from coliags_plugin.results.record import Result
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
     from coliags_plugin.surface.meshing.writing import MeshedRun
@@ -344,7 +344,7 @@ class Run:
             InputError: See :meth:`load`; viser is not installed, the port is in use or not allowed, or the host is not
                 of this machine.
         """
-        from coliags_plugin.export.viewer.serving import Viewer
+        from coliags_plugin.export.viewer.live import Viewer
 
         return Viewer(self.load(), host, port)
 

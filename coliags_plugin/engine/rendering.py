@@ -70,9 +70,7 @@ def render_run(
     path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
     if along is not None:
         path = list(along.cameras(trained.scene.train[0].camera, fps))
-    sample = (chosen or path)[:: max(1, len(chosen or path) // 4)][:4]
-    sampled = [as_array(render_view(trained, frame, wants)[depth]) for frame in sample]
-    limits = depth_limits(sampled, unit)
+    limits = sampled_depth_limits(trained, chosen or path, depth)
     with (
         atomic_folder(output, overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * video) as progress,
@@ -98,6 +96,13 @@ def render_run(
         if video:
             name = "trajectory.mp4" if along is None else "path.mp4"
             write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, fps)
+
+
+def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], depth: str) -> tuple[float, float]:
+    """One scale for a kind of depth of all views, from that of four of them."""
+    sample = views[:: max(1, len(views) // 4)][:4]
+    rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in sample)
+    return depth_limits([as_array(output[depth]) for output in rendered], trained.scene.length_unit)
 
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:

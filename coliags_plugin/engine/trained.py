@@ -13,7 +13,13 @@ import torch
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
+from coliags_plugin.engine.checkpoints import (
+    checkpoint_folder,
+    latest_checkpoint,
+    newest_checkpoint,
+    read_checkpoint,
+    restore_model,
+)
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.data_formats import load_scene, recorded_scale
 from coliags_plugin.engine.model import Model
@@ -77,3 +83,15 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     model = restore_model(saved, config, scene.scaled(scale), renderer).to(device).eval()
     model.scale = scale
     return TrainedRun(run, config, method, scene, model, saved.step, device, identity.seed, provenance, saved.cost)
+
+
+def load_newer(trained: TrainedRun) -> TrainedRun | None:
+    """The run at a checkpoint that was written since it was loaded; None where there is none."""
+    newest = newest_checkpoint(trained.run.checkpoints)
+    if newest is None or newest == checkpoint_folder(trained.run.checkpoints, trained.step):
+        return None
+    saved, scale = read_checkpoint(newest, trained.method, trained.device), trained.model.scale
+    model = restore_model(saved, trained.config, trained.scene.scaled(scale), trained.model.renderer)
+    model = model.to(trained.device).eval()
+    model.scale = scale
+    return replace(trained, model=model, step=saved.step, cost=saved.cost)

@@ -160,21 +160,22 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
     from coliags_plugin.comparison.report.view_pixels import evenly
     from coliags_plugin.contracts import knows_lamp
     from coliags_plugin.engine.held_light import flatten
-    from coliags_plugin.export.viewer.content import FramePictures
-    from coliags_plugin.outputs.image_files import write_png
+    from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
+    from coliags_plugin.outputs.image_files import eight_bit, write_png
 
-    pictures = FramePictures(trained)
-    flat = FramePictures(flatten(trained)) if knows_lamp(trained.model.field) else None
-    scale = ""
-    for index in evenly(len(trained.scene.video), _PICTURED):
-        frame = trained.scene.video[index]
+    flat = flatten(trained) if knows_lamp(trained.model.field) else None
+    depth, video, scale = "depth_expected", trained.scene.video, ""
+    if depth in trained.model.outputs:
+        limits = sampled_depth_limits(trained, video, depth)
+        scale = f"expected depth, {limits[0]:g} to {limits[1]:g} {trained.scene.length_unit}"
+    for index in evenly(len(video), _PICTURED):
+        frame = video[index]
         write_png(folder / frame.name / "recorded.png", frame.image)
-        if "depth" in pictures.kinds:
-            depth = pictures.of(frame, "depth")
-            write_png(folder / frame.name / "depth.png", depth.image)
-            scale = depth.caption
+        if scale:
+            output = render_view(trained, frame, ("rgb", "alpha", depth))
+            write_png(folder / frame.name / "depth.png", depth_picture(output, depth, limits))
         if flat is not None:
-            write_png(folder / frame.name / "flattened light.png", flat.of(frame, "render").image)
+            write_png(folder / frame.name / "flattened light.png", eight_bit(render_view(flat, frame).rgb))
     return scale
 
 

@@ -22,7 +22,6 @@ from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.training import TrainingRequest, open_training
 from coliags_plugin.export.baking.exporting import export_run
 from coliags_plugin.export.splats.files import read_splats
-from coliags_plugin.export.viewer.content import ViewerContent
 from coliags_plugin.outputs.image_files import read_depth_tiff
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
@@ -130,11 +129,6 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
     export, export_mm = (record["cost"]["test"] for record in records)
     assert export["export"]["psnr"] == pytest.approx(export_mm["export"]["psnr"], abs=0.05)
     assert factor**2 * export["export"]["depth_mse"] == pytest.approx(export_mm["export"]["depth_mse"], rel=0.02)
-    views = [ViewerContent.of(run) for run in runs]
-    np.testing.assert_allclose(factor * views[0].baked.means, views[1].baked.means, rtol=1e-3, atol=1e-3)
-    seen = [view.decoder.of(view.first_camera, view.flattened) for view in views]
-    np.testing.assert_allclose(factor * seen[0].means, seen[1].means, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(seen[0].harmonics, seen[1].harmonics, atol=1e-3)
 
 
 @pytest.mark.thorough

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from coliags_plugin.contracts import GaussianField, gaussians_under
+from coliags_plugin.contracts import gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
@@ -140,21 +140,6 @@ class GaussianAverages:
             made.shN.copy_(harmonics[:, 1:])
             made.degree.fill_(degree)
         return made
-
-
-@torch.no_grad()
-def mean_gaussians(field: GaussianField, cameras: Sequence[Camera]) -> Gaussians:
-    """The Gaussians of a field for no view in particular: averages over views, weighted by their opacities there.
-
-    The lamp of each camera lights them, so that colours are of the average light.
-    """
-    views = [field.gaussians(camera) for camera in cameras]
-    slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
-    per_element, scales = field.slots_per_element, views[0].scales.shape[1]
-    averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
-    for view, camera in zip(views, cameras, strict=True):
-        averages.add(view, view.opacities, camera)
-    return averages.gaussians(averages.visible())
 
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.

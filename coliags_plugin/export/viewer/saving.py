@@ -9,19 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from coliags_plugin.contracts import GaussianField, knows_lamp
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import SECONDS, bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
-from coliags_plugin.export.viewer.content import NOTHING, ViewerContent, mesh_files
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
-from coliags_plugin.export.viewer.splats import most_visible
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -140,10 +143,33 @@ class _Page:
         cameras = [adjusted_camera(trained, frame) for frame in frames]
         self._path = CameraPath(frames, cameras, trained.training_frames)
 
-    def html(self, layers: list[Layer], splats: SplatCloud = NOTHING, first: int = 0) -> str:
+    def html(self, layers: list[Layer], splats: SplatCloud | None = None, first: int = 0) -> str:
         """The page; ``splats`` tell how far the wall is, and it opens at a training frame."""
-        trained, renderer = self._trained, self._trained.model.renderer
-        content = ViewerContent.of_cloud(trained, splats, first)
-        start = content.frames.index(trained.scene.train[first])
+        scene, renderer = self._trained.scene, self._trained.model.renderer
+        frame, points = scene.train[first], scene.points.positions if splats is None else torch.as_tensor(splats.means)
+        distance = look_distance(scene, frame.camera, points)
         blur = renderer.settings.eps2d if isinstance(renderer, SplattingRenderer) else 0.0
-        return page_html(content.title, layers, self._path, start, content.look_distance, blur, content.near_plane)
+        title, near = f"{self._trained.method} on {scene.name}", min(frame.camera.near_plane, 0.02 * distance)
+        return page_html(title, layers, self._path, scene.video.index(frame), distance, blur, near)
+
+
+def look_distance(scene: Scene, camera: Camera, points: Float[Tensor, "N 3"]) -> float:
+    """Median depth, in a view, of points in the world; of none, the extent of the scene."""
+    depth, seen = camera.to("cpu", torch.float64).sees(points.detach().cpu().double())
+    return float(depth[seen].median()) if seen.any() else scene.extent or 1.0
+
+
+def most_visible(splats: SplatCloud, count: int) -> SplatCloud:
+    """At most so many splats: those that cover most, by opacity times area seen from the front, in their order."""
+    covers = splats.opacities * np.sort(splats.scales, axis=1)[:, 1:].prod(axis=1)
+    kept = np.zeros(len(splats), bool)
+    kept[np.argsort(-covers, kind="stable")[:count]] = True
+    return splats.part(kept)
+
+
+def mesh_files(run: Path) -> dict[str, Path]:
+    """Meshes in a run folder by the names of their layers: of ``coliags mesh`` and ``coliags coverage``."""
+    files = {"mesh": run / "mesh" / "mesh.ply"}
+    for file in sorted((run / "coverage").glob("*.ply")):
+        files["coverage" if file.stem == "coverage" else f"coverage: {file.stem}"] = file
+    return {name: file for name, file in files.items() if file.is_file()}

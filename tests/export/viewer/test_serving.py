@@ -1,7 +1,9 @@
-"""Serving a run: its address, what browsers are told, and what they change."""
+"""Serving a run: its address, the pictures that browsers get, what they change, and runs that are being trained."""
 
 from __future__ import annotations
 
+import json
+import shutil
 import signal
 import socket
 import subprocess
@@ -9,22 +11,29 @@ import sys
 import time
 import urllib.request
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import coliags_plugin as cp
+from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.export.viewer import serving
-from coliags_plugin.export.viewer.splats import in_view, shown, widened
+from coliags_plugin.engine.camera_path import CameraPath
+from coliags_plugin.engine.held_light import flatten
+from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
+from coliags_plugin.export.viewer import live, serving
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.outputs.image_files import as_array, eight_bit
 from tests.commands import refused
+from tests.engine.test_trainer import EARLY_GROWTH, assert_same, final_state, make_trainer
+from tests.scenes import SMALL
 
 pytest.importorskip("viser")
 
-from tests.export.viewer.viser_client import HEIGHT, WIDTH, ViserClient, splats_of
+from tests.export.viewer.viser_client import HEIGHT, WIDTH, ViserClient
 
 #: viser's, of browsers that leave during an update; the viewer filters it, pytest shows it again.
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
@@ -39,19 +48,38 @@ def viewer(anchors):
 
 @contextmanager
 def connected(viewer, index=0):
-    """A browser at a training frame, and its session."""
-    camera = viewer.content.trained.scene.train[index].camera
+    """A browser at a training frame, which has its first picture, and the frame's camera."""
+    camera = viewer.trained.scene.train[index].camera
     with ViserClient(viewer.port) as client:
         client.look(camera)
+        client.picture()
         yield client, camera
 
 
-def newest(client, seconds=30.0):
-    """Splats of the next update."""
-    while True:
-        updates = client.wait_for("SceneNodeUpdateMessage", seconds)["updates"]
-        if "buffer" in updates:
-            return splats_of(updates["buffer"])
+def newest(client, width=WIDTH):
+    """The next picture of full size."""
+    while (picture := client.picture()).shape[1] != width:
+        pass
+    return picture
+
+
+def browsers(camera, width=WIDTH, height=HEIGHT):
+    """The browser's camera: square pixels, the principal point in the middle."""
+    focal = camera.fy * height / camera.height
+    pose = camera.camera_to_world.float()
+    return Camera(focal, focal, width / 2, height / 2, width, height, pose, camera.near_plane)
+
+
+def assert_like(picture, expected):
+    """As far as JPEG keeps it."""
+    assert picture.shape == expected.shape
+    assert np.abs(picture.astype(float) - as_array(expected)).mean() < 4.0
+
+
+def session_of(viewer):
+    while not viewer.sessions:
+        time.sleep(0.01)
+    return viewer.sessions[-1]
 
 
 def test_the_page_is_served_on_the_port(viewer):
@@ -61,7 +89,9 @@ def test_the_page_is_served_on_the_port(viewer):
 
 
 def test_a_browser_starts_at_the_first_training_frame(viewer):
-    with connected(viewer) as (client, camera):
+    camera = viewer.trained.scene.train[0].camera
+    with ViserClient(viewer.port) as client:
+        client.look(camera)
         said = {
             name: client.wait_for(f"SetCamera{name}Message") for name in ("Position", "LookAt", "UpDirection", "Fov")
         }
@@ -73,106 +103,171 @@ def test_a_browser_starts_at_the_first_training_frame(viewer):
     assert said["Fov"]["fov"] == pytest.approx(2 * np.arctan(0.5 * camera.height / camera.fy))
 
 
-def test_splats_come_at_once_and_then_as_seen_from_the_camera(viewer):
-    content = viewer.content
-    with connected(viewer) as (client, camera):
-        first = splats_of(client.wait_for("GaussianSplatsMessage")["props"]["buffer"])
-        np.testing.assert_allclose(first["centers"] * content.unit, content.decoder.beside.means, rtol=1e-5)
-        second = newest(client)
-    seen = shown(content.trained.model.field.gaussians(widened(session_camera(camera))))
-    np.testing.assert_allclose(second["centers"][: len(seen)] * content.unit, seen.means, atol=1e-4)
-    np.testing.assert_allclose(second["rgba"][: len(seen), :3], 255 * seen.colors, atol=1)
-    rest = second["centers"][len(seen) :] * content.unit
-    assert not in_view(rest, widened(session_camera(camera))).any()
-
-
-def session_camera(camera):
-    """The browser's camera: square pixels, the principal point in the middle."""
-    focal = camera.fy * HEIGHT / camera.height
-    return Camera(focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, camera.camera_to_world)
-
-
-def test_a_moved_camera_is_decoded_for(viewer):
-    frames = viewer.content.trained.scene.train
-    with connected(viewer) as (client, _):
-        before = newest(client)
-        client.look(frames[-1].camera)
-        after = newest(client)
-    assert len(after["centers"]) != len(before["centers"]) or (after["rgba"] != before["rgba"]).any()
-
-
-def test_flattened_light_is_the_exchange_packages(viewer):
-    content = viewer.content
-    with connected(viewer) as (client, camera):
+def test_pictures_are_what_the_runs_renderer_draws(viewer):
+    trained, depth = viewer.trained, "depth_expected"
+    with connected(viewer) as (client, first):
+        client.set("Show", "depth")
+        output = render_view(trained, browsers(first), ("rgb", "alpha", depth))
+        limits = sampled_depth_limits(trained, trained.scene.video, depth)
+        assert_like(newest(client), depth_picture(output, depth, limits))
+        client.set("Show", "normals")
+        normals = as_array(render_view(trained, browsers(first), ("rgb", "alpha", "normals"))["normals"])
+        assert_like(newest(client), np.clip(127.5 + 127.5 * normals * (1, -1, -1), 0, 255))
+        client.set("Show", "colour")
         newest(client)
+        camera = trained.scene.train[-1].camera
+        client.look(camera)
+        client.picture()  # of the moving camera
+        own = render_view(trained, browsers(camera)).rgb
+        assert_like(newest(client), eight_bit(own))
         client.set("Light", "flattened")
-        drawn = newest(client)
-    field, placed = content.trained.model.field, widened(session_camera(camera))
-    seen = shown(field.gaussians_in_light(placed, content.flattened))
-    np.testing.assert_allclose(drawn["rgba"][: len(seen), :3], 255 * seen.colors, atol=1)
-    assert (np.abs(seen.colors - shown(field.gaussians(placed)).colors) > 2 / 255).any()
+        flat = render_view(flatten(trained), browsers(camera)).rgb
+        assert_like(newest(client), eight_bit(flat))
+        assert (flat - own).abs().max() > 0.02
 
 
-def test_the_threshold_leaves_out_the_fainter_ones(viewer):
+def test_a_moving_camera_gets_small_pictures_and_one_that_rests_the_whole(viewer, monkeypatch):
+    monkeypatch.setattr(live, "_FLUID", 1e-9)  # no picture is drawn so fast
+    monkeypatch.setattr(live, "_SMALLEST", 0.25)
     with connected(viewer) as (client, _):
-        every = newest(client)
-        client.set("Least opacity", 0.3)
-        kept = newest(client)
-    opaque = every["rgba"][:, 3] >= round(0.3 * 255)
-    assert 0 < len(kept["centers"]) < len(opaque)
-    assert abs(len(kept["centers"]) - opaque.sum()) <= 0.02 * len(opaque)
+        for index in (1, 2):
+            client.look(viewer.trained.scene.train[index].camera)
+            newest(client)
+        client.look(viewer.trained.scene.train[3].camera)
+        newest(client, WIDTH // 4)
+        assert client.picture().shape == (HEIGHT, WIDTH, 3)
+        client.set("Most pixels across", 32)
+        assert client.picture().shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
 def test_the_slider_moves_the_camera_and_shows_the_frame(viewer):
-    frame = viewer.content.frames[5]
+    frame = viewer.trained.scene.video[5]
     with connected(viewer) as (client, _):
-        newest(client)
         client.set("Frame", 5)
-        while True:
-            position = client.wait_for("SetCameraPositionMessage")
-            if not position.get("initial"):
-                break
+        while (position := client.wait_for("SetCameraPositionMessage")).get("initial"):
+            pass
         np.testing.assert_allclose(position["position"], as_array(frame.camera.center), atol=1e-6)
 
 
-def test_a_mesh_of_the_run_is_sent_when_it_is_wanted(viewer, tmp_path):
+def test_a_mesh_of_the_run_and_its_cameras_are_sent_when_they_are_wanted(viewer, tmp_path):
     with connected(viewer) as (client, _):
-        newest(client)
-        client.set("Mesh", True)
+        client.set("Show", "mesh")
         mesh = client.wait_for("GlbMessage")
         assert mesh["name"] == "/mesh"
-        sent = tmp_path / "sent.glb"
-        sent.write_bytes(mesh["props"]["glb_data"])
-        np.testing.assert_array_equal(read_mesh(sent).vertices, np.eye(3))
-
-
-def test_cameras_come_with_their_pictures(viewer):
-    with connected(viewer) as (client, _):
+        (tmp_path / "sent.glb").write_bytes(mesh["props"]["glb_data"])
+        np.testing.assert_array_equal(read_mesh(tmp_path / "sent.glb").vertices, np.eye(3))
+        assert client.picture().shape == (1, 1, 3)  # black
+        client.set("Show", "colour")
         newest(client)
         client.set("Cameras", True)
-        names = {client.wait_for("CameraFrustumMessage")["name"] for _ in viewer.content.frames}
-    assert names == {f"/cameras/{frame.name}" for frame in viewer.content.frames}
+        frames = viewer.trained.scene.video
+        names = {client.wait_for("CameraFrustumMessage")["name"] for _ in frames}
+    assert names == {f"/cameras/{frame.name}" for frame in frames}
 
 
 def test_a_browser_that_leaves_is_forgotten(viewer):
-    with connected(viewer) as (client, _):
-        newest(client)
+    with connected(viewer):
         assert viewer.sessions
-    for _ in range(100):
-        if not viewer.sessions:
-            return
+    ends = time.monotonic() + 10.0
+    while viewer.sessions:
+        assert time.monotonic() < ends, "the session is still there"
         time.sleep(0.1)
-    raise AssertionError("the session is still there")
 
 
-def test_a_port_in_use_is_one_clear_error(anchors, capsys):
+def test_a_path_that_is_set_in_the_view(viewer):
+    run, file = viewer.trained.run.path, viewer.trained.run.path / "camera-path.json"
+    with connected(viewer) as (_, camera):
+        session = session_of(viewer)
+        session.add_keyframe()
+        session.save_path()
+        assert session.path_line.content == "A path needs two keyframes or more." and not file.exists()
+        session.add_keyframe()
+        session.add_keyframe()
+        session.remove_keyframe()
+        session.save_path()
+        assert session.path_line.content == f"Saved. Its video: `coliags render {run} --path {file}`"
+    path = CameraPath.read(file)
+    assert len(path.keyframes) == 2 and json.loads(file.read_text())["seconds"] == 2.0
+    np.testing.assert_allclose(path.keyframes[0].camera_to_world, camera.camera_to_world, atol=1e-6)
+    file.unlink()
+
+
+def test_newer_checkpoints_are_taken_up(anchors, wall, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "CHECKED", 0.05)
+    shutil.copytree(anchors.path, tmp_path / "run")
+    longer = cp.train("coliags", wall, tmp_path / "longer", steps=3, settings=parse_assignments(SMALL))
+    with cp.load_run(tmp_path / "run").view(port=0) as viewer, connected(viewer) as (client, camera):
+        assert session_of(viewer)._about.content.startswith("Step 2; 9 frames, 2 held out")
+        (newer,) = (longer.path / "checkpoints").glob("step-*3")
+        shutil.copytree(newer, tmp_path / "copy")
+        (tmp_path / "copy").rename(tmp_path / "run" / "checkpoints" / newer.name)
+        assert_like(newest(client), eight_bit(render_view(longer.load(), browsers(camera)).rgb))
+        assert session_of(viewer)._about.content.startswith("Step 3;")
+
+
+# While a run is trained
+
+
+def test_a_browser_sees_what_the_newest_step_has_of_a_run_that_stays_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "_SHARE", 1.0)
+    options = {"steps": 10, "overrides": EARLY_GROWTH}
+    alone, watched = make_trainer(tmp_path / "a", **options), make_trainer(tmp_path / "b", **options)
+    alone.start()
+    alone.train()
+    watched.start()
+    view = live.LiveView(watched, port=0)
+    camera = watched.scene.train[1].camera
+    with ViserClient(view.viewer.port) as client:
+        client.look(camera)
+        session_of(view.viewer)
+        watched.train(followers=[view])
+        assert client.picture().shape[2] == 3
+    assert_same(final_state(alone), final_state(watched))
+    again = live.LiveView(watched, port=0)
+    with ViserClient(again.viewer.port) as client:
+        client.look(camera)
+        session = session_of(again.viewer)
+        time.sleep(live.REST)
+        again.stepped(7)
+        assert_like(newest(client), eight_bit(render_view(again.viewer.trained, browsers(camera)).rgb))
+        assert session._about.content.startswith("Step 7;")
+    again.close()
+
+
+def test_drawing_takes_a_share_of_the_time(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path / "run")
+    trainer.start()
+    view, now, drawn = live.LiveView(trainer, port=0), [0.0], []
+
+    def draw():
+        drawn.append(view.viewer.trained.step)
+        now[0] += 2.0
+
+    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(view.viewer, "draw", draw)
+    for step in range(1, 31):
+        now[0] += 1.0
+        view.stepped(step)
+    monkeypatch.undo()
+    view.close()
+    assert drawn == [1, 9, 17, 25]  # 2 s of drawing, then 8 s of training
+
+
+# Addresses
+
+
+def test_a_port_in_use_is_one_clear_error(anchors, wall, tmp_path, capsys):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(InputError, match=f"--port {port} is in use.*--port {port + 1}"):
+        message = f"--port {port} is in use.*--port {port + 1}"
+        with pytest.raises(InputError, match=message):
             anchors.view(port=port)
         assert f"--port {port} is in use" in refused(capsys, "view", anchors.path, "--port", port, "--no-open")
+        with pytest.raises(InputError, match=message):
+            cp.train("coliags", wall, tmp_path / "run", steps=1, view_port=port)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -193,16 +288,11 @@ def test_no_browser_is_opened_without_a_display(viewer, monkeypatch):
     monkeypatch.setattr(serving.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(serving.webbrowser, "open", lambda url: pytest.fail("opened"))
-    assert viewer.open() is False
-    monkeypatch.setenv("DISPLAY", ":0")
     opened = []
-    monkeypatch.setattr(serving.webbrowser, "open", lambda url: opened.append(url) or True)
+    monkeypatch.setattr(live.webbrowser, "open", lambda url: opened.append(url) or True)
+    assert viewer.open() is False and opened == []
+    monkeypatch.setenv("DISPLAY", ":0")
     assert viewer.open() is True and opened == [viewer.url]
-
-
-def test_nothing_is_printed(viewer, capsys):
-    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.thorough
@@ -220,3 +310,13 @@ def test_ctrl_c_ends_the_command_cleanly(anchors, request):
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     assert out == "ended\n" and "Traceback" not in err and "server" not in err
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("method", "settings"), [("2dgs", {}), ("reim-nerf-small", {"field.width": 8})])
+def test_surfels_and_radiance_fields_are_drawn_too(run_of, method, settings):
+    run = run_of(method, *(f"{key}={value}" for key, value in settings.items()))
+    with run.view(port=0) as viewer, connected(viewer) as (client, camera):
+        client.set("Most pixels across", 64)
+        client.look(replace(camera))
+        assert_like(newest(client), eight_bit(render_view(viewer.trained, browsers(camera)).rgb))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import viser
@@ -14,7 +16,6 @@ from viser._messages import GuiUpdateMessage, ViewerCameraMessage
 from websockets.sync.client import connect
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.export.viewer.content import vertical_fov
 
 #: Of the window, px.
 WIDTH, HEIGHT = 64, 48
@@ -48,7 +49,7 @@ class ViserClient:
             ViewerCameraMessage(
                 wxyz=tuple(transforms.SO3.from_matrix(matrix[:3, :3]).wxyz),
                 position=tuple(position),
-                fov=vertical_fov(camera),
+                fov=2.0 * math.atan(0.5 * camera.height / camera.fy),
                 near=0.01,
                 far=1000.0,
                 image_height=HEIGHT,
@@ -76,6 +77,12 @@ class ViserClient:
                     return message
             self.messages += self._received(ends - time.monotonic())
 
+    def picture(self, seconds: float = 30.0) -> np.ndarray:
+        """The next picture behind the scene, RGB. [H, W, 3]"""
+        while (data := self.wait_for("BackgroundImageMessage", seconds)["rgb_data"]) is None:
+            pass  # viser clears the scene of a new browser
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
     def _received(self, seconds: float) -> list[dict[str, Any]]:
         """Messages of one packet, arrays in their places."""
         data = self._socket.recv(timeout=max(0.0, seconds))
@@ -96,13 +103,3 @@ def _filled(value: Any, buffers: list[bytes]) -> Any:
             return np.frombuffer(buffers[value["__binary_index"]], value["dtype"])
         return {key: _filled(inner, buffers) for key, inner in value.items()}
     return [_filled(inner, buffers) for inner in value] if isinstance(value, (list, tuple)) else value
-
-
-def splats_of(buffer: np.ndarray) -> dict[str, np.ndarray]:
-    """Centres, covariances (upper triangle) and RGBA in viser's buffer. [N, 3], [N, 6], [N, 4]"""
-    rows = np.ascontiguousarray(buffer).view(np.uint8).reshape(-1, 32)
-    return {
-        "centers": rows[:, :12].copy().view(np.float32),
-        "covariances": rows[:, 16:28].copy().view(np.float16),
-        "rgba": rows[:, 28:],
-    }
