@@ -25,7 +25,6 @@ def reconstruct(
     jobs: int | None = None,
     threads: int | None = None,
     ray_address: str | None = None,
-    budget: float | None = None,
 ) -> Record | FinishedProcedure:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
@@ -43,7 +42,6 @@ def reconstruct(
         jobs: Worker processes at a time; None: one per CPU, or per GPU.
         threads: CPU threads of each; None: the CPUs divided by the jobs.
         ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
-        budget: Seconds that it may take, by forecast: training steps, then frames, are reduced; None: any.
 
     Returns:
         The record: what each stage made, with which options, in what time. Of a video that is longer than a segment
@@ -66,4 +64,4 @@ def reconstruct(
     masked = None if mask is None else Path(mask)
     with progress_callback() as progress:
         where = choose_device("cpu" if by_workers else device)
-        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, execution, budget)
+        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, execution)

@@ -51,8 +51,6 @@ class ReconstructCommand:
     """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
     steps: arguments.OptionalInt = None
     """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
-    budget: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="30min|2h")] = None
-    """Time that it may take, by forecast: training steps, then frames, are reduced to fit; default: any."""
     executor: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="local|ray")] = None
     """Have sub-maps done at the same time, by processes of this machine or of a Ray cluster; default: one after the
     other, unless --jobs is given."""
@@ -74,7 +72,6 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.pipeline.forecast import seconds_of
         from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
         from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE
@@ -103,7 +100,6 @@ class ReconstructCommand:
             jobs=self.jobs,
             threads=self.threads,
             ray_address=self.ray_address,
-            budget=None if self.budget is None else seconds_of(self.budget),
         )
         if isinstance(made, FinishedProcedure):
             self._tell(made)

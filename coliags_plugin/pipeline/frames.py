@@ -49,7 +49,7 @@ class KeptFrame(_Part):
 
     frame: int  # number in the video
     name: FrameName
-    blurred: bool = False  # of use for poses alone
+    blurred: bool  # of use for poses alone
 
 
 class DroppedFrame(_Part):
@@ -63,8 +63,8 @@ class FramesRecord(_Part):
     """Content of ``frames.json``, as far as it is read again."""
 
     kept: list[KeptFrame]
-    dropped: list[DroppedFrame] = []
-    deinterlaced: bool = False
+    dropped: list[DroppedFrame]
+    deinterlaced: bool
 
     @classmethod
     def read(cls, folder: Path) -> FramesRecord | None:

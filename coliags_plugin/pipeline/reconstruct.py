@@ -12,17 +12,17 @@ from coliags_plugin.core.files import refuse_overlap
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
-from coliags_plugin.execution.choice import ExecutionOptions, available_cpus, make_executor
+from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.forecast import forecast, within_budget
+from coliags_plugin.pipeline.forecast import forecast
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
 from coliags_plugin.pipeline.recordings import opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
-from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, run_stages
+from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,6 @@ def reconstruct(
     overwrite: bool = False,
     progress: Progress | None = None,
     execution: ExecutionOptions | None = None,
-    budget: float | None = None,
 ) -> Record | FinishedProcedure:
     """Reconstruct a video, or go on with what was begun; arguments as in :func:`coliags_plugin.reconstruct`.
 
@@ -58,14 +57,7 @@ def reconstruct(
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
         video = frame_source(source, Span(frames.first, frames.last, frames.seek))
-        if budget is not None:
-            settings = within_budget(video, settings, budget, _cores(execution))
-            frames = settings.frames
-            log.info("within the budget: one of %d frames, %d steps of a hundred", frames.every, settings.steps)
-        expected = forecast(video, settings)
-        log.info("%s", expected)
-        if not (out / RECORD_FILE).is_file():
-            expected.check_disk(out)
+        log.info("%s", forecast(video, settings))
         is_long = is_procedure(video, frames.every, frames.segment)
     else:
         _refuse_unused(source, settings, mask)
@@ -87,14 +79,6 @@ def reconstruct(
     if failure is not None:
         raise failure
     return record
-
-
-def _cores(execution: ExecutionOptions | None) -> float:
-    """CPU cores that work at a time."""
-    cpus = available_cpus()
-    if execution is None or execution.executor != "local" or execution.jobs is None:
-        return cpus
-    return min(cpus, execution.jobs * (execution.threads or max(1, cpus // execution.jobs)))
 
 
 def _by_workers(context: StageContext, execution: ExecutionOptions, overwrite: bool) -> Record:

@@ -30,8 +30,8 @@ from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
 
-#: Name of the file, and version of its schema.
-RECORD_FILE, _FORMAT = "reconstruction.json", 1
+#: Name of the file, and version of the schema of what a reconstruction records.
+RECORD_FILE, FORMAT = "reconstruction.json", 1
 #: Page that leads to everything a reconstruction has made.
 PAGE_FILE = "index.html"
 #: Lock that a process holds while it works in the folder.
@@ -145,7 +145,7 @@ class Record:
     def write(self) -> None:
         """Write the file atomically."""
         stages = {n: asdict(stage) for n, stage in self.stages.items() if not self._is_worker or n in self._own}
-        write_json(self._file, {"format": _FORMAT, "version": __version__, "stages": stages})
+        write_json(self._file, {"format": FORMAT, "version": __version__, "stages": stages})
 
 
 def _worker_file(name: str) -> str:
@@ -154,12 +154,24 @@ def _worker_file(name: str) -> str:
 
 def _read(file: Path) -> dict[str, StageRecord]:
     try:
-        return _RECORDED.validate_python(parse_json(json_text(file))["stages"])
+        content = parse_json(json_text(file))
+        check_format(file, content)
+        return _RECORDED.validate_python(content["stages"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
         raise InputError(
             f"cannot read {file}: {told}", "what `coliags reconstruct` wrote", "Choose another --output"
         ) from error
+
+
+def check_format(file: Path, content: Any) -> None:
+    """Refuse the record of another version of this package."""
+    if isinstance(content, dict) and content.get("format") != FORMAT:
+        raise InputError(
+            f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
+            f"format {FORMAT}, of version {__version__}",
+            "Choose another --output, or go on with that version",
+        )
 
 
 def _is_ours(path: Path) -> bool:

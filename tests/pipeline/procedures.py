@@ -60,6 +60,7 @@ def procedure_content(**changes):
         "first": 0,
         "options": {},
         "seek": True,
+        "deinterlace": False,
         "frames": FRAMES,
         "rate": RATE,
         "size": [40, 32],
@@ -80,8 +81,8 @@ def write_segment(folder: Path, first: int) -> None:
     images = folder / "frames" / "images"
     shutil.copytree(poses / "images", images)
     write_image(images / "lost.png", np.zeros((32, 40, 3), np.uint8))
-    kept = [{"frame": first + index, "name": name} for index, name in enumerate(names)]
-    write_json(folder / "frames" / "frames.json", {"kept": kept, "dropped": []})
+    kept = [{"frame": first + index, "name": name, "blurred": False} for index, name in enumerate(names)]
+    write_json(folder / "frames" / "frames.json", {"kept": kept, "dropped": [], "deinterlaced": False})
     record = record_in(folder)
     record.stages["evaluate"] = done({"run/eval/paper": "metrics"}, psnr=24.0, ssim=0.85, held_out=2)
     record.stages["report"] = done()

@@ -153,14 +153,15 @@ def test_frames_are_counted_from_where_the_survey_began(out):
 
 def test_a_long_video_has_a_time_line_of_bounded_size(out):
     frames = 8000
-    kept = [{"frame": frame, "name": f"frame_{frame:06d}"} for frame in range(frames)]
+    kept = [{"frame": frame, "name": f"frame_{frame:06d}", "blurred": False} for frame in range(frames)]
     atlas = {
         "frames": [f"{one['name']}.png" for one in kept],
         "submaps": [{"model": "sparse/0", "unit": "unknown", "frames": [*range(0, frames, 2)]}],
+        "joins": [],
         "lost": [{"frame": frame, "reason": "blurred"} for frame in range(1, frames, 2)],
     }
     write_json(out / "segment-000" / "poses" / "atlas.json", atlas)
-    write_json(out / "segment-000" / "frames" / "frames.json", {"kept": kept})
+    write_json(out / "segment-000" / "frames" / "frames.json", {"kept": kept, "dropped": [], "deinterlaced": False})
     segments = [{"name": "segment-000", "first": 0, "last": frames - 1}]
     write_json(out / "procedure.json", procedure_content(frames=frames, segments=segments, skipped=[], joins=[]))
     procedure = read_procedure(out)

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE, Procedure
 from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, Stage, StageOutcome, run_stages
 
 
@@ -95,9 +96,16 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match="already exists and is no reconstruction"):
         Record.of(tmp_path)
-    (tmp_path / RECORD_FILE).write_text('{"stages": 3}')
+    (tmp_path / RECORD_FILE).write_text('{"format": 1, "stages": 3}')
     with pytest.raises(InputError, match=r"cannot read .*reconstruction.json"):
         Record.of(tmp_path)
+
+
+def test_records_of_other_versions_are_refused(tmp_path):
+    for name, read in ((RECORD_FILE, Record.of), (PROCEDURE_FILE, Procedure.read)):
+        (tmp_path / name).write_text('{"format": 0, "version": "0.0.1", "stages": {}}')
+        with pytest.raises(InputError, match=rf"{name} is of version 0\.0\.1 .*Choose another --output"):
+            read(tmp_path)
 
 
 def test_the_record_is_json_with_version(tmp_path):

@@ -46,8 +46,8 @@ class AtlasRecord(_Part):
 
     frames: list[str]  # names of the images in order: frames are numbered from 0
     submaps: list[AtlasStretch]
-    joins: list[AtlasJoin] = []
-    lost: list[LostFrame] = []
+    joins: list[AtlasJoin]
+    lost: list[LostFrame]
 
 
 def read_atlas(scene: Path) -> AtlasRecord | None:

@@ -11,14 +11,16 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
+from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import json_text
+from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.settings import first_error
 from coliags_plugin.pipeline.procedure.segments import Segment, Skipped, Stretch
+from coliags_plugin.pipeline.stages import FORMAT, check_format
 
-#: Name of the file, and version of its schema.
-PROCEDURE_FILE, _FORMAT = "procedure.json", 1
+#: Name of the file.
+PROCEDURE_FILE = "procedure.json"
 #: Most frames of a video: a day at 60 a second.
 _MOST_FRAMES = 6_000_000
 #: Error of a rotation matrix in double precision that is written as JSON.
@@ -70,10 +72,10 @@ class Procedure(_Part):
     first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)]  # at which the survey began
     options: dict[str, Any]  # of cutting
     seek: bool  # whether frames are found by their number
-    deinterlace: bool = False  # whether they were read so
+    deinterlace: bool  # whether they were read so
     segments: Sequence[Segment]
     skipped: Sequence[Skipped]
-    joins: Sequence[SegmentJoin] = ()
+    joins: Sequence[SegmentJoin]
 
     @model_validator(mode="after")
     def _within_the_video(self) -> Self:
@@ -92,7 +94,7 @@ class Procedure(_Part):
 
     def write(self, folder: Path) -> None:
         """Write ``procedure.json``."""
-        write_json(folder / PROCEDURE_FILE, {"format": _FORMAT, **self.model_dump(mode="json")})
+        write_json(folder / PROCEDURE_FILE, {"format": FORMAT, "version": __version__, **self.model_dump(mode="json")})
 
     @classmethod
     def read(cls, folder: Path) -> Procedure | None:
@@ -101,7 +103,9 @@ class Procedure(_Part):
         if not file.is_file():
             return None
         try:
-            return cls.model_validate_json(json_text(file), strict=True)
+            text = json_text(file)
+            check_format(file, parse_json(text))
+            return cls.model_validate_json(text, strict=True)
         except (OSError, ValueError) as error:
             told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
             raise InputError(f"cannot read {file}: {told}", "what `coliags reconstruct` wrote") from error
