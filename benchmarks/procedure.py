@@ -44,9 +44,9 @@ from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
 from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.outputs.video import write_video
+from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
 from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
-from coliags_plugin.pipeline.submaps import Submap
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.views import CoverageView
 from coliags_plugin.surface.coverage.visibility import Level

@@ -51,15 +51,12 @@ def train_command(scene: Path, method: str = "coliags", assignments: Sequence[st
     return coliags("train", method, "--data", scene, *_set(assignments))
 
 
-def depth_commands(scene: Path, assignments: Sequence[str] = ()) -> list[str]:
-    """The commands that estimate the depth of a scene with poses and points, and train on it.
-
-    ``assignments`` are options of its data manager, ``datamanager.KEY=VALUE``.
-    """
+def depth_commands(scene: Path) -> list[str]:
+    """The commands that estimate the depth of a scene with poses and points, and train on it."""
     with_depth = scene.with_name(f"{scene.name}-depth")
     return [
-        coliags("depth", "estimate", scene, "--output", with_depth, *_set(assignments)),
-        train_command(with_depth, ESTIMATED_DEPTH_METHOD, assignments),
+        coliags("depth", "estimate", scene, "--output", with_depth),
+        train_command(with_depth, ESTIMATED_DEPTH_METHOD),
     ]
 
 

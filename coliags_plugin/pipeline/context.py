@@ -1,4 +1,4 @@
-"""Folders of a reconstruction and of its sub-maps, with what their stages share."""
+"""Sub-maps of a reconstruction, folders of both, and what their stages share."""
 
 from __future__ import annotations
 
@@ -8,14 +8,50 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.datamanagers.colmap.files import find_models
+from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frames import read_blurred
 from coliags_plugin.pipeline.settings import ReconstructionSettings
-from coliags_plugin.pipeline.submaps import LARGEST, Submap, find_submaps
 
 if TYPE_CHECKING:
     import torch
 
     from coliags_plugin.core.scenes import Frame, Scene
+
+
+@dataclass(frozen=True)
+class Submap:
+    """A model of a scene. The first, number 0, is the largest that structure from motion has found."""
+
+    number: int = 0
+    model: str | None = None  # its folder, relative to the scene; None: the only one, which the data manager finds
+    frames: int | None = None  # that have a pose in it; None: not counted, as it is the only one
+
+    @property
+    def folder(self) -> str:
+        """Folder of its results, relative to the reconstruction's; empty for the first."""
+        return f"submap-{self.number}" if self.number else ""
+
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return f"sub-map {self.number}"
+
+
+LARGEST = Submap()
+
+
+def find_submaps(scene: Path, least: int) -> list[Submap]:
+    """The first model of a scene in COLMAP's layout, and the others that have ``least`` frames or more."""
+    models = [folder for folder in find_models(scene) if folder.name.isdecimal()]
+    if len(models) < 2:
+        return [LARGEST]
+    counts = [len(colmap.read(folder).camera_to_world) for folder in models]
+    return [
+        Submap(number, folder.relative_to(scene).as_posix(), count)
+        for number, (folder, count) in enumerate(zip(models, counts, strict=True))
+        if number == 0 or count >= least
+    ]
 
 
 @dataclass(frozen=True)

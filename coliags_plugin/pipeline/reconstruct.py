@@ -16,11 +16,10 @@ from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.forecast import forecast
-from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.frame_sources import Span, frame_source, opened_recording
 from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
-from coliags_plugin.pipeline.recordings import opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings

@@ -8,7 +8,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.datamanagers.rgbd.writer import TRAJECTORY, write_frame
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import FisheyeLens
-from coliags_plugin.geometry.lenses.vicalib import calibration_text
+from coliags_plugin.geometry.lenses.vicalib import TYPE
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout
@@ -43,3 +43,17 @@ class EndoMapperLayout(Layout):
         tum.write(folder / TRAJECTORY, Trajectory(poses, timestamps=np.arange(len(poses), dtype=np.float64)))
         atomic_write(folder / CALIBRATION, calibration_text(lens, DEPTH_SCALE))
         write_unit(folder, "mm")
+
+
+def calibration_text(lens, depth_scale=None):
+    """A calibration file of Vicalib: pixel centres at integers, and perhaps depth steps per scene unit."""
+    k = lens.pinhole
+    params = (k.fx, k.fy, k.cx - 0.5, k.cy - 0.5, lens.k1, lens.k2, lens.k3, lens.k4)
+    scale = "" if depth_scale is None else f"      <depth_scale> {depth_scale!r} </depth_scale>\n"
+    return (
+        "<rig>\n  <camera>\n"
+        f'    <camera_model name="" index="0" serialno="0" type="{TYPE}" version="8">\n'
+        f"      <width> {lens.width} </width>\n      <height> {lens.height} </height>\n"
+        f"      <params> [ {'; '.join(map(repr, params))} ] </params>\n{scale}"
+        "    </camera_model>\n  </camera>\n</rig>\n"
+    )

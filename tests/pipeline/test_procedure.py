@@ -26,8 +26,7 @@ from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.procedure import run
 from coliags_plugin.pipeline.procedure.joins import PosedFrames, joins
 from coliags_plugin.pipeline.procedure.record import Procedure
-from coliags_plugin.pipeline.procedure.segments import OVERLAP, Stretch, cut
-from coliags_plugin.pipeline.procedure.survey import Survey, survey_video
+from coliags_plugin.pipeline.procedure.segments import OVERLAP, Stretch, Survey, cut, survey_video
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from tests import commands

@@ -18,13 +18,13 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.morphology import eroded
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
-from coliags_plugin.geometry.lenses.vicalib import calibration_text
 from coliags_plugin.pipeline import capture_stages
-from coliags_plugin.pipeline.recordings import opened_recording
+from coliags_plugin.pipeline.frame_sources import opened_recording
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
 from tests import commands
+from tests.layouts.endomapper import calibration_text
 from tests.pipeline.conftest import CAPTURE, TRAINING
 from tests.pipeline.films import HEIGHT, WIDTH, film, write_images
 

@@ -19,10 +19,9 @@ from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline import capture_stages, training_stages
-from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.context import StageContext, Submap, find_submaps
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
-from coliags_plugin.pipeline.submaps import Submap, find_submaps
 from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
 from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas

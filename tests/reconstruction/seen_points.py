@@ -39,7 +39,7 @@ def seen_points(shift=0.0):
         fx, fy, cx, cy = INTRINSICS
         observed.append(SeenPoints(local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy), numbers))
     model = frame_model(frames)
-    add_points(model, observed, positions, np.zeros((len(positions), 3), np.uint8), np.ones(len(positions)))
+    add_points(model, observed, positions, np.zeros((len(positions), 3), np.uint8))
     return model, observed
 
 

@@ -25,9 +25,8 @@ from coliags_plugin.reconstruction.structure.adjustment import (
     widest_between,
 )
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
-from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
+from coliags_plugin.reconstruction.structure.colmap_scene import draw_ribbon, write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images
-from coliags_plugin.reconstruction.structure.ribbon import draw_ribbon
 from coliags_plugin.reconstruction.structure.sfm import Atlas, _apart, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
 from tests.reconstruction.seen_points import COMMON, COUNT, GAP, frame_points, seen_points

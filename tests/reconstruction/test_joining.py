@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.images import write_image
-from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure import joining, sfm
 from coliags_plugin.reconstruction.structure.atlas import part_of
+from coliags_plugin.reconstruction.structure.features import quiet_colmap
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis
 from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.joining import join_models, stretches_of

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, LampFacts, PathFacts
-from coliags_plugin.checks.data.hypotheses import ADVICE, GIVEN, NO_MOTION
 from coliags_plugin.checks.data.matches import EpipolarAgreement
-from coliags_plugin.checks.data.reprojection import Agreement, BestScale
+from coliags_plugin.checks.data.reprojection import ADVICE, GIVEN, NO_MOTION, Agreement, BestScale
 from coliags_plugin.core.scenes import Frame
 
 #: Largest median depth difference of agreeing frames, relative to the depth, if it is true; and if it is estimated: two

@@ -6,18 +6,21 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.checks.data.hypotheses import CHANGES, GIVEN
+from coliags_plugin.checks.data.reprojection import CHANGES, GIVEN
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
+from coliags_plugin.reconstruction.structure.matching import have_positive_depths, mutual_matches
 from coliags_plugin.reconstruction.structure.point_tracks import track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
+#: Features that are matched; largest ratio in Lowe's test, and largest distance of descriptors.
+_FEATURES, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE = FeatureSettings(max_features=2000), 0.8, 0.7
 #: Smallest number of matches of a usable pair.
 _MIN_MATCHES = 8
 #: An epipolar geometry passes through seven matches whatever they are. Smallest share of the others that it explains if
@@ -63,33 +66,17 @@ class EpipolarAgreement:
 
 
 def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FrameMatches]:
-    """Mutual best matches of SIFT features on CLAHE images that some epipolar geometry explains, whatever the poses.
+    """Mutual best matches of SIFT features that some epipolar geometry explains, whatever the poses.
 
     Pairs with few matches, or with no more that agree on a geometry than random ones would, are left out.
     """
-    import cv2
-
-    detector: Any = cv2.SIFT.create(nfeatures=2000, contrastThreshold=0.01)
-    contrast = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8))
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
     matches = []
-    for source, target in pairs:
-        described = []
-        for frame in (source, target):
-            gray = contrast.apply(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY))
-            described.append(detector.detectAndCompute(gray, frame.valid.numpy().astype(np.uint8)))
-        (points, features), (points_there, features_there) = described
-        if features is None or features_there is None or min(len(points), len(points_there)) < _MIN_MATCHES:
-            continue
-        forward = [m for m, n in matcher.knnMatch(features, features_there, k=2) if m.distance < 0.8 * n.distance]
-        back = {m.queryIdx: m.trainIdx for m in matcher.match(features_there, features)}
-        mutual = [m for m in forward if back.get(m.trainIdx) == m.queryIdx]
-        if len(mutual) < _MIN_MATCHES:
-            continue
-        # OpenCV has pixel centres at integers.
-        here = np.array([points[m.queryIdx].pt for m in mutual]) + 0.5
-        there = np.array([points_there[m.trainIdx].pt for m in mutual]) + 0.5
-        matches += _explained(source, target, here, there)
+    with quiet_colmap(0):
+        extract = feature_extractor(_FEATURES)
+        for pair in pairs:
+            one, other = (extract(frame.image.numpy(), frame.valid.numpy()) for frame in pair)
+            here, there = mutual_matches(one, other, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE).T
+            matches += _explained(*pair, one.pixels[here], other.pixels[there])
     return matches
 
 
@@ -181,16 +168,8 @@ def _epipolar_errors(pair: FrameMatches, change: str) -> tuple[np.ndarray, np.nd
     with np.errstate(divide="ignore", invalid="ignore"):
         far = (turned / turned[:, 2:]) @ matrices[1].T
     parallax = np.where(turned[:, 2] > 0.0, np.linalg.norm(far[:, :2] - pair.pixels_there, axis=1), np.inf)
-    return distance, _in_front(turned, rays_there, translation), parallax
+    return distance, have_positive_depths(turned, rays_there, translation), parallax
 
 
 def _homogeneous(pixels: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 3"]:
     return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-
-
-def _in_front(turned: np.ndarray, there: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Whether the least-squares solution of ``a turned + translation = b there`` has a, b > 0. [K]"""
-    aa, bb, ab = (turned**2).sum(1), (there**2).sum(1), (turned * there).sum(1)
-    at, bt = turned @ translation, there @ translation
-    determinant = np.maximum(aa * bb - ab**2, 1e-30)
-    return np.asarray(((ab * bt - bb * at) / determinant > 0) & ((aa * bt - ab * at) / determinant > 0))

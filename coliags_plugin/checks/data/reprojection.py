@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +10,40 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from coliags_plugin.checks.data.hypotheses import CHANGES, GIVEN, Change
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
+
+Change = Callable[[Float[Tensor, "4 4"]], Float[Tensor, "4 4"]]
+
+#: The poses as they are.
+GIVEN = "given"
+#: Identity poses, the baseline that the given poses must beat.
+NO_MOTION = "no motion"
+
+
+def _transposed(pose: Tensor) -> Tensor:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3].T
+    return turned
+
+
+CHANGES: dict[str, Change] = {
+    GIVEN: lambda pose: pose,
+    NO_MOTION: lambda pose: torch.eye(4, dtype=pose.dtype),
+    "world-to-camera": torch.linalg.inv,
+    "rotation transposed": _transposed,
+    "translation of opposite sign": lambda pose: pose * pose.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4]),
+    "camera axes y up, z backward": lambda pose: pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0]),
+}
+
+#: Advice where a hypothesis fits.
+ADVICE = {
+    "world-to-camera": "The poses look like world-to-camera transforms; write camera-to-world, their inverses",
+    "rotation transposed": "The rotations look transposed: the program that wrote the file confused rows and columns",
+    "translation of opposite sign": "The translations look negated: check the sign in the program that wrote the file",
+    "camera axes y up, z backward": "The camera axes look like OpenGL's; negate the second and third column",
+}
+
 
 #: Largest number of pixels reprojected per frame.
 _PIXELS = 4000

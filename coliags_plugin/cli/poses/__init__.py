@@ -8,9 +8,8 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli import arguments
-from coliags_plugin.cli.poses.export import PosesExportCommand
 from coliags_plugin.cli.poses.structure import PosesSfmCommand
-from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand
+from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand, PosesExportCommand
 
 Subcommand = (
     Annotated[PosesConvertCommand, tyro.conf.subcommand("convert")]

@@ -27,12 +27,10 @@ def add_points(
     seen: Sequence[SeenPoints],
     positions: Float[np.ndarray, "N 3"],
     colors: UInt8[np.ndarray, "N 3"],
-    errors: Float[np.ndarray, "N"] | None = None,
 ) -> None:
     """Add points, in scene units, to a model of posed images; point k gets COLMAP's ID k + 1.
 
-    ``seen`` are the observations of each image; image i has ID i + 1. ``errors`` are mean reprojection errors, pixels,
-    computed where they are None.
+    ``seen`` are the observations of each image; image i has ID i + 1.
     """
     import pycolmap
 
@@ -41,15 +39,9 @@ def add_points(
         model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in here.pixels])
         for index, point in enumerate(here.points):
             tracks[point].add_element(number, index)
-    numbers = [
+    for position, track, color in zip(positions, tracks, colors, strict=True):
         model.add_point3D(position, track, color)
-        for position, track, color in zip(positions, tracks, colors, strict=True)
-    ]
-    if errors is None:
-        model.update_point_3d_errors()
-        return
-    for number, error in zip(numbers, errors, strict=True):
-        model.points3D[number].error = float(error)
+    model.update_point_3d_errors()
 
 
 def write_model(folder: Path, model: pycolmap.Reconstruction, number: int = 0) -> None:

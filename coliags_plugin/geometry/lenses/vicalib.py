@@ -66,20 +66,6 @@ def calibration_files(folder: Path) -> list[Path]:
     return [path for path in candidates if path.suffix.lower() == SUFFIX and _mentions_camera(path)]
 
 
-def calibration_text(lens: FisheyeLens, depth_scale: float | None = None) -> str:
-    """The content of a calibration file; ``depth_scale`` as of :class:`Calibration`."""
-    k = lens.pinhole
-    params = (k.fx, k.fy, k.cx - _CENTER, k.cy - _CENTER, lens.k1, lens.k2, lens.k3, lens.k4)
-    scale = "" if depth_scale is None else f"      <depth_scale> {depth_scale!r} </depth_scale>\n"
-    return (
-        "<rig>\n  <camera>\n"
-        f'    <camera_model name="" index="0" serialno="0" type="{TYPE}" version="8">\n'
-        f"      <width> {lens.width} </width>\n      <height> {lens.height} </height>\n"
-        f"      <params> [ {'; '.join(map(repr, params))} ] </params>\n{scale}"
-        "    </camera_model>\n  </camera>\n</rig>\n"
-    )
-
-
 def _mentions_camera(path: Path) -> bool:
     try:
         return path.is_file() and "<camera_model" in whole_text(path)

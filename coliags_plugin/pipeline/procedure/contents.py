@@ -18,8 +18,7 @@ from coliags_plugin.datamanagers.units import Unit
 from coliags_plugin.pipeline.frames import IMAGES, MADE, FramesRecord
 from coliags_plugin.pipeline.page import SubmapResults, results_of
 from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE, ModelKey, Procedure
-from coliags_plugin.pipeline.procedure.segments import Segment
-from coliags_plugin.pipeline.procedure.survey import SURVEY_FILE
+from coliags_plugin.pipeline.procedure.segments import SURVEY_FILE, Segment
 from coliags_plugin.pipeline.stages import Record
 
 #: Arrays of the survey that are shown.

@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.features import (
     Features,
     FeatureSettings,
     feature_extractor,
     image_and_mask,
+    quiet_colmap,
 )
 from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,7 @@ Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None
 def feature_extractor(settings: FeatureSettings) -> Extractor:
     """Create a reusable feature extractor: CLAHE, COLMAP's SIFT, and rejection of masked features.
 
-    Call it within :func:`~coliags_plugin.reconstruction.libraries.quiet_colmap`.
+    Call it within :func:`quiet_colmap`.
     """
     import cv2
     import pycolmap
@@ -131,3 +132,21 @@ def brightness(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
     """The largest of the three channels, many times as fast as by ``max``."""
     red, green, blue = np.moveaxis(image, -1, 0)
     return np.asarray(np.maximum(np.maximum(red, green), blue))
+
+
+#: glog's level FATAL.
+_FATAL = 3
+
+
+@contextmanager
+def quiet_colmap(seed: int) -> Iterator[None]:
+    """Silence COLMAP's log and seed its global random generator."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = _FATAL
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

@@ -142,11 +142,11 @@ def _epipolar_candidates(
     error = np.abs(np.einsum("ij,ij->i", line_in_other[one], ray_other[other]))
     near = error <= max_error * np.hypot(slope_other[one], slope_one[other])
     one, other = one[near], other[near]
-    front = _have_positive_depths(ray_one[one] @ rotation.T, ray_other[other], translation)
+    front = have_positive_depths(ray_one[one] @ rotation.T, ray_other[other], translation)
     return one[front], other[front]
 
 
-def _have_positive_depths(turned: np.ndarray, other: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def have_positive_depths(turned: np.ndarray, other: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """Whether the lines ``a * turned + translation`` and ``b * other`` are closest at positive a and b. [K]"""
     aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (other, other), (turned, other)))
     at, bt = turned @ translation, other @ translation

@@ -17,9 +17,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Again, Link, contradictions, link_at, part_of, weak_links
+from coliags_plugin.reconstruction.structure.features import quiet_colmap
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     adjusted,

@@ -18,7 +18,6 @@ from jaxtyping import Float, Float32, Int64
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
-from coliags_plugin.reconstruction.structure.colmap_database import write_database
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
@@ -282,3 +281,40 @@ def _tracked(
     keypoints = tuple(frame.pixels[rows] for frame, rows in zip(points, used, strict=True))
     brightness = tuple(frame.brightness[rows].astype(np.float64) for frame, rows in zip(points, used, strict=True))
     return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points), tuple(ids))
+
+
+def write_database(
+    path: Path,
+    cameras: Sequence[pycolmap.Camera],
+    images: Sequence[tuple[str, int]],
+    keypoints: Sequence[Float32[np.ndarray, "K D"]],
+    matches: Matches,
+    first_index: int = 0,
+) -> None:
+    """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.
+
+    Images are counted from ``first_index``, those of the matches too. COLMAP has to verify the matches.
+    """
+    import pycolmap
+
+    database = pycolmap.Database.open(str(path))
+    try:
+        for number, camera in enumerate(cameras, start=1):
+            camera.camera_id = number
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        numbered = enumerate(zip(images, keypoints, strict=True), start=first_index + 1)
+        for number, ((name, camera_index), image_keypoints) in numbered:
+            image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(number, np.ascontiguousarray(image_keypoints))
+        for (first, second), pairs in matches.items():
+            if len(pairs):
+                database.write_matches(first + 1, second + 1, np.ascontiguousarray(pairs, np.uint32))
+    finally:
+        database.close()

@@ -15,10 +15,9 @@ import torch
 from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.findings import image_findings, path_findings
-from coliags_plugin.checks.data.hypotheses import CHANGES
 from coliags_plugin.checks.data.matches import FrameMatches, epipolar_agreement, follow, match, supported
 from coliags_plugin.checks.data.page import check_page
-from coliags_plugin.checks.data.reprojection import Pair, agreement, best_scale
+from coliags_plugin.checks.data.reprojection import CHANGES, Pair, agreement, best_scale
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings

@@ -10,10 +10,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.lenses.vicalib import (
     calibration_files,
-    calibration_text,
     find_calibration,
     read_calibration,
 )
+from tests.layouts.endomapper import calibration_text
 
 #: As Vicalib writes it, comments and all.
 VICALIB = """<rig>
