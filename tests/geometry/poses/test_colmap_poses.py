@@ -179,17 +179,6 @@ def test_a_real_model_read_as_pycolmap_reads_it(shared_data, tmp_path, folder):
     np.testing.assert_allclose(text.camera_to_world, read.camera_to_world, atol=1e-12)
 
 
-def test_a_real_model_to_text_and_back(shared_data, tmp_path):
-    from dataclasses import replace
-
-    read = colmap.read(shared_data / "colmap_23img" / "sparse")
-    colmap.write_text(tmp_path / "text", replace(read, intrinsics=PINHOLE))
-    colmap.write(tmp_path / "binary", colmap.read(tmp_path / "text"))
-    back = colmap.read(tmp_path / "binary")
-    assert back.names == read.names
-    np.testing.assert_allclose(back.camera_to_world, read.camera_to_world, atol=1e-12)
-
-
 def test_a_model_without_points_will_do(shared_data, tmp_path):
     for part in ("images.bin", "cameras.bin"):
         shutil.copy(shared_data / "colmap_23img" / "sparse" / part, tmp_path)
