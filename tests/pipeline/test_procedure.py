@@ -99,6 +99,9 @@ def test_every_frame_is_in_a_segment_or_left_out_and_none_is_too_long(seed, coun
     assert all(one.first < other.first and one.last < other.last for one, other in pairwise(segments))
 
 
+BOTH = ("segment-000", "segment-001")
+
+
 def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
     """Cameras on a bent path that look at points 30 away; in a world of its own."""
     generator = np.random.default_rng(7)
@@ -116,19 +119,23 @@ def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
 def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
     other = (0.4, Rotation.from_rotvec([0.3, -1.0, 2.0]), np.array([5.0, -7.0, 1.0]))
     first, second = posed(20), posed(30, other, first=12)
-    (found,) = joins([posed(4, model="sparse/1", first=90), first], [second])
+    (found,) = joins(BOTH, [posed(4, model="sparse/1", first=90), first], [second])
     assert (found.reason, found.frames, found.models) == ("", 8, ("sparse/0", "sparse/0"))
     for name in ("frame_000012", "frame_000019"):
-        place = found.transform @ [*second.centers[name], 1.0]
+        place = np.array(found.transform) @ [*second.centers[name], 1.0]
         np.testing.assert_allclose(place[:3], first.centers[name], atol=1e-9)
-    assert found.rotation == pytest.approx(0.0, abs=1e-5) and found.position == pytest.approx(0.0, abs=1e-9)
-    assert "3 frames have a pose on both sides" in joins([posed(15)], [posed(9, other, first=12)])[0].reason
-    assert "do not agree" in joins([first], [posed(30, other, 20.0, first=12)])[0].reason
-    both = joins([first, posed(9, model="sparse/1", first=31)], [second])
+    assert (
+        found.joined
+        and found.rotation_deg == pytest.approx(0.0, abs=1e-5)
+        and found.position == pytest.approx(0.0, abs=1e-9)
+    )
+    assert "3 frames have a pose on both sides" in joins(BOTH, [posed(15)], [posed(9, other, first=12)])[0].reason
+    assert "do not agree" in joins(BOTH, [first], [posed(30, other, 20.0, first=12)])[0].reason
+    both = joins(BOTH, [first, posed(9, model="sparse/1", first=31)], [second])
     assert [(one.models, one.frames, one.reason) for one in both] == [
         (("sparse/1", "sparse/0"), 9, ""), (("sparse/0", "sparse/0"), 8, "")
     ]  # fmt: skip
-    assert joins([], [second])[0].reason == "no frame has a pose on one side"
+    assert joins(BOTH, [], [second])[0].reason == "no frame has a pose on one side"
 
 
 @pytest.fixture

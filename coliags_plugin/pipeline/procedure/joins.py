@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.datamanagers.colmap.files import find_models
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
+from coliags_plugin.pipeline.procedure.record import SegmentJoin
 
 #: Fewest frames that both models have to have posed.
 _FEWEST = 6
@@ -28,18 +29,6 @@ class PosedFrames:
     rotations: dict[str, Float[np.ndarray, "3 3"]]  # camera to world, by the stem of the frame's name
     centers: dict[str, Float[np.ndarray, "3"]]
     depths: dict[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Join:
-    """Whether two models of neighbouring segments are in one place, and how."""
-
-    models: tuple[str, str]
-    frames: int  # that both have posed
-    reason: str = ""  # why they are not joined; empty where they are
-    transform: Float[np.ndarray, "4 4"] | None = None  # from the second model's world to the first's
-    rotation: float = 0.0  # residual, degrees, root mean square
-    position: float = 0.0  # residual, share of the median depth, root mean square
 
 
 def read_posed(scene: Path) -> list[PosedFrames]:
@@ -60,14 +49,21 @@ def read_posed(scene: Path) -> list[PosedFrames]:
     return found
 
 
-def joins(first: list[PosedFrames], second: list[PosedFrames]) -> list[Join]:
+def joins(segments: tuple[str, str], first: list[PosedFrames], second: list[PosedFrames]) -> list[SegmentJoin]:
     """Joins of models of one segment with those of the next: of all that share frames, or why there is none."""
-    tried = sorted((_join_models(*pair) for pair in product(first, second)), key=lambda one: -one.frames)
+    tried = sorted((_join_models(segments, *pair) for pair in product(first, second)), key=lambda one: -one.frames)
     sharing = [one for one in tried if one.frames >= _FEWEST]
-    return sharing or tried[:1] or [Join(("", ""), 0, "no frame has a pose on one side")]
+    return sharing or tried[:1] or [apart(segments, "no frame has a pose on one side")]
 
 
-def _join_models(first: PosedFrames, second: PosedFrames) -> Join:
+def apart(segments: tuple[str, str], reason: str, models: tuple[str, str] = ("", ""), frames: int = 0) -> SegmentJoin:
+    """A place at which nothing could be compared."""
+    return SegmentJoin(
+        segments=segments, models=models, frames=frames, joined=False, reason=reason, rotation_deg=0.0, position=0.0
+    )
+
+
+def _join_models(segments: tuple[str, str], first: PosedFrames, second: PosedFrames) -> SegmentJoin:
     """The similarity by which the shared cameras agree.
 
     The scale is that of the depths that the shared frames see, which are far less uncertain than the short way of the
@@ -76,7 +72,8 @@ def _join_models(first: PosedFrames, second: PosedFrames) -> Join:
     names = sorted(first.rotations.keys() & second.rotations.keys())
     models = (first.model, second.model)
     if len(names) < _FEWEST:
-        return Join(models, len(names), f"{len(names)} frames have a pose on both sides, fewer than {_FEWEST}")
+        reason = f"{len(names)} frames have a pose on both sides, fewer than {_FEWEST}"
+        return apart(segments, reason, models, len(names))
     ratios = np.array([first.depths[name] / second.depths[name] for name in names])
     scale = float(np.median(ratios))
     spread = float(np.median(np.abs(ratios / scale - 1.0)))
@@ -96,4 +93,13 @@ def _join_models(first: PosedFrames, second: PosedFrames) -> Join:
         )
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = scale * turn.as_matrix(), shift
-    return Join(models, len(names), reason, transform, rotation, position)
+    return SegmentJoin(
+        segments=segments,
+        models=models,
+        frames=len(names),
+        joined=not reason,
+        reason=reason,
+        transform=None if reason else transform.tolist(),
+        rotation_deg=round(rotation, 3),
+        position=round(position, 4),
+    )

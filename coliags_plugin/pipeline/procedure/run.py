@@ -22,7 +22,7 @@ from coliags_plugin.pipeline.frame_selection import reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import MASK
 from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
-from coliags_plugin.pipeline.procedure.joins import Join, PosedFrames, joins, read_posed
+from coliags_plugin.pipeline.procedure.joins import PosedFrames, apart, joins, read_posed
 from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
 from coliags_plugin.pipeline.procedure.segments import SURVEY_FILE, Segment, Survey, checksum, cut, survey_video
@@ -237,19 +237,7 @@ def _joins(out: Path, procedure: Procedure, names: Sequence[str]) -> list[Segmen
         posed = _posed(out / other)
         gap = second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"
-        found += [
-            SegmentJoin(
-                segments=(one, other),
-                models=made.models,
-                frames=made.frames,
-                joined=not made.reason,
-                reason=made.reason,
-                transform=None if made.transform is None or made.reason else made.transform.tolist(),
-                rotation_deg=round(made.rotation, 3),
-                position=round(made.position, 4),
-            )
-            for made in (joins(before, posed) if gap < 0 else [Join(("", ""), 0, why)])
-        ]
+        found += joins((one, other), before, posed) if gap < 0 else [apart((one, other), why)]
         before = posed
     return found
 
