@@ -41,6 +41,7 @@ def tube(tmp_path_factory):
     return write_tube(tmp_path_factory.mktemp("tubes") / "tube", COUNT)
 
 
+@pytest.mark.thorough
 def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog):
     out = tmp_path / "out"
     assert run("poses", "sfm", tube / "images", "--output", out, *CAMERA, "--every", 2, "--max-frames", 5) == 0

@@ -97,6 +97,7 @@ def test_overlays_are_found():
     assert surveyed([*labelled, FILM[0][:50]]).mask() is None
 
 
+@pytest.mark.thorough
 def test_memory_of_large_frames():
     """Extremes and sum, and what finding the mask takes besides: 0.5 GB of frames of 3840 x 2160."""
     frames = [np.kron(frame, np.ones((9, 9, 1), np.uint8)) for frame in FILM[:10]]
