@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 # As the command line does, and before torch is imported: tests share their machine.
@@ -10,6 +12,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 import pytest
 import torch
+from filelock import FileLock
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
@@ -19,8 +22,8 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(autouse=True)
 def repeatable_torch():
-    """The same numbers in whatever order tests run: two torch threads (the order of sums), and a seed."""
-    torch.set_num_threads(2)
+    """The same numbers in whatever order tests run: one torch thread (the order of sums), and a seed."""
+    torch.set_num_threads(1)
     torch.manual_seed(0)
 
 
@@ -30,3 +33,26 @@ def shared_data():
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no real data at {SHARED_DATA.name} beside the checkout")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory):
+    """Makes a folder of a name once for all processes of a test run: ``shared_folder(name, make)``, ``make(folder)``.
+
+    Tests must not change what is in it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder(name: str, make: Callable[[Path], object]) -> Path:
+        place, scratch = base / "shared" / name, base / "unfinished" / name
+        with FileLock(base / f"{name}.lock"):
+            if not place.exists():
+                shutil.rmtree(scratch, ignore_errors=True)
+                scratch.parent.mkdir(exist_ok=True)
+                make(scratch)
+                place.parent.mkdir(exist_ok=True)
+                scratch.rename(place)
+        return place
+
+    return folder

@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 import open3d
 
-from coliags_plugin.api.training import import_splats, train
-from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.api.training import train
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.export.splats.files import write_splats
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.geometry.poses.formats import format_named, write_trajectory
+from coliags_plugin.geometry.poses.formats import write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from tests.comparison.small import TINY
@@ -28,6 +27,16 @@ from tests.pipeline.procedures import write_procedure
 
 FRAMES = 9
 METHOD = "coliags"
+METHODS = ("coliags", "3dgs", "reim-nerf", "pr-endo")
+#: Where the trajectory lies in each format.
+TRAJECTORIES = {
+    "c3vd": "c3vd.txt",
+    "tum": "tum.txt",
+    "colmap": "colmap",
+    "colmap-text": "colmap-text",
+    "nerfstudio": "nerfstudio/transforms.json",
+    "endogslam": "endogslam/params.npz",
+}
 
 
 def make_seeds(folder: Path) -> None:
@@ -42,7 +51,7 @@ def make_seeds(folder: Path) -> None:
     _trajectories(folder / "poses", poses)
     _meshes(folder / "meshes", surface)
     _splats(folder / "splats", folder / "c3vd")
-    _runs(folder, work)
+    _runs(folder)
     _methods(folder / "methods")
     _depth_maps(folder / "depth-maps", phantom)
     _points(folder / "points", folder / "c3vd")
@@ -76,18 +85,13 @@ def _rich_transforms(scene: Path, target: Path, surface: TriangleMesh) -> None:
 
 
 def _trajectories(folder: Path, poses: np.ndarray) -> None:
-    """The same trajectory in every format that is written, and EndoGSLAM's."""
+    """A trajectory in every format."""
     folder.mkdir()
     names = tuple(f"{index:04d}.png" for index in range(len(poses)))
     trajectory = Trajectory(poses, names, np.arange(len(poses)) / 30.0, Intrinsics(50.0, 50.0, 32.0, 25.5, 64, 51))
-    for name in pose_formats:
-        known = format_named(name)
-        if known.write is not None:
-            suffix = {"nerfstudio": "/transforms.json", "endogslam": "/params.npz"}.get(
-                name, "" if known.folder else ".txt"
-            )
-            (folder / name).mkdir() if suffix.startswith("/") else None
-            write_trajectory(folder / f"{name}{suffix}", trajectory, name)
+    for name, file in TRAJECTORIES.items():
+        (folder / file).parent.mkdir(exist_ok=True)
+        write_trajectory(folder / file, trajectory, name)
     write_trajectory(folder / "reference.txt", replace(trajectory, names=None), "tum")
 
 
@@ -99,14 +103,8 @@ def _meshes(folder: Path, surface: TriangleMesh) -> None:
     small = TriangleMesh(surface.vertices[used], triangles.reshape(-1, 3), colors)
     for suffix in ("ply", "obj", "glb"):
         write_mesh(folder / f"mesh.{suffix}", small)
-    open3d.io.write_triangle_mesh(
-        str(folder / "text.ply"),
-        open3d.geometry.TriangleMesh(
-            open3d.utility.Vector3dVector(small.vertices.astype(np.float64)),
-            open3d.utility.Vector3iVector(small.triangles),
-        ),
-        write_ascii=True,
-    )
+    mesh = open3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
+    open3d.io.write_triangle_mesh(str(folder / "text.ply"), mesh, write_ascii=True)
     seen = np.arange(len(small)) % 2 == 0
     np.savez(folder / "mesh_seen.npz", face_seen=seen, face_seen_by_any_frame=seen)
 
@@ -118,7 +116,7 @@ def _splats(folder: Path, scene: Path) -> None:
     shutil.copytree(scene, folder / "scene", ignore=shutil.ignore_patterns("truth", "rotation"))
 
 
-def _runs(folder: Path, work: Path) -> None:
+def _runs(folder: Path) -> None:
     """A run that can be resumed, and one with results."""
     target = folder / "run"
     target.mkdir()
@@ -128,17 +126,14 @@ def _runs(folder: Path, work: Path) -> None:
     given["schedule.checkpoint_every"] = 2
     run = train(METHOD, scene, target / "run", steps=3, settings=given)
     run.evaluate()
-    shutil.copytree(target / "run", folder / "results/run")
-    for name in ("checkpoints",):
-        shutil.rmtree(folder / "results/run" / name)
-    (target / "run/eval").rename(work / "eval")
-    import_splats(folder / "splats/cloud.ply", scene, work / "imported")
+    shutil.copytree(target / "run", folder / "results/run", ignore=shutil.ignore_patterns("checkpoints"))
+    shutil.rmtree(target / "run/eval")
 
 
 def _methods(folder: Path) -> None:
     folder.mkdir()
     shipped = Path(__file__).parents[2] / "method_configs"
-    for name in ("coliags", "3dgs", "reim-nerf", "pr-endo"):
+    for name in METHODS:
         shutil.copy(shipped / f"{name}.yaml", folder / f"{name}.yaml")
     shutil.copy(shipped / "benchmarks/phantoms-8.yaml", folder / "benchmark.yaml")
     shutil.copy(shipped / "benchmarks/ablations/embedding-sizes.yaml", folder / "ablation.yaml")
@@ -162,4 +157,3 @@ def _points(folder: Path, scene: Path) -> None:
     np.savez(folder / "cloud.npz", positions=positions, colors=random.integers(0, 255, (300, 3)).astype(np.uint8))
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(positions.astype(np.float64)))
     open3d.io.write_point_cloud(str(folder / "cloud.ply"), cloud)
-    assert KINDS
