@@ -17,6 +17,8 @@ from filelock import FileLock
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
 
+torch.set_num_threads(1)  # as many processes run as there are CPUs, and the order of sums depends on it
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -25,6 +27,25 @@ def repeatable_torch():
     """The same numbers in whatever order tests run: one torch thread (the order of sums), and a seed."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compile_once(tmp_path_factory):
+    """Let one of several processes of a test run compile a kernel; the others load it from numba's cache."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    from numba.core.registry import CPUDispatcher
+
+    place, compile_kernel = tmp_path_factory.getbasetemp().parent, CPUDispatcher.compile
+
+    def compile_alone(dispatcher, signature):
+        with FileLock(place / f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__qualname__}.lock"):
+            return compile_kernel(dispatcher, signature)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CPUDispatcher, "compile", compile_alone)
+        yield
 
 
 @pytest.fixture
@@ -45,14 +66,13 @@ def shared_folder(tmp_path_factory):
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
     def folder(name: str, make: Callable[[Path], object]) -> Path:
-        place, scratch = base / "shared" / name, base / "unfinished" / name
+        place, whole = base / "shared" / name, base / f"{name}.whole"
         with FileLock(base / f"{name}.lock"):
-            if not place.exists():
-                shutil.rmtree(scratch, ignore_errors=True)
-                scratch.parent.mkdir(exist_ok=True)
-                make(scratch)
+            if not whole.exists():
+                shutil.rmtree(place, ignore_errors=True)
                 place.parent.mkdir(exist_ok=True)
-                scratch.rename(place)
+                make(place)
+                whole.touch()
         return place
 
     return folder

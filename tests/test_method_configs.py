@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
 from coliags_plugin.checks.method.check import CHECKS, check_method
 from coliags_plugin.config.components import is_auto
@@ -22,12 +21,6 @@ SMALL_NETWORKS = {
         *("renderer.samples=16", "renderer.importance_samples=16"),
     )
 }
-
-
-@pytest.fixture(autouse=True)
-def one_thread(repeatable_torch):
-    """On so few pixels a second thread costs more than it gains."""
-    torch.set_num_threads(1)
 
 
 @pytest.mark.parametrize(

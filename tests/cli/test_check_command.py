@@ -7,9 +7,6 @@ import re
 import sys
 from pathlib import Path
 
-import pytest
-import torch
-
 from coliags_plugin.checks.method.check import CHECKS
 from coliags_plugin.checks.results import CheckResult, line, summary
 from coliags_plugin.config import registry
@@ -31,11 +28,6 @@ COMPONENTS = {"losses": {"sharp": SharpLoss}}
 """
 #: Enough of a method to be checked in a second.
 SMALL = ("--steps", 10, "--set", "datamanager.points_count=500")
-
-
-@pytest.fixture(autouse=True)
-def one_thread(repeatable_torch):
-    torch.set_num_threads(1)
 
 
 def test_a_sound_method(tmp_path, capsys, monkeypatch):

@@ -11,7 +11,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import torch
 
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
@@ -75,7 +74,6 @@ def start_compare(methods, wall, folder, steps, *words, stderr=subprocess.PIPE):
 
 def undisturbed_hashes(methods, wall, folder, steps):
     """Hashes of a comparison that nobody disturbs, each run on one CPU thread."""
-    torch.set_num_threads(1)
     assert not compare_inline(methods, [wall], folder, steps=steps, overrides=OFTEN).failures
     return hashes(folder)
 

@@ -53,7 +53,6 @@ def test_interior_against_scikit_image():
 
 @pytest.mark.parametrize("with_mask", [False, True])
 def test_gradients(with_mask):
-    torch.set_num_threads(1)  # thousands of tiny products, which two threads only slow down
     a, b = images(4, 7, channels=2)
     mask = torch.rand(4, 7, generator=torch.Generator().manual_seed(1)) < 0.7 if with_mask else None
     a.requires_grad_()

@@ -44,7 +44,6 @@ def scene():
 @pytest.fixture(scope="module")
 def loaded(scene, tmp_path_factory):
     """Trains and loads a run of the scene."""
-    torch.set_num_threads(2)  # as for every test; the fixture that says so comes later
     patch = pytest.MonkeyPatch()
     patch.setattr(trained_module, "load_scene", lambda config, path: scene)
     folder, count = tmp_path_factory.mktemp("runs"), iter(range(99))

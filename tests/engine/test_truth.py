@@ -54,7 +54,6 @@ def renamed(scene):
 
 @pytest.fixture(scope="module")
 def trained(estimated, tmp_path_factory):
-    torch.set_num_threads(2)
     patch = pytest.MonkeyPatch()
     patch.setattr(trained_module, "load_scene", lambda config, path: estimated)
     path = tmp_path_factory.mktemp("runs") / "run"

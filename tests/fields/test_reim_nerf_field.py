@@ -24,12 +24,6 @@ from tests.scenes import camera_at, wall_scene
 SMALL = {"layers": 3, "width": 32, "skip": 1, "color_width": 16}
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Matrices are small: on a busy machine a second thread is only waited for."""
-    torch.set_num_threads(1)
-
-
 def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 

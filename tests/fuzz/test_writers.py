@@ -22,7 +22,7 @@ from tests.faults import content, fault, killed, no_space
 
 pytestmark = pytest.mark.thorough
 
-MOMENTS = int(os.environ.get("FUZZ_EXAMPLES", "2"))
+MOMENTS = int(os.environ.get("FUZZ_EXAMPLES", "1"))
 #: Exit statuses of an exception that no message was made of, and of a command that was killed.
 TRACEBACK, KILLED = 99, 9
 TEXTS = (".json", ".jsonl", ".html", ".yaml", ".csv", ".md", ".log", ".txt")
@@ -101,7 +101,7 @@ def _work(words, when, kind, folder):
 def run():
     """Runs a command in a process forked from one that has imported everything and has no threads."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["coliags_plugin.cli", "torch", "cv2", "open3d", "pycolmap", "kornia"])
+    context.set_forkserver_preload(["coliags_plugin.api", "coliags_plugin.cli", "cv2", "kornia", "numba", "open3d", "pycolmap", "torch"])
 
     def run(words, folder, when=-1, kind=no_space):
         process = context.Process(target=_work, args=(words.split(), when, kind, folder))

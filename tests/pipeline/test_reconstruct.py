@@ -8,7 +8,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
@@ -169,7 +168,6 @@ def test_bad_input_leaves_nothing(tmp_path, capsys):
 def test_a_tube_is_reconstructed_from_its_frames(tmp_path, monkeypatch):
     """All stages on ten small frames; a few steps of training, so that only the path is exact."""
     monkeypatch.setattr(distillation, "STEPS", 3)
-    torch.set_num_threads(1)
     frames = tube_frames(10, 2.0)
     folder = write_images(tmp_path / "film", [frame.image.numpy() for frame in frames])
     settings = {
