@@ -12,7 +12,6 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
 from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.geometry.poses import colmap
@@ -49,12 +48,7 @@ def checkpoint(target, count):
         save_tensors({"a": torch.arange(100.0 * count)}, scratch / "state.safetensors")
 
 
-def exr(target, count):
-    with atomic_folder(target, overwrite=True) as scratch:
-        write_exr_channels(scratch / "0000.exr", {"Z": FRAMES[count, ..., 0].astype(np.float32)})
-
-
-@pytest.mark.parametrize("write", [colmap_binary, colmap_text, video, checkpoint, exr])
+@pytest.mark.parametrize("write", [colmap_binary, colmap_text, video, checkpoint])
 def test_what_was_there_stays_until_all_fits(tmp_path, write):
     target = tmp_path / "target"
 

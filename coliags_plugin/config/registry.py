@@ -156,7 +156,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
         "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.reader:C3VDEndoGSLAMDataManager",
         "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.reader:C3VDv2DataManager",
         "colmap": "coliags_plugin.datamanagers.colmap.reader:ColmapDataManager",
-        "endomapper": "coliags_plugin.datamanagers.endomapper.reader:EndoMapperDataManager",
+        "endomapper": "coliags_plugin.datamanagers.rgbd.reader:EndoMapperDataManager",
         "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.reader:NerfstudioDataManager",
         "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.reader:ReimNerfDataManager",
         "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",

@@ -12,6 +12,7 @@ import pytest
 
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.images import encode_image
+from tests.layouts.rotatecolon import write_exr
 
 READ = """if True:
     import logging, sys
@@ -58,9 +59,7 @@ def test_a_short_tiff_is_told_once(tmp_path, pixels):
 
 
 def test_a_short_exr_is_told_once(tmp_path, pixels):
-    from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
-
-    write_exr_channels(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 50)).astype(np.float32)})
+    write_exr(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 50)).astype(np.float32)})
     data = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "a.exr").write_bytes(data[: len(data) // 2])  # OpenEXR: corrupt leader, and a warning on stdout
     (line,) = said(tmp_path / "a.exr")

@@ -17,6 +17,7 @@ import OpenEXR
 import pycolmap
 
 from tests.datamanagers.wall_scenes import FRAMES, write_wall
+from tests.layouts.rotatecolon import write_exr
 
 Spoil = Callable[[Path], Any]
 
@@ -154,10 +155,6 @@ def change_exr(path: Path, change: Callable[[str, np.ndarray], tuple[str, np.nda
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.parts[0].channels.items()}
     write_exr(path, dict(change(name, pixels) for name, pixels in channels.items()))
-
-
-def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))
 
 
 def half_size(pixels: np.ndarray) -> np.ndarray:

@@ -20,8 +20,9 @@ from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.trainer import Trainer
-from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber, write_exr
+from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
+from tests.layouts.rotatecolon import write_exr
 from tests.scenes import SMALL
 
 Z = "ViewLayer.Depth.Z"

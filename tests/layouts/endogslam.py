@@ -9,8 +9,7 @@ from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
-from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
-from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, PREPARED_PINHOLE, SH0
+from coliags_plugin.datamanagers.c3vd_endogslam.reader import OPTIMIZED, PARAMS, PREPARED_DEPTH, PREPARED_PINHOLE, SH0
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse

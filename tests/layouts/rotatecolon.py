@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import OpenEXR
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
-from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
+from coliags_plugin.datamanagers.rotatecolon.reader import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
@@ -47,9 +47,7 @@ class RotateColonLayout(Layout):
             channels = {f"ViewLayer.Combined.{name}": linear[..., at].copy() for at, name in enumerate("RGB")}
             channels["ViewLayer.Combined.A"] = np.ones(frame.z_depth.shape, np.float16)
             depth = np.where(frame.z_depth > 0.0, frame.z_depth * _DEPTH_FACTOR, _BACKGROUND).astype(np.float32)
-            write_exr_channels(
-                folder / TRAIN_DEPTH / f"{frame.index:04d}.exr", {**channels, "ViewLayer.Depth.Z": depth}
-            )
+            write_exr(folder / TRAIN_DEPTH / f"{frame.index:04d}.exr", {**channels, "ViewLayer.Depth.Z": depth})
 
     def write_sequence(self, folder, part, poses, lens):
         frames = [
@@ -65,3 +63,9 @@ class RotateColonLayout(Layout):
     def seen_mask(self, folder, part, index):
         """In ``truth/``: the dataset has no seen masks."""
         return folder / "truth" / "seen" / f"{index:04d}_seen.png"
+
+
+def write_exr(path, channels):
+    """Write float channels [H, W] by their full names."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))

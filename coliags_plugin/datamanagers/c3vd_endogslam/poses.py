@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS, PreparedFiles
 from coliags_plugin.datamanagers.recording import check_pose_count
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices
@@ -21,6 +20,7 @@ from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_
 
 log = logging.getLogger(__name__)
 
+PARAMS = "params.npz"
 PoseSource = Literal["slam", "ground-truth"]
 
 #: Largest difference of params.npz's true poses from pose.txt, mm and degrees. Rounding is a thousandth of this;
@@ -28,6 +28,21 @@ PoseSource = Literal["slam", "ground-truth"]
 SAME_SEQUENCE = 0.05
 #: Ratio of the ATE to the spread of the cameras from which tracking counts as lost.
 LOST = 0.2
+
+
+@dataclass(frozen=True)
+class PreparedFiles:
+    """The files of one sequence, frame 0 first.
+
+    ``params`` is EndoGSLAM's result, ``cloud`` the optimised Gaussians of PR-Endo's release.
+    """
+
+    folder: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: Path | None
+    params: Path | None
+    cloud: Path | None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,15 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.datamanagers.c3vd_endogslam.files import (
+from coliags_plugin.datamanagers.c3vd_endogslam.poses import (
     PARAMS,
+    PoseSource,
     PreparedFiles,
-    find_sequence,
-    recognise,
-    scene_folder,
+    SequencePoses,
+    load_poses,
 )
-from coliags_plugin.datamanagers.c3vd_endogslam.poses import PoseSource, SequencePoses, load_poses
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
+from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint, make_shots
@@ -29,9 +30,15 @@ from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectific
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.geometry.poses.c3vd import read_poses
+from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, read_params
 
+LAYOUT = (
+    "EndoGSLAM's C3VD: color/NNNN_color.png and depth/NNNN_depth.tiff with pose.txt, params.npz or both; "
+    "or PR-Endo's: C3VD/<scene> beside C3VD_endogslam_optimized/<scene>"
+)
+#: PR-Endo's release has the scenes in a folder X and EndoGSLAM's results in X_endogslam_optimized.
+OPTIMIZED = "_endogslam_optimized"
 #: K of the prepared images, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it, with
 #: pixel centres at integers: hence + 0.5.
 PREPARED_PINHOLE = Intrinsics(401.1595, 400.9425, 334.1430 + 0.5, 273.8665 + 0.5, 675, 540)
@@ -76,12 +83,12 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        return _recognised(path)
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
-        folder = scene_folder(path)
-        files = find_sequence(folder, self.settings.params_file)
+        folder = _scene_folder(path)
+        files = _find_sequence(folder, self.settings.params_file)
         params = None if files.params is None else read_params(files.params)
         poses = load_poses(files, params, self.settings.poses)
         rectification = self._rectification(files, params)
@@ -136,14 +143,14 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         return Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
 
     def _rotation(self, folder: Path, rectification: Rectification, poses: SequencePoses) -> list[Shot]:
-        files = find_sequence(folder, None)
+        files = _find_sequence(folder, None)
         if files.poses is None or poses.from_file is None:
             raise InputError(
                 f"{folder} has images, but {'the scene' if files.poses else 'it'} has no pose.txt",
                 "pose.txt of the scene and of its rotation views, in one world",
                 f"Add it, or move {folder.name} away",
             )
-        rotation = read_poses(files.poses).camera_to_world
+        rotation = c3vd_poses.read_poses(files.poses).camera_to_world
         check_pose_count(files.poses, len(rotation), len(files.images))
         seen = find_seen_masks(folder, len(files.images))
         camera_to_world, depth_format = poses.from_file @ rotation, _depth_format(files)
@@ -174,3 +181,74 @@ def _map_points(cloud: Path | None, params: EndoGslamParams | None, poses: Seque
     if poses.from_slam is not None:
         positions = positions @ poses.from_slam[:3, :3].T + poses.from_slam[:3, 3]
     return PointCloud(torch.from_numpy(positions.astype(np.float32)), torch.from_numpy(colors))
+
+
+def _recognised(folder: Path) -> str | None:
+    """The files that identify such a sequence or the folder of PR-Endo's release; None otherwise."""
+    images = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
+    poses = folder / "pose.txt"
+    if images and _params(folder, None) is not None:
+        return "color/NNNN_color.png and a params.npz"
+    if images and poses.is_file() and c3vd_poses.recognise(poses):
+        return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
+    if not images and (beside := _release(folder)):
+        return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
+    return None
+
+
+def _scene_folder(path: Path) -> Path:
+    """The sequence's folder: ``path`` itself, or the only scene of PR-Endo's release in it."""
+    require_folder(path, LAYOUT)
+    scenes = [] if (path / "color").is_dir() else _release(path)
+    if len(scenes) > 1:
+        raise InputError(f"{path} holds several scenes", "one scene", f"Name one, for instance {sorted(scenes)[0]}")
+    return scenes[0] if scenes else path
+
+
+def _find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
+    """Find the files of the sequence in the folder that contains ``color``.
+
+    ``params_file`` is EndoGSLAM's result, relative to the folder or absolute; None: search in the folder and in
+    PR-Endo's release.
+    """
+    images = numbered_images(folder / "color", "color", LAYOUT, "C3VD/cecum_t1_b")
+    depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES)
+    params = _params(folder, params_file)
+    poses = folder / "pose.txt"
+    return PreparedFiles(
+        folder,
+        *paired(folder, images, depths),
+        poses if poses.is_file() else None,
+        params,
+        None if params is None else _newest_cloud(params.parent),
+    )
+
+
+def _params(folder: Path, params_file: str | None) -> Path | None:
+    if params_file is not None:
+        if not (folder / params_file).is_file():
+            raise InputError(f"no file {folder / params_file}", "EndoGSLAM's params.npz", "Correct params_file")
+        return folder / params_file
+    here = folder.resolve()
+    beside = here.parent.with_name(here.parent.name + OPTIMIZED) / here.name if here.parent.name else here
+    return next((path / PARAMS for path in (folder, beside) if (path / PARAMS).is_file()), None)
+
+
+def _newest_cloud(folder: Path) -> Path | None:
+    """``point_cloud/iteration_N/point_cloud.ply`` of the largest N."""
+    clouds = {
+        int(match.group(1)): path
+        for path in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (match := re.fullmatch(r"iteration_(\d+)", path.parent.name))
+    }
+    return clouds[max(clouds)] if clouds else None
+
+
+def _release(folder: Path) -> list[Path]:
+    """The scenes of PR-Endo's release in a folder for which EndoGSLAM's result exists."""
+    return [
+        scene
+        for results in folder.glob(f"*{OPTIMIZED}")
+        for scene in (folder / results.name.removesuffix(OPTIMIZED)).glob("*")
+        if (scene / "color").is_dir() and (results / scene.name / PARAMS).is_file()
+    ]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
+from coliags_plugin.datamanagers.c3vd.reader import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.rectification import Rectification

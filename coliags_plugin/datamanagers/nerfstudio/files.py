@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+import math
 import posixpath
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.json_files import read_json, read_number
-from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of
+from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.datamanagers.reading.files import first_few, named_file
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, PinholeLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 
 FILE = "transforms.json"
 #: Key of the list of frames that estimated depth was made from.
 ESTIMATED_FROM = "depth_estimated_from"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+
+PixelCenters = Literal["half", "integer"]
+
+#: nerfstudio's camera models and their distortion parameters; others must be 0 or absent.
+_MODELS: Mapping[str, tuple[str, ...]] = {
+    "OPENCV": ("k1", "k2", "k3", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+}
+_BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 @dataclass(frozen=True)
@@ -64,7 +76,7 @@ class Transforms:
             FrameFiles(
                 name,
                 image,
-                camera_of(
+                _camera_of(
                     {**self.content, **self.frames[name]}, f"{self.path}, frame {name}", pixel_centers, first_size
                 ),
                 depth,
@@ -166,3 +178,54 @@ class Transforms:
         if not path.is_file():
             raise InputError(f"{self.path}, frame {name}: no file {path}", f"the file of {key}", "Restore it")
         return path
+
+
+def _camera_of(
+    values: Mapping[str, Any], where: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
+) -> Lens:
+    """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
+
+    ``values`` are the keys of the file, overlaid with those of the frame; ``where`` names the frame in messages.
+    ``stored_size`` returns width and height of the image; it is called only if the file has no size.
+    """
+    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if not isinstance(model, str) or model not in _MODELS:
+        raise InputError(f"{where}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
+    width, height = image_size(values, where) if "w" in values or "h" in values else stored_size()
+    fx, fy = _focal_lengths(values, where, width, height)
+    # The default principal point is the image centre in either convention.
+    shift = 0.0 if pixel_centers == "half" else 0.5
+    cx = read_number(values, "cx", where) + shift if "cx" in values else 0.5 * width
+    cy = read_number(values, "cy", where) + shift if "cy" in values else 0.5 * height
+    if min(fx, fy, width, height) <= 0.0:
+        raise InputError(f"{where}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
+    bends = {key: read_number(values, key, where) for key in _BENDS if values.get(key)}
+    if wrong := sorted(set(bends) - set(_MODELS[model])):
+        meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
+        raise InputError(
+            f"{where}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
+            f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
+            "Undistort the images, or correct camera_model",
+        )
+    if model == "OPENCV_FISHEYE":
+        k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
+        return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+    if not bends:
+        return PinholeLens(fx, fy, cx, cy, width, height)
+    k1, k2, k3, p1, p2 = (bends.get(key, 0.0) for key in _MODELS[model])
+    return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+
+def _focal_lengths(values: Mapping[str, Any], where: str, width: int, height: int) -> tuple[float, float]:
+    """Horizontal and vertical focal length, pixels; equal if only one is given."""
+    lengths: dict[str, float] = {}
+    for axis, pixels in (("x", width), ("y", height)):
+        if f"fl_{axis}" in values:
+            lengths[axis] = read_number(values, f"fl_{axis}", where)
+        elif f"camera_angle_{axis}" in values:
+            expected = "radians, above 0 and below pi"
+            angle = read_number(values, f"camera_angle_{axis}", where, expected, above=0.0, below=math.pi)
+            lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
+    if not lengths:
+        raise InputError(f"{where}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
+    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))

@@ -12,8 +12,7 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters
-from coliags_plugin.datamanagers.nerfstudio.files import FILE, Transforms
+from coliags_plugin.datamanagers.nerfstudio.files import FILE, PixelCenters, Transforms
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import short_names, unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.recorded import RecordedDataManager

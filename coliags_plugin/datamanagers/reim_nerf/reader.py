@@ -2,25 +2,112 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Float32, Shaped
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.files import unposed_images, warn_of_unposed
-from coliags_plugin.datamanagers.reading.images import read_mask
+from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
+from coliags_plugin.datamanagers.reading.files import (
+    inventory,
+    named_file,
+    require_folder,
+    unposed_images,
+    warn_of_unposed,
+)
+from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, ReimNerfSequence, ray_cosines, read_sequence
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
+from coliags_plugin.geometry.poses.trajectory import natural_order, refuse_repeated
 
 MASK_FILE = "rgb_mask.png"
+#: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
+PARTS = ("train", "val", "test", "true_test")
+EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-NeRF's preprocessing writes them"
+#: z-depth at which C3VD's depth is clipped, mm. The preprocessing treats clipped pixels as valid.
+C3VD_RANGE = 100.0
+#: Digits tried of numbers in file names.
+_DIGITS = 6
+#: Keys that have the same value in all files of a sequence.
+_SHARED = (
+    *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "w", "h"),
+    *("camera_model", "scene_scale", "distmap_scale", "scene_T"),
+)
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """A frame of the JSON files: its image, its distance map, if any, and its pose, OpenCV axes, mm."""
+
+    image: Path
+    distances: Path | None
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class ReimNerfSequence:
+    """Combined contents of a folder's JSON files; frames in video order, ``parts`` are indices into them.
+
+    The images are distorted by ``lens``. ``scene_scale`` is in normalised units per mm, ``scene_shift`` is added to
+    positions in mm before scaling, and ``distmap_scale`` is the normalised distance of the stored value 65535.
+    """
+
+    files: Mapping[str, Path]
+    lens: FisheyeLens
+    scene_scale: float
+    scene_shift: Float[np.ndarray, "3"]
+    distmap_scale: float
+    frames: tuple[FrameEntry, ...]
+    parts: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class RayDistance(DepthFormat):
+    """16-bit distance along the ray; 0 is unknown, and C3VD's 100 mm z-depth is a lower bound."""
+
+    size: float  # mm per step, along the ray
+    cosine: Float32[np.ndarray, "h w"]  # ratio of z-depth to ray distance at each working pixel's source pixel
+
+    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`."""
+        return read_gray(path, 16, "a one-channel 16-bit distance map")
+
+    def z_depth(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        """See :class:`DepthFormat`."""
+        depth = self._z(stored)
+        depth[(stored == 0) | self._is_clipped(stored, depth)] = np.nan
+        return depth
+
+    def clipped_at(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"] | None:
+        """See :class:`DepthFormat`."""
+        depth = self._z(stored)
+        clipped = self._is_clipped(stored, depth)
+        if not clipped.any():
+            return None
+        return np.where(clipped, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
+
+    def _z(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        return np.asarray(stored.astype(np.float32) * np.float32(self.size) * self.cosine)
+
+    def _is_clipped(
+        self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
+    ) -> Bool[np.ndarray, "h w"]:
+        """Pixels clipped in the distance map or in the original depth, with one step for rounding."""
+        return np.asarray((stored == 65535) | (depth >= C3VD_RANGE - self.size))
 
 
 class ReimNerfDataSettings(SceneSettings):
@@ -115,3 +202,160 @@ def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
     if ignored.shape != (height, width):
         raise InputError(f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the images' size, {width} x {height}")
     return np.asarray(~ignored)
+
+
+def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
+    """Ratio of z-depth to ray distance at every stored pixel; 0 outside the lens's field of view.
+
+    The preprocessing takes its rays at integers + 0.5 with a calibration that counts from integers, half a pixel off
+    the centres, and so does this inverse; the half pixel changes depth by at most 3e-4 of its value.
+    """
+    column, row = np.meshgrid(np.arange(lens.width) + 1.0, np.arange(lens.height) + 1.0)
+    rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
+    cosine = 1.0 / np.linalg.norm(rays, axis=1)
+    return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
+
+
+def read_sequence(folder: Path, outside: bool = False) -> ReimNerfSequence:
+    """Read and combine the JSON files of a folder; they must not contradict each other.
+
+    ``outside`` tells whether files may be named outside of it.
+    """
+    require_folder(folder, EXPECTED)
+    files = {part: folder / f"transforms_{part}.json" for part in PARTS}
+    files = {part: file for part, file in files.items() if file.is_file()}
+    if "train" not in files:
+        raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Add transforms_train.json")
+    contents = {part: _read(file) for part, file in files.items()}
+    first = contents["train"]
+    for part, content in contents.items():
+        for key in _SHARED:
+            if first.get(key) != content.get(key):
+                raise InputError(
+                    f"{files[part]}: {key} differs from {files['train'].name}",
+                    "one camera and one scale for all files",
+                    "Write all files in one run",
+                )
+    lens = _lens(files["train"], first)
+    scale, shift = _normalisation(files["train"], first)
+    defaults = {"distmap_scale": math.pi, **first}
+    distmap_scale = read_number(defaults, "distmap_scale", files["train"], "a number above 0", above=0.0)
+    frames: dict[str, FrameEntry] = {}
+    names_of: dict[str, list[str]] = {}
+    for part, content in contents.items():
+        names_of[part] = []
+        for name, frame in _frames(folder, files[part], content, scale, shift, outside):
+            known = frames.setdefault(name, frame)
+            if known.distances != frame.distances or not np.allclose(
+                known.camera_to_world, frame.camera_to_world, atol=1e-4
+            ):
+                raise InputError(
+                    f"{files[part]}: pose or distance map of {name} differs from another file's",
+                    "the same values for a frame in all files",
+                    "Write all files in one run",
+                )
+            names_of[part].append(name)
+    names = list(frames)
+    names = [names[index] for index in natural_order(names)]
+    index_of = {name: index for index, name in enumerate(names)}
+    if sum(frame.distances is not None for frame in frames.values()) not in (0, len(frames)):
+        lone = next(name for name in names if frames[name].distances is None)
+        raise InputError(f"{folder}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
+    return ReimNerfSequence(
+        files,
+        lens,
+        scale,
+        shift,
+        distmap_scale,
+        tuple(frames[name] for name in names),
+        {part: tuple(sorted(index_of[name] for name in names)) for part, names in names_of.items()},
+    )
+
+
+def _read(file: Path) -> dict[str, Any]:
+    content = read_json(file, "a JSON object with frames")
+    frames = content.get("frames") if isinstance(content, dict) else None
+    # A short video may have no validation frames, but there must be training frames.
+    if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
+        raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
+    return content
+
+
+def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
+    if content.get("camera_model") not in ("FISHEYE_OPENCV", "OPENCV_FISHEYE"):
+        raise InputError(f"{file}: camera_model {content.get('camera_model')!r}", "FISHEYE_OPENCV")
+    width, height = image_size(content, file)
+    fx, fy = (read_number(content, key, file, "a number above 0", above=0.0) for key in ("fx", "fy"))
+    cx, cy, k1, k2, k3, k4 = (read_number(content, key, file) for key in ("cx", "cy", "k1", "k2", "k3", "k4"))
+    for key in ("p1", "p2"):
+        if content.get(key):
+            raise InputError(f"{file}: {key} = {content[key]!r}", "0: OpenCV's fisheye has no such term")
+    cx, cy = cx + 0.5, cy + 0.5  # the file counts pixel centres at integers
+    return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+
+
+def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float[np.ndarray, "3"]]:
+    scale = read_number(content, "scene_scale", file, "a number above 0", above=0.0)
+    shift = _array(content.get("scene_T"))
+    if shift.shape != (4, 4) or not np.allclose(shift[:3, :3], np.eye(3)) or not np.allclose(shift[3], (0, 0, 0, 1)):
+        raise InputError(f"{file}: scene_T is not a translation", "a 4x4 matrix without rotation")
+    return scale, shift[:3, 3]
+
+
+def _frames(
+    folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"], outside: bool
+) -> list[tuple[str, FrameEntry]]:
+    result, names, matrices = [], [], []
+    for index, frame in enumerate(content["frames"]):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's image")
+        matrix = _array(frame.get("transform_matrix"))
+        if matrix.shape != (4, 4):
+            raise InputError(
+                f"{file}, frame {index} ({name}): transform_matrix is missing or not a matrix",
+                "4 rows of 4 finite numbers",
+            )
+        names.append(name)
+        matrices.append(matrix)
+    refuse_repeated(names, str(file))
+    # Also with no frames: a short video may have no validation frames.
+    check_rigid(np.reshape(matrices, (-1, 4, 4)), lambda index: f"{file}, frame {index} ({names[index]})")
+    for name, matrix, frame in zip(names, matrices, content["frames"], strict=True):
+        camera_to_world = matrix @ FLIP_Y_AND_Z
+        camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
+        distances = frame.get("distmap_path")
+        stated = [name, *([distances] if isinstance(distances, str) else [])]
+        named = [named_file(folder, text, str(file), outside) for text in stated]
+        paths = [_padded_otherwise(path) for path in named]
+        for path, existing in zip(named, paths, strict=True):
+            if not existing.is_file():
+                raise InputError(
+                    f"{file} names {path}, which does not exist, nor with its number padded otherwise",
+                    "every named file",
+                    "Restore it",
+                )
+        result.append((name, FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
+    return result
+
+
+def _padded_otherwise(named: Path) -> Path:
+    """The file that a JSON file names, or else the one whose number has more or fewer leading zeros.
+
+    C3VD's releases and the preprocessing write both 0_color.png and 0000_color.png.
+    """
+    number = re.match(r"\d+", named.name)
+    if named.is_file() or number is None:
+        return named
+    rest = named.name[number.end() :]
+    others = (named.with_name(f"{int(number.group()):0{digits}d}{rest}") for digits in range(1, _DIGITS + 1))
+    return next((path for path in others if path.is_file()), named)
+
+
+def _array(value: Any) -> np.ndarray:
+    """Array of finite numbers; empty for any other value."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+    return array if np.all(np.isfinite(array)) else np.empty(0)

@@ -279,3 +279,13 @@ class RGBDDataManager(RecordedDataManager):
                 "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
             )
         return scale
+
+
+class EndoMapperDataManager(RGBDDataManager):
+    """Reads posed sequences of EndoMapper (Azagra et al., 2023): fisheye images, depth and a calibration.
+
+    See docs/layouts/endomapper.md.
+    """
+
+    name = "endomapper"
+    is_calibrated = True

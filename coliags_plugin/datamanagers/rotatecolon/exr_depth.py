@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ from jaxtyping import Float32, Shaped
 
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import make_folder
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 
 #: Stored depth from this value on is background; Blender writes 1e10.
@@ -72,18 +70,6 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
             "Choose the one that holds depth with --set datamanager.depth_channel=NAME",
         )
     return np.asarray(channels[channel]).astype(np.float32)
-
-
-def write_exr_channels(path: Path, channels: Mapping[str, np.ndarray]) -> None:
-    """Write float channels [H, W] by their full names."""
-    import OpenEXR
-
-    make_folder(path.parent)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
-        OpenEXR.File(header, dict(channels)).write(str(path))
-    except RuntimeError as error:  # the only error it knows, of a full disk too
-        raise InputError(f"cannot write {path}: {error}", "a writable folder with space left") from error
 
 
 def _damaged(path: Path) -> InputError:

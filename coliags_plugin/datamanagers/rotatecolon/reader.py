@@ -1,37 +1,61 @@
-"""Data manager for RotateColon, PR-Endo's rendered colon with rotated test views."""
+"""Data manager for RotateColon, PR-Endo's rendered colon with rotated test views (docs/layouts/rotatecolon.md)."""
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.files import inventory, require_folder
+from coliags_plugin.datamanagers.reading.files import inventory, numbered, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.rotatecolon import files as layout
-from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)
 
+_LAYOUT = "RotateColon's transforms.json, train_views/NNNN.png and perhaps depth_train/NNNN.exr"
+TRAIN, TRAIN_VIEWS, TRAIN_DEPTH = "transforms.json", "train_views", "depth_train"
+TEST = "transforms_test.json"
+POINTS = "init_point_cloud.ply"
 #: The colour that PR-Endo and the authors' code give all initial points, ignoring the file's colours.
 PINK = (188, 99, 76)
 #: Name of the split's test set, or of the dataset's test views if the split holds out none.
 _MAIN_SET = "test"
+
+
+@dataclass(frozen=True)
+class _ViewFiles:
+    """Images, in order of their numbers, depth files, if any, and poses of one JSON file.
+
+    Poses are rigid, with OpenCV axes, in the data's units; ``angle`` is the horizontal field of view, radians;
+    ``unposed`` the number of images without a pose.
+    """
+
+    transforms: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    camera_to_world: Float[np.ndarray, "N 4 4"]
+    angle: float
+    unposed: int
 
 
 class RotateColonSettings(SceneSettings):
@@ -70,11 +94,7 @@ class RotateColonDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return (
-            f"{layout.TRAIN} beside {layout.TRAIN_VIEWS}/"
-            if (path / layout.TRAIN).is_file() and (path / layout.TRAIN_VIEWS).is_dir()
-            else None
-        )
+        return f"{TRAIN} beside {TRAIN_VIEWS}/" if (path / TRAIN).is_file() and (path / TRAIN_VIEWS).is_dir() else None
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -87,8 +107,7 @@ class RotateColonDataManager(RecordedDataManager):
         if test is not None:
             seen = find_seen_masks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
             test_sets[name], facts[name] = self._shots(test, seen, "test-")
-        points = path / layout.POINTS
-        facts["depth_against_points"] = self._compared(shots, points)
+        points = path / POINTS
         files = [part for part in (train, test) if part is not None]
         return Recording(
             kind="RotateColon layout",
@@ -108,25 +127,25 @@ class RotateColonDataManager(RecordedDataManager):
             points_source=points,
         )
 
-    def _views(self, path: Path) -> tuple[layout.ViewFiles, layout.ViewFiles | None]:
+    def _views(self, path: Path) -> tuple[_ViewFiles, _ViewFiles | None]:
         """The training views, and the test views if there are any."""
-        require_folder(path, layout.LAYOUT)
+        require_folder(path, _LAYOUT)
         if self.recognise(path) is None:
-            raise InputError(f"{path} holds {inventory(path)}", layout.LAYOUT, "Name the scene's own folder")
-        train = layout.find_views(path / layout.TRAIN, path / layout.TRAIN_VIEWS, path / layout.TRAIN_DEPTH)
-        if not (path / layout.TEST).is_file():
+            raise InputError(f"{path} holds {inventory(path)}", _LAYOUT, "Name the scene's own folder")
+        train = _find_views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)
+        if not (path / TEST).is_file():
             return train, None
         images = path / self.settings.test_folder
         if not images.is_dir():
             raise InputError(
-                f"{path} has {layout.TEST} but no folder {self.settings.test_folder}",
+                f"{path} has {TEST} but no folder {self.settings.test_folder}",
                 "the images of the test views",
                 "Name the folder they are in with --set datamanager.test_folder=FOLDER",
             )
-        return train, layout.find_views(path / layout.TEST, images, None)
+        return train, _find_views(path / TEST, images, None)
 
     def _shots(
-        self, files: layout.ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
+        self, files: _ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
         settings = self.settings
         width, height = size_of(files.images[0])
@@ -147,30 +166,66 @@ class RotateColonDataManager(RecordedDataManager):
         }
         return shots, facts
 
-    def _compared(self, shots: list[Shot], points: Path) -> dict[str, float] | None:
-        """Scale agreement of depth and initial points; None if one of them is missing."""
-        if not points.is_file():
-            return None
-        fit = fit_scale(shots, load_points(points).positions.double().numpy())
-        if fit is None:
-            return None
-        divisor = self.settings.depth_divisor
-        if fit.disagrees:
-            log.warning(
-                "%s: depth / %g is off the points by %.2g of the depth, depth / %.4g by %.2g; "
-                "consider depth_divisor (docs/layouts/rotatecolon.md 4)",
-                points,
-                divisor,
-                fit.distance,
-                divisor / fit.factor,
-                fit.distance_at_best,
+
+def _find_views(transforms: Path, images: Path, depth: Path | None) -> _ViewFiles:
+    """Find the images and depth files of the poses in a JSON file.
+
+    There must be an image for every pose; others are counted. Either all frames have a depth file, or none.
+    """
+    trajectory = read_transforms(transforms)
+    expected = "the horizontal field of view, radians, between 0 and pi"
+    content = read_json(transforms, "a transforms.json")
+    image_files = numbered(images, "", frozenset({".png"}))
+    stated = _numbers(transforms, trajectory.names_or_numbers())
+    order = sorted(range(len(stated)), key=stated.__getitem__)
+    numbers = [stated[index] for index in order]
+    for number in numbers:
+        if number not in image_files:
+            raise InputError(
+                f"{transforms}: frame {number} has no image {images / f'{number:04d}.png'}",
+                "an image for every frame",
+                "Restore it, or remove the frame",
             )
-        return {
-            "best_divisor": divisor / fit.factor,
-            "ratio": fit.factor,
-            "median_distance_over_depth": fit.distance,
-            "at_best_divisor": fit.distance_at_best,
-        }
+    unposed = len(image_files) - len(numbers)
+    if unposed:
+        log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, images.name)
+    return _ViewFiles(
+        transforms,
+        tuple(image_files[number] for number in numbers),
+        _depths(numbers, depth),
+        trajectory.camera_to_world[order],
+        read_number(content, "camera_angle_x", transforms, expected, above=0.0, below=math.pi),
+        unposed,
+    )
+
+
+def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
+    """Frame numbers from ``file_path``, with or without folder and suffix."""
+    numbers: list[int] = []
+    for name in names:
+        stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".png")
+        if not stem.isdecimal():
+            raise InputError(f"{transforms}: file_path '{name}'", "the frame's number, for instance '12'")
+        number = int(stem)
+        if number in numbers:
+            raise InputError(f"{transforms}: frame {number} is repeated", "one pose for each image")
+        numbers.append(number)
+    return numbers
+
+
+def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | None:
+    files = {} if folder is None else numbered(folder, "", frozenset({".exr"}))
+    lacking = [number for number in numbers if number not in files]
+    if folder is None or len(lacking) == len(numbers):
+        return None
+    if lacking:
+        raise InputError(
+            f"{folder} has {len(numbers) - len(lacking)} depth files for {len(numbers)} frames; frame {lacking[0]} has "
+            "none",
+            "a depth file for every image, or none at all",
+            "Restore the missing files: incomplete archives are common",
+        )
+    return tuple(files[number] for number in numbers)
 
 
 def _pink(points: PointCloud) -> PointCloud:

@@ -1,1 +1,0 @@
-"""Posed sequences of the EndoMapper dataset."""
