@@ -1,9 +1,8 @@
-"""Hints for mistyped or outdated command-line arguments."""
+"""Hints for mistyped command-line arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import Any, get_args, get_type_hints
 
 import tyro
@@ -12,29 +11,10 @@ from coliags_plugin.core.errors import did_you_mean
 
 
 def hint(argv: Sequence[str], commands: Any) -> str:
-    """Hint for arguments that cannot be parsed: the new spelling of an old one, or the nearest name; empty without one.
+    """The command that an unknown one resembles most, or else the option of its command; empty without one.
 
     ``commands`` is the union of the commands.
     """
-    return renamed_argument(argv) or _nearest(argv, commands)
-
-
-def renamed_argument(argv: Sequence[str]) -> str:
-    """Hint with the present spelling of an argument of an older release; empty without one."""
-    options = {word.partition("=")[0] for word in argv}
-    for old in ("--out", "--save"):
-        if old in options:
-            return f"{old} is now --output, or -o"
-    is_positional = list(argv[:1]) == ["phantom"] or list(argv[:2]) == ["poses", "convert"]
-    if is_positional and not options & {"--output", "-o"}:
-        return "what is written is now named by --output, or -o"
-    if any(option == "--json" and path.endswith(".json") for option, path in pairwise(argv)):
-        return "--json prints the summary, and takes no file: write `--json > FILE`"
-    return ""
-
-
-def _nearest(argv: Sequence[str], commands: Any) -> str:
-    """The command that an unknown one resembles most, or else the option of its command."""
     if not argv:
         return ""
     kinds = {name.name: kind for kind, name in map(get_args, get_args(commands))}
@@ -43,7 +23,7 @@ def _nearest(argv: Sequence[str], commands: Any) -> str:
     kind = kinds[argv[0]]
     fields = get_type_hints(kind, include_extras=True)
     if (inner := fields.get("subcommand")) is not None:
-        return _nearest(argv[1:], get_args(inner)[0])
+        return hint(argv[1:], get_args(inner)[0])
     known = {option for field in fields.items() for option in _options(*field)}
     unknown = (word.partition("=")[0] for word in argv if word.startswith("--"))
     return next((did_you_mean(word, known) for word in unknown if word not in known), "")

@@ -106,7 +106,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
         scenes = {cell.scene.path for cell in cells if finished.of(cell) is None}
         if scenes:
             executor.check(folder.path, sorted(scenes))
-        folder.record(request, cells, has_results=bool(finished))
+        folder.record(request, cells)
         failures = CellRuns(folder, executor, options, cells, finished).run()
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)

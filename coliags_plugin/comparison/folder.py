@@ -118,10 +118,10 @@ class ComparisonFolder:
                 "Leave both out, or choose another --output",
             )
 
-    def record(self, request: Request, cells: Sequence[ComparisonCell], has_results: bool) -> None:
+    def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:
         """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
 
-        With results in the folder, new and changed cells are recorded as later. Only a new plan takes up a decision.
+        Only a new plan takes up a decision.
         """
         former_plan = read_plan(self.path)
         before = former_plan or ComparisonPlan()
@@ -137,13 +137,10 @@ class ComparisonFolder:
             )
         scenes = dict(before.scenes)
         for cell in cells:
-            former = entries.get(cell.identity)
-            is_kept = former is not None and former.key == cell.known_keys.result
             entries[cell.identity] = PlannedCell(
                 **cell.named,
                 run=self.run(cell).path.relative_to(self.path).as_posix(),
                 result=self.result(cell).relative_to(self.path).as_posix(),
-                later=former.later if former is not None and is_kept else has_results,
             )
             scenes[cell.scene.name] = PlannedScene(
                 phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__

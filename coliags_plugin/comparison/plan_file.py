@@ -47,11 +47,12 @@ class _NamedCell(_PlanPart):
 
 
 class PlannedCell(_NamedCell):
-    """A cell of a plan."""
+    """A cell of a plan; what else archived plans say of it is not read."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
     run: str = Field(pattern=f"^{RUNS}/")  # run folder, relative to the comparison's
     result: str = Field(pattern=f"^{RESULTS}/")  # results file, likewise; there once the cell is done
-    later: bool = False  # asked for, or changed, after the first result
 
     @property
     def identity(self) -> tuple[str, str, int, str]:

@@ -37,8 +37,6 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
-#: Sections whose former options ``near`` and ``near_plane`` are ``near_plane`` of the method.
-_HAD_NEAR_PLANE = ("renderer", "field")
 #: Of the run, neither its start nor its end.
 Share = Annotated[float, Field(gt=0, lt=1)]
 
@@ -173,7 +171,7 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     """Merged config tree of a method with overrides applied, before validation, each value with its origin."""
     tree = _resolve(_find(method, Path.cwd()), ())
     for assignment in overrides:
-        tree = merge(tree, _with_moved_options(parse_assignment(assignment)))
+        tree = merge(tree, parse_assignment(assignment))
     return tree
 
 
@@ -197,7 +195,7 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     if path in seen:
         chain = " -> ".join(p.name for p in (*seen, path))
         raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
-    tree = _with_moved_options(read_tree(path))
+    tree = read_tree(path)
     base = tree.value.get("base")
     if base is None:
         return tree
@@ -207,37 +205,6 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     inherited = {key: node for key, node in parent.value.items() if key != "description"}
     own = {key: node for key, node in tree.value.items() if key != "base"}
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
-
-
-def _with_moved_options(tree: Node) -> Node:
-    """A method config, as written in one file or assignment, with its near planes at their present place.
-
-    See "Renamed options" in the changelog.
-    """
-    if not tree.is_mapping:
-        return tree
-    top = dict(tree.value)
-    planes = {"near_plane": top["near_plane"]} if "near_plane" in top else {}
-    for section in _HAD_NEAR_PLANE:
-        node = top.get(section)
-        if node is None or not node.is_mapping:
-            continue
-        own = {f"{section}.{key}": node.value[key] for key in ("near", "near_plane") if key in node.value}
-        if own:
-            kept = {key: child for key, child in node.value.items() if f"{section}.{key}" not in own}
-            top[section] = Node(kept, node.origin)
-            planes |= own
-    if len({plane.value for plane in planes.values()}) > 1:
-        listed = " and ".join(f"{key} {plane.value} ({plane.origin})" for key, plane in planes.items())
-        raise InputError(
-            f"{listed}: earlier versions had several near planes, of which one is left",
-            "one near_plane",
-            "Leave one of them, or write near_plane: LENGTH at the top level",
-        )
-    for plane in planes.values():
-        # Of the volume renderer, null left the start of rays to the field.
-        top["near_plane"] = Node(0.0, plane.origin) if plane.value is None else plane
-    return Node(top, tree.origin)
 
 
 def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:

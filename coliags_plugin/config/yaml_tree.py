@@ -44,28 +44,8 @@ class Node:
         return node
 
 
-#: Of a file, aliases expanded; the largest method config has 200.
-_MOST_VALUES = 10_000
-
-
 class _Loader(yaml.SafeLoader):
-    """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it; text can be encoded."""
-
-    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
-        """The value of a scalar node; raises ConstructorError for text that cannot be encoded as UTF-8."""
-        value = super().construct_scalar(node)
-        if isinstance(value, str) and not _is_text(value):
-            raise yaml.constructor.ConstructorError(None, None, f"{value!a} is not text in Unicode", node.start_mark)
-        return value
-
-
-def _is_text(value: str) -> bool:
-    """Whether a string can be encoded as UTF-8; one with a lone surrogate, as of an undecodable argument, cannot."""
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -115,8 +95,6 @@ def parse_tree(text: str, source: str) -> Node:
         loader = _Loader(text)
         try:
             root = loader.get_single_node()
-            if root is not None:
-                _check_extent(root, source)
             tree = Node({}, source) if root is None else _convert(loader, root, source)
         finally:
             loader.dispose()
@@ -138,26 +116,6 @@ def parse_value(text: str) -> object:
         return tuples(yaml.load(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError):
         return text
-
-
-def _check_extent(root: yaml.Node, source: str) -> None:
-    """Refuse aliases that refer to themselves, or that expand a short text to more values than any config has."""
-    extents: dict[int, float] = {}
-
-    def extent(node: yaml.Node) -> float:
-        if isinstance(node, yaml.ScalarNode):
-            return 1
-        if id(node) not in extents:
-            extents[id(node)] = math.inf  # while it is being counted: what refers to itself is endless
-            pairs = isinstance(node, yaml.MappingNode)
-            children = [child for pair in node.value for child in pair] if pairs else node.value
-            extents[id(node)] = 1 + sum(map(extent, children))
-        return extents[id(node)]
-
-    found = extent(root)
-    if found > _MOST_VALUES:
-        many = "endlessly many" if math.isinf(found) else f"{found:,}"
-        raise InputError(f"{source} has {many} values, aliases expanded", f"at most {_MOST_VALUES:,}")
 
 
 def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
@@ -207,8 +165,6 @@ _KEY = re.compile(r'"[^"]+"|[^".]+')
 
 def parse_assignment(assignment: str) -> Node:
     """The tree of one ``key.path=value``; a key with a dot is put in double quotes."""
-    if not _is_text(assignment):
-        raise InputError(f"--set {assignment!a}", "text in UTF-8")
     path, equals, text = assignment.partition("=")
     keys = _KEY.findall(path.strip())
     if not equals or ".".join(keys) != path.strip():

@@ -15,9 +15,6 @@ from coliags_plugin.core.json_files import read_json
 
 Model = TypeVar("Model", bound=BaseModel)
 
-#: Of the largest integers of arrays and tensors, besides the sign.
-_INTEGER_BITS = 63
-
 
 class Settings(BaseModel):
     """Frozen, strictly typed options; an unknown key is an error that names the nearest known one.
@@ -31,25 +28,24 @@ class Settings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _refuse_unknown_keys_and_huge_integers(cls, data: object) -> object:
+    def _refuse_unknown_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         known = ", ".join(cls.model_fields) or "none"
-        problems = {
-            key: PydanticCustomError(
-                "unknown_key",
-                "unknown key '{key}'; known keys: {known}. {hint}",
-                {"key": str(key), "known": known, "hint": cls._meant(str(key), data)},
+        details = [
+            InitErrorDetails(
+                type=PydanticCustomError(
+                    "unknown_key",
+                    "unknown key '{key}'; known keys: {known}. {hint}",
+                    {"key": str(key), "known": known, "hint": cls._meant(str(key), data)},
+                ),
+                loc=(key,),
+                input=value,
             )
-            for key in data
-            if key not in cls.model_fields
-        } or {
-            key: PydanticCustomError("huge_integer", "an integer of more than 64 bits")
             for key, value in data.items()
-            if _is_huge(value)
-        }
-        if problems:
-            details = [InitErrorDetails(type=why, loc=(key,), input=data[key]) for key, why in problems.items()]
+            if key not in cls.model_fields
+        ]
+        if details:
             raise ValidationError.from_exception_data(cls.__name__, details)
         return data
 
@@ -61,13 +57,6 @@ class Settings(BaseModel):
 
 #: Settings of a component's base class.
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
-
-
-def _is_huge(value: object) -> bool:
-    """Whether a value is, or has, an integer that no array can hold."""
-    if isinstance(value, (tuple, list)):
-        return any(map(_is_huge, value))
-    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
 
 
 def validated(kind: type[Model], values: Mapping[str, object], what: str) -> Model:

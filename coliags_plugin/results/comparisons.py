@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -105,20 +105,36 @@ class RivalComparison:
 
 
 def compare_with_rivals(
-    values: Mapping[str, BySeed], reference: str, higher_is_better: bool, family: Sequence[Collection[str]] = ()
+    values: Mapping[str, BySeed], reference: str, higher_is_better: bool, family: int = 0
 ) -> list[RivalComparison]:
     """Compare a reference with every other method, each pair on their common scenes, seeds averaged first.
 
-    p-values are adjusted for the family: all methods that were to be compared, with or without values, each with all
-    names that it has; empty: those that have values.
+    p-values are adjusted for the family: so many rivals, with or without values, and at least those that are here.
     """
     leads = {
         rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
         for rival, by_seed in values.items()
         if rival != reference
     }
-    rivals = [names for names in family or [[rival] for rival in leads] if reference not in names]
-    tests = _adjusted({rival: _tested(own) for rival, own in leads.items() if len(own) >= FEWEST_SCENES}, rivals)
+    samples = {rival: np.array([*own.values()]) for rival, own in leads.items() if len(own) >= FEWEST_SCENES}
+    wilcoxon = {rival: wilcoxon_p(sample) for rival, sample in samples.items()}
+    t_test = {rival: p for rival, sample in samples.items() if (p := t_test_p(sample)) is not None}
+    wilcoxon_holm, t_test_holm = (
+        dict(zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True))
+        for p_values in (wilcoxon, t_test)
+    )
+    tests = {
+        rival: PairedTests(
+            wilcoxon[rival],
+            wilcoxon_holm[rival],
+            t_test.get(rival),
+            t_test_holm.get(rival),
+            t_interval(sample),
+            cohen_dz(sample),
+            rank_biserial(sample),
+        )
+        for rival, sample in samples.items()
+    }
     return [
         RivalComparison(
             rival=rival,
@@ -135,27 +151,3 @@ def _leads(reference: BySeed, rival: BySeed, sign: float) -> dict[str, float]:
     """Lead of the reference on each common scene."""
     one, other = scene_means(reference), scene_means(rival)
     return {scene: sign * (one[scene] - other[scene]) for scene in common_scenes([reference, rival])}
-
-
-def _tested(leads: Mapping[str, float]) -> PairedTests:
-    sample = np.array([*leads.values()])
-    wilcoxon, t_test = wilcoxon_p(sample), t_test_p(sample)
-    return PairedTests(wilcoxon, wilcoxon, t_test, t_test, t_interval(sample), cohen_dz(sample), rank_biserial(sample))
-
-
-def _adjusted(tests: Mapping[str, PairedTests], rivals: Sequence[Collection[str]]) -> dict[str, PairedTests]:
-    """The tests with p-values adjusted for the rivals; the reference under another name is none."""
-    wilcoxon = _holm_by_name({rival: test.wilcoxon for rival, test in tests.items()}, rivals)
-    t_test = _holm_by_name({rival: test.t_test for rival, test in tests.items() if test.t_test is not None}, rivals)
-    return {
-        rival: replace(test, wilcoxon_holm=wilcoxon.get(rival, 1.0), t_test_holm=t_test.get(rival))
-        for rival, test in tests.items()
-    }
-
-
-def _holm_by_name(p_values: Mapping[str, float], rivals: Sequence[Collection[str]]) -> dict[str, float]:
-    """Of one rival under several names, the largest p counts, and once."""
-    tested = [[name for name in names if name in p_values] for names in rivals]
-    tested = [names for names in tested if names]
-    adjusted = holm([max(p_values[name] for name in names) for names in tested], len(rivals))
-    return {name: p for names, p in zip(tested, adjusted, strict=True) for name in names}

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import stats
 
 #: Scenes from which on a test is run: with 5, the two-sided Wilcoxon test cannot give less than .0625.
 FEWEST_SCENES = 6
-#: Largest sample whose p is exact, scipy's limit as well.
-_MOST_EXACT = 50
 
 Differences = Float[np.ndarray, "n"]
 
@@ -22,31 +20,13 @@ def smallest_p(scenes: int) -> float:
 
 
 def wilcoxon_p(differences: Differences) -> float:
-    """Two-sided p of the Wilcoxon signed-rank test.
+    """Two-sided p of the Wilcoxon signed-rank test by scipy, without the zeros.
 
-    Zeros are dropped. Exact for up to 50 differences, of which scipy takes those without ties; the normal approximation
-    beyond. Never below :func:`smallest_p`. Without a difference that is not zero it is 1.
+    Exact for up to 50 differences without ties, else the normal approximation; never below :func:`smallest_p`. Without
+    a difference that is not zero it is 1.
     """
     kept = differences[differences != 0.0]
-    if not kept.size:
-        return 1.0
-    tied = len(np.unique(np.abs(kept))) < len(kept)
-    if tied and len(kept) <= _MOST_EXACT:
-        return _exact_p(stats.rankdata(np.abs(kept)), kept > 0.0)
-    return max(float(stats.wilcoxon(kept).pvalue), smallest_p(len(kept)))
-
-
-def _exact_p(ranks: Float[np.ndarray, "n"], positive: Bool[np.ndarray, "n"]) -> float:
-    """Two-sided p of the sum of positive ranks, under all sign changes alike; tied ranks are halves."""
-    doubled = np.rint(2.0 * ranks).astype(np.int64)
-    # counts[s]: ways of choosing the positive ranks so that twice their sum is s. Exact: below 2^53.
-    counts = np.zeros(int(doubled.sum()) + 1)
-    counts[0] = 1.0
-    for rank in doubled:
-        counts[rank:] += counts[:-rank].copy()
-    observed = int(doubled[positive].sum())
-    tail = min(counts[: observed + 1].sum(), counts[observed:].sum())
-    return float(min(1.0, 2.0 * tail / counts.sum()))
+    return max(float(stats.wilcoxon(kept).pvalue), smallest_p(len(kept))) if kept.size else 1.0
 
 
 def t_test_p(differences: Differences) -> float | None:

@@ -13,7 +13,7 @@ import tyro
 
 from coliags_plugin._version import __version__
 from coliags_plugin.cli import Command
-from coliags_plugin.cli.hints import hint, renamed_argument
+from coliags_plugin.cli.hints import hint
 from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 
@@ -59,28 +59,6 @@ def test_a_summary_for_people_and_for_scripts(capsys):
     assert json.loads(capsys.readouterr().out) == {"step": 3, "written": ["a b"], "next": ["coliags eval 'a b'"]}
     print_summary("text", as_json=True)
     assert json.loads(capsys.readouterr().out) == {"summary": "text", "written": [], "next": []}
-
-
-@pytest.mark.parametrize(
-    ("argv", "hint"),
-    [
-        ("mesh RUN --out OUT", "--out is now --output, or -o"),
-        ("reconstruct VIDEO --out=OUT", "--out is now --output, or -o"),
-        ("view RUN --save page.html", "--save is now --output, or -o"),
-        ("phantom OUT --seed 1", "what is written is now named by --output, or -o"),
-        ("poses convert IN OUT --to tum", "what is written is now named by --output, or -o"),
-        ("data check SCENE --json check.json", "write `--json > FILE`"),
-    ],
-)
-def test_old_spellings_are_refused_with_the_new_ones(argv, hint, capsys):
-    assert run(*argv.split()) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("coliags: ") and last.endswith(hint)
-
-
-def test_other_mistakes_are_not_taken_for_old_spellings():
-    for argv in ("mesh RUN --outpu OUT", "phantom --output OUT --sed 1", "data check SCENE --json --bogus"):
-        assert not renamed_argument(argv.split())
 
 
 @pytest.mark.parametrize(

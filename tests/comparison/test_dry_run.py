@@ -10,6 +10,8 @@ import pytest
 from coliags_plugin.comparison.compare import dry_run, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.plan import make_cells
+from coliags_plugin.comparison.plan_file import ComparisonPlan
+from coliags_plugin.core.files import write_json
 from tests.comparison.small import compare_inline
 from tests.scenes import write_wall
 
@@ -28,6 +30,7 @@ def test_a_run_with_a_checkpoint_goes_on(cells, folder):
     checkpoint = folder.run(cells[1]).checkpoints / "step-000040"
     checkpoint.mkdir(parents=True)
     (checkpoint / "state.json").write_text("{}")
+    write_json(folder.path / "plan.json", ComparisonPlan(steps=100).model_dump(mode="json"))
     table = dry_run(make_request(["coliags", "3dgs", "scaffold-gs"], [cells[0].scene.path], steps=100), folder)
     assert [(row["state"], row["steps"]) for row in table.rows] == [
         ("new", "100"),

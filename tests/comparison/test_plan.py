@@ -119,7 +119,7 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     first = requested(wall, ["coliags"], reference="coliags", primary=["psnr", "depth_mse_inner"])
     folder.check_extends(first)
     folder.path.mkdir()
-    folder.record(first, make_cells(first), has_results=False)
+    folder.record(first, make_cells(first))
     decided = folder.plan().decided
     assert (decided.reference, decided.primary) == ("coliags", ("psnr", "depth_mse_inner"))
     assert decided.date == datetime.now(timezone.utc).date().isoformat()
@@ -128,14 +128,12 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
         folder.check_extends(requested(wall, ["coliags"], reference="coliags", primary=["psnr"]))
     more = requested(wall, ["coliags", "3dgs"])
     folder.check_extends(more)
-    folder.record(more, make_cells(more), has_results=True)
+    folder.record(more, make_cells(more))
     assert folder.plan().decided is not None
-    assert [(cell.method, cell.later) for cell in folder.plan().cells] == [("coliags", False), ("3dgs", True)]
+    assert [cell.method for cell in folder.plan().cells] == ["coliags", "3dgs"]
     changed = make_cells(requested(wall, [Variant("coliags", "coliags", ("field.features=8",))]))
-    folder.record(first, changed, has_results=True)
-    assert [(cell.method, cell.later) for cell in folder.plan().cells] == [("coliags", True), ("3dgs", True)]
-    folder.record(more, make_cells(more), has_results=False)
-    assert [cell.later for cell in folder.plan().cells] == [False, True]
+    folder.record(first, changed)
+    assert folder.plan().cells[0].key == changed[0].keys.result
 
 
 def test_nothing_is_decided_after_the_first_run(wall, tmp_path):
@@ -145,6 +143,6 @@ def test_nothing_is_decided_after_the_first_run(wall, tmp_path):
     with pytest.raises(InputError, match="had decided nothing when it was begun"):
         folder.check_extends(late)
     plain = requested(wall, ["coliags"])
-    folder.record(plain, make_cells(plain), has_results=False)
+    folder.record(plain, make_cells(plain))
     with pytest.raises(InputError, match="had decided nothing"):
         folder.check_extends(late)

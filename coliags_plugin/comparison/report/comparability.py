@@ -10,7 +10,6 @@ from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import held_out_uses
 from coliags_plugin.reporting.model import leaves
-from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.results.record import Result
 
 
@@ -107,7 +106,6 @@ def cautions(study: Study) -> list[str]:
     texts = [
         *_missing_scenes(study),
         *_unpaired_seeds(study),
-        *_later(study),
         *_codes(study),
         *_steps(study),
         *_untrained_views(study),
@@ -158,15 +156,6 @@ def _unpaired_seeds(study: Study) -> list[str]:
     return [f"The methods were trained with different seeds on {first}{more}; a mean over more seeds varies less."]
 
 
-def _later(study: Study) -> list[str]:
-    """Caution about results that were planned after the first one of a pre-registered comparison."""
-    later = Counter(run.method for run in study.runs if not run.planned)
-    if study.decided is None or not later:
-        return []
-    each = ", ".join(f"{method} ({counted(count, 'result')})" for method, count in later.items())
-    return [f"Planned or changed after the first result, so that comparisons with them are exploratory: {each}."]
-
-
 def _codes(study: Study) -> list[str]:
     """Which results come from which code, if not all are of one."""
     by_code: dict[str, list[StudyRun]] = {}
@@ -188,14 +177,11 @@ def _codes(study: Study) -> list[str]:
 
 
 def code_of(result: Result) -> str:
-    """Key of the code that trained and evaluated; of earlier versions, which record none, the version."""
-    trained, evaluated = (
-        str(each.get("code") or f"version {each.get('package_version')}")
-        for each in (result.provenance.get("training", {}), result.software)
-    )
-    changes = result.provenance.get("training", {}).get("code_changes", [])
-    trained = ", then ".join(dict.fromkeys([trained, *(str(change["code"]) for change in changes)]))
-    return evaluated if trained in ("version None", evaluated) else f"{trained}, evaluated by {evaluated}"
+    """Key of the code that trained and evaluated."""
+    training, evaluated = result.provenance.get("training", {}), str(result.software.get("code"))
+    codes = [training.get("code", evaluated), *(change["code"] for change in training.get("code_changes", []))]
+    trained = ", then ".join(dict.fromkeys(map(str, codes)))
+    return evaluated if trained == evaluated else f"{trained}, evaluated by {evaluated}"
 
 
 def _steps(study: Study) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product, starmap
+from itertools import starmap
 
 from coliags_plugin.comparison.report.metric_columns import metric_columns, metric_title
 from coliags_plugin.comparison.report.metric_tables import shared_scenes, spreads
@@ -26,7 +26,6 @@ EXPLANATION = (
     "correlation, 1 where the reference is better on every scene."
 )
 _SMALLEST_PRINTED = 1e-4
-_LATER = "planned or changed after the first result: exploratory"
 _TESTS = {
     "smallest": "Smallest p",
     "wilcoxon": "Wilcoxon p",
@@ -63,29 +62,24 @@ def _best_method(part: Part) -> str:
 
 
 def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
-    """Paired comparisons of the reference with every shown method by one metric; empty where it has no value."""
-    study, values = part.study, part.values(column.key, hidden=True)
+    """Paired comparisons of the reference with every method by one metric; empty where it has no value."""
+    study, values = part.study, part.values(column.key)
     if column.direction is None or not values[reference]:
         return []
     rivals = {method: by_scene for method, by_scene in values.items() if by_scene}
-    compared = compare_with_rivals(rivals, reference, column.direction == "higher", study.family)
-    is_primary = is_decided(study, reference) and study.decided is not None and column.key in study.decided.primary
-    return [
-        replace(row, exploratory=not (is_primary and _planned(part, row, reference)))
-        for row in compared
-        if row.rival in study.methods
-    ]
+    compared = compare_with_rivals(rivals, reference, column.direction == "higher", _family(study, reference))
+    is_primary = study.decided is not None and is_decided(study, reference) and column.key in study.decided.primary
+    return [replace(row, exploratory=not is_primary) for row in compared]
+
+
+def _family(study: Study, reference: str) -> int:
+    """Number of rivals that p-values are adjusted for: all methods that were planned or given."""
+    return len({*study.family, *study.methods} - {reference})
 
 
 def is_decided(study: Study, reference: str) -> bool:
     """Whether the reference is that which was decided before the first result."""
     return study.decided is not None and study.decided.reference == reference
-
-
-def _planned(part: Part, row: RivalComparison, reference: str) -> bool:
-    """Whether all that a comparison is of was planned before the first result."""
-    pairs = product(row.scenes, (reference, row.rival))
-    return all(run.planned for scene, method in pairs for run in part.runs(scene, method))
 
 
 def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
@@ -108,11 +102,7 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
         columns=columns,
         rows=[
             {
-                "over": TableCell(
-                    row.rival,
-                    style=part.study.methods.index(row.rival),
-                    note="" if _planned(part, row, reference) or part.study.decided is None else _LATER,
-                ),
+                "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
                 "scenes": len(row.scenes),
                 "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
                 "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
@@ -163,38 +153,22 @@ def statistics_text(study: Study, compared: Sequence[RivalComparison], reference
             f"{smallest_p_text(most)}; tests are run from {FEWEST_SCENES} scenes on "
             f"(p = {smallest_p_text(FEWEST_SCENES)})."
         ]
-    rivals = sum(reference not in names for names in study.family)
+    rivals = _family(study, reference)
     text = [
         f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
-        f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or "
-        f"{smallest_p_text(most, rivals)} after Holm's adjustment for {counted(rivals, 'rival')}."
+        f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or {smallest_p_text(most, rivals)} "
+        f"after Holm's adjustment for {counted(rivals, 'rival')}: all that were planned or given."
     ]
     if min(1.0, rivals * smallest_p(most)) >= LEVELS[0]:
         needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
         text.append(f"No star is possible, as that is not below {p_text(LEVELS[0])}; it takes {needed} scenes.")
-    text += [*_family_text(study), _decision_text(study, reference)]
+    text.append(_decision_text(study, reference))
     if not chosen:
         text.append(
             f"{reference} is the reference because it came out best, so that the p-values are too small: choose one "
             "beforehand, with --reference."
         )
     return text
-
-
-def _family_text(study: Study) -> list[str]:
-    """Which rivals the adjustment counts without that they are shown, and which under several names once."""
-    results = {run.method for run in study.hidden}
-    unseen = [names[0] for names in study.family if not {*names} & {*study.methods}]
-    told = {
-        "not shown": [name for name in unseen if name in results],
-        "without a result that can be compared": [name for name in unseen if name not in results],
-        "the same under several names, and counted once": [" = ".join(names) for names in study.family if names[1:]],
-    }
-    return [
-        f"Of all methods that were planned or given, {what}: {', '.join(names)}."
-        for what, names in told.items()
-        if names
-    ]
 
 
 def _decision_text(study: Study, reference: str) -> str:

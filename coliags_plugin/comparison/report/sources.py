@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, ComparisonPlan, file_name, read_plan
+from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, ComparisonPlan, read_plan
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.json_files import json_text, parse_json, read_json
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.results.hashing import training_config
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
 #: Below results and failures: scene, method, and seed with key.
 _CELL = "*/*/s*-*.json"
-_SEED = re.compile(r"s(\d+)-")
 
 
 def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
@@ -48,45 +46,13 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     _refuse_twice(runs)
     if not runs:
         raise _nothing_yet(paths, missing)
-    planned = [(entry.method, entry.key) for plan in plans for entry in plan.cells]
-    planned += [(one.method, "") for one in missing]
-    with_results = {run.method for run in runs}
     runs = disambiguate_labels(runs)
-    keys = [(run.method, run.result.key) for run in runs]
-    family = _one_methods([*keys, *(each for each in planned if each[0] not in with_results)])
+    family = dict.fromkeys(run.method for run in runs)
+    family |= dict.fromkeys([*(cell.method for plan in plans for cell in plan.cells), *(one.method for one in missing)])
     decisions = {plan.decided for plan in plans}
     shown, missing = _only(methods, runs, missing) if methods else (runs, missing)
     refuse_incomparable(shown)
-    return Study(
-        tuple(shown),
-        tuple(missing),
-        tuple(_comparable([run for run in runs if methods and run.method not in methods], shown)),
-        family,
-        decisions.pop() if len(decisions) == 1 else None,
-    )
-
-
-def _one_methods(keys: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
-    """Names of one method together: those with the key of a result in common; without a key, a name stands alone."""
-    owner: dict[str, str] = {}
-    first: dict[str, str] = {}
-    for name, key in keys:
-        first.setdefault(name, name)
-        other = owner.setdefault(key or name, name)
-        if other != name:
-            first[name] = first[other]
-    return tuple(tuple(name for name in first if first[name] == one) for one in dict.fromkeys(first.values()))
-
-
-def _comparable(hidden: Sequence[StudyRun], shown: Sequence[StudyRun]) -> Iterator[StudyRun]:
-    """The runs of those methods that are comparable with what is shown."""
-    for name in dict.fromkeys(run.method for run in hidden):
-        own = [run for run in hidden if name == run.method]
-        try:
-            refuse_incomparable([*shown, *own])
-        except InputError:
-            continue
-        yield from own
+    return Study(tuple(shown), tuple(missing), tuple(family), decisions.pop() if len(decisions) == 1 else None)
 
 
 def _only(
@@ -110,12 +76,6 @@ def _read_run(folder: Path, protocol: str) -> StudyRun:
     name = protocol.removesuffix(TRUTH_SUFFIX)
     truth = "" if name == protocol else " --truth SCENE"
     do = f"Run `coliags eval {folder} --protocol {name}{truth}`"
-    if (evaluation / "metrics.json").is_file():
-        raise InputError(
-            f"{folder} was evaluated by an older release, which wrote no {RESULT_FILE}",
-            "an evaluated run",
-            f"{do} again",
-        )
     if not (folder / "eval").is_dir() and not (folder / "config.yaml").is_file():
         raise InputError(
             f"{folder} holds no results",
@@ -142,12 +102,12 @@ def _is_comparison(folder: Path) -> bool:
 def _read_comparison(
     folder: Path, plan: ComparisonPlan | None, protocol: str
 ) -> tuple[list[StudyRun], list[MissingResult]]:
-    """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan."""
+    """Results and failures of one protocol: those of the plan, in its order; without a plan, all results."""
     if plan is not None:
         return _read_planned(folder, plan, protocol)
-    if (folder / RESULTS).is_dir():
-        return _read_unplanned(folder / RESULTS, folder / RUNS, protocol), list(_read_failures(folder))
-    return _read_unplanned(folder, None, protocol), []
+    found = [_read_file(file, file.stem) for file in sorted([*folder.glob(_CELL), *(folder / RESULTS).glob(_CELL)])]
+    _refuse_other_protocols(folder, protocol, {one.result.protocol.name for one in found})
+    return [one for one in found if one.result.protocol.name == protocol], []
 
 
 def _read_planned(folder: Path, plan: ComparisonPlan, protocol: str) -> tuple[list[StudyRun], list[MissingResult]]:
@@ -157,8 +117,7 @@ def _read_planned(folder: Path, plan: ComparisonPlan, protocol: str) -> tuple[li
         file = folder / entry.result
         if file.is_file():
             own = _with_images(folder / entry.run, protocol)
-            is_planned = plan.decided is not None and not entry.later
-            one = replace(_read_file(file, file.stem, own), method=entry.method, planned=is_planned)
+            one = replace(_read_file(file, file.stem, own), method=entry.method)
             if own is not None:
                 runs[one.result.key] = own
             found.append(one)
@@ -170,20 +129,6 @@ def _read_planned(folder: Path, plan: ComparisonPlan, protocol: str) -> tuple[li
     return [replace(one, run=one.run or runs.get(one.result.key)) for one in found], missing
 
 
-def _read_unplanned(folder: Path, runs: Path | None, protocol: str) -> list[StudyRun]:
-    """The name of a method's folder tells variants of one method apart."""
-    found = [_read_file(file, file.stem) for file in sorted(folder.glob(_CELL))]
-    _refuse_other_protocols(folder, protocol, {one.result.protocol.name for one in found})
-    named = []
-    for one in found:
-        if one.result.protocol.name == protocol:
-            place = one.file.parent
-            method = one.method if file_name(one.method) == place.name else place.name
-            run = runs and _find_run(runs / place.relative_to(folder), one.stamp, one.result.key, protocol)
-            named.append(replace(one, method=method, run=run))
-    return named
-
-
 def _refuse_other_protocols(folder: Path, protocol: str, protocols: set[str]) -> None:
     if protocols and protocol not in protocols:
         raise InputError(
@@ -193,31 +138,9 @@ def _refuse_other_protocols(folder: Path, protocol: str, protocols: set[str]) ->
         )
 
 
-def _find_run(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
-    """The run whose evaluation has the key; runs have keys of their own in their names."""
-    seed = stem.partition("-")[0]
-    for run in sorted(folder.glob(f"{seed}-*")):
-        try:
-            content = parse_json(json_text(run / "eval" / protocol / RESULT_FILE))
-        except (OSError, ValueError):
-            continue
-        if isinstance(content, dict) and content.get("key") == key:
-            return _with_images(run, protocol)
-    return None
-
-
 def _with_images(run: Path, protocol: str) -> Path | None:
     """The run, if it still has the images of its evaluation."""
     return run if (run / "eval" / protocol / "renders").is_dir() else None
-
-
-def _read_failures(folder: Path) -> Iterator[MissingResult]:
-    """Cells that failed and have no result."""
-    for file in sorted((folder / FAILURES).glob(_CELL)):
-        place = file.relative_to(folder / FAILURES)
-        seed = _SEED.match(file.name)
-        if seed is not None and not (folder / RESULTS / place).is_file():
-            yield MissingResult(place.parts[0], place.parts[1], int(seed.group(1)), _failure_reason(file))
 
 
 def _failure_reason(file: Path) -> str:

@@ -23,7 +23,6 @@ class StudyRun:
     file: Path  # its results file
     stamp: str  # name of its run folder or results file
     run: Path | None = None  # folder with the images of this evaluation; None: only the results file is there
-    planned: bool = False  # whether its comparison had it in its plan, with a decision, before the first result
 
     @property
     def scene(self) -> str:
@@ -91,10 +90,10 @@ class Part:
         records = (self.record(run) for run in self.study.runs if run.scene == scene)
         return next((record.frames for record in records if record is not None), ())
 
-    def values(self, metric: str, hidden: bool = False) -> dict[str, BySeed]:
-        """Means over the frames, by method, scene and seed; empty where a method has none. Hidden methods on demand."""
+    def values(self, metric: str) -> dict[str, BySeed]:
+        """Means over the frames, by method, scene and seed; empty where a method has none."""
         values: dict[str, dict[str, dict[int, float]]] = {}
-        for run in (*self.study.runs, *(self.study.hidden if hidden else ())):
+        for run in self.study.runs:
             own, record = values.setdefault(run.method, {}), self.record(run)
             mean = None if record is None else record.mean(metric)
             if mean is not None:
@@ -128,8 +127,7 @@ class Study:
 
     runs: tuple[StudyRun, ...]  # at least one
     missing: tuple[MissingResult, ...] = ()  # cells without a result
-    hidden: tuple[StudyRun, ...] = ()  # of methods that are not shown, as far as they are comparable
-    family: tuple[tuple[str, ...], ...] = ()  # all methods that were planned or given, with all names that each has
+    family: tuple[str, ...] = ()  # all methods that were planned or given, shown or not
     decided: Decision | None = None  # before the first result
 
     @cached_property

@@ -84,18 +84,7 @@ def test_variants_of_a_comparison_have_the_names_of_their_folders(tmp_path):
     assert read_study([folder]).methods == ["ablations/none", "coliags-steady"]
 
 
-def test_failures_are_kept_unless_there_is_a_result(tmp_path):
-    result = result_of("coliags")
-    failed = ("cecum", "3dgs", 2, "ran out of memory")
-    folder = write_comparison(tmp_path, [result], [failed])
-    repeated = folder / "failures/cecum/coliags" / f"s0-{result.key[:8]}.json"
-    repeated.parent.mkdir()
-    repeated.write_text(json.dumps({"reason": "once"}))
-    (failure,) = read_study([folder]).missing
-    assert (failure.scene, failure.method, failure.seed, failure.reason) == failed
-
-
-def plan(folder, results, *more, decided=None, later=()):
+def plan(folder, results, *more, decided=None):
     """The plan of results, and of cells (scene, method, seed) without one."""
     cells = []
     for result in results:
@@ -107,8 +96,6 @@ def plan(folder, results, *more, decided=None, later=()):
          "result": f"results/{place}.json"}
         for scene, method, seed, place in cells
     ]  # fmt: skip
-    for entry in entries:
-        entry["later"] = entry["scene"] in later
     content = {"format": "coliags-comparison", "decided": decided, "cells": entries}
     (folder / "plan.json").write_text(json.dumps(content))
 
@@ -137,9 +124,8 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
 
 @pytest.fixture
 def compared(tmp_path):
-    """A comparison of four methods on eight scenes, one of them under two names, and of one without results."""
+    """A comparison of four methods on eight scenes, and of one without results."""
     results = made_scenes({"coliags": 1.0, "a": 0.7, "b": 0.6, "c": 0.9})
-    results += [one.model_copy(update={"method": "row-5"}) for one in results if one.method == "coliags"]
     folder = write_comparison(tmp_path / "comparison", results)
     plan(folder, results, ("scene-1", "later", 0))
     return folder
@@ -151,41 +137,20 @@ def holm_of(study):
     return {row.rival: row.tests.wilcoxon_holm for row in compare(part, column, "coliags")}
 
 
-def test_methods_that_are_not_shown_stay_in_the_family(compared):
-    whole = read_study([compared])
-    names = (("coliags", "row-5"), ("a",), ("b",), ("c",), ("later",))
-    assert whole.family == names
-    adjusted = holm_of(whole)
-    raw = {name: stats.wilcoxon(*(values_of(whole, each) for each in ("coliags", name))).pvalue for name in "abc"}
-    expected = multipletests([*raw.values(), 1.0], method="holm")[1]  # later may have any p
-    assert [adjusted[name] for name in "abc"] == pytest.approx(expected[:3].tolist())
-    assert adjusted["row-5"] == 1.0
-    for shown in (["coliags", "a"], ["b", "coliags"], ["coliags", "row-5", "c"]):
+def test_the_family_is_all_that_was_planned_shown_or_not(compared):
+    def values(study, method):
+        return [run.result.sets["test"].mean("psnr") for run in study.runs if run.method == method]
+
+    for shown in ((), ["coliags", "a"], ["b", "coliags"]):
         study = read_study([compared], methods=shown)
-        assert (study.methods, study.family) == (shown, names)
-        assert holm_of(study) == {name: adjusted[name] for name in shown if name != "coliags"}
-
-
-def values_of(study, method):
-    return [run.result.sets["test"].mean("psnr") for run in study.runs if run.method == method]
-
-
-def test_the_report_tells_the_family(compared):
-    page = text_page(read_study([compared], methods=["coliags", "a"]), Choices())
-    said = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
-    assert "after Holm's adjustment for 4 rivals" in said
-    assert "given, not shown: b, c." in said and "without a result that can be compared: later." in said
-    assert "the same under several names, and counted once: coliags = row-5." in said
-
-
-def test_what_is_not_comparable_with_what_is_shown_still_counts(tmp_path):
-    files = [tmp_path / f"{index}.json" for index in range(3)]
-    for file, result in zip(
-        files, [result_of("coliags"), result_of("3dgs"), result_of("2dgs", split="block")], strict=True
-    ):
-        write_result(file, result)
-    study = read_study(files, methods=["coliags", "3dgs"])
-    assert study.hidden == () and study.family == (("coliags",), ("3dgs",), ("2dgs",))
+        assert study.family == ("coliags", "a", "b", "c", "later")
+        rivals = [name for name in study.methods if name != "coliags"]
+        raw = [stats.wilcoxon(values(study, "coliags"), values(study, name)).pvalue for name in rivals]
+        expected = multipletests([*raw, *[1.0] * (4 - len(raw))], method="holm")[1]  # the others may have any p
+        assert [holm_of(study)[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
+        page = text_page(study, Choices())
+        said = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
+        assert "after Holm's adjustment for 4 rivals: all that were planned or given" in said
 
 
 def test_a_decision_holds_where_all_plans_have_it(tmp_path):
@@ -194,14 +159,12 @@ def test_a_decision_holds_where_all_plans_have_it(tmp_path):
         write_comparison(tmp_path / name, [result_of(name, scene) for scene in "pq"]) for name in ("coliags", "3dgs")
     ]
     for folder, name in zip(folders, ("coliags", "3dgs"), strict=True):
-        plan(folder, [result_of(name, scene) for scene in "pq"], decided=decision, later={"q"})
+        plan(folder, [result_of(name, scene) for scene in "pq"], decided=decision)
     study = read_study(folders)
     assert study.decided.primary == ("psnr",)
-    assert [(run.scene, run.planned) for run in study.runs] == [("p", True), ("q", False)] * 2
     plan(folders[1], [result_of("3dgs", scene) for scene in "pq"])
     study = read_study(folders)
     assert study.decided is None
-    assert [run.planned for run in study.runs] == [True, False, False, False]
 
 
 def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
@@ -220,7 +183,7 @@ def test_nothing_is_refused(tmp_path):
     (tmp_path / "results").mkdir()
     refuses([tmp_path], "holds no results. Expected at least one finished cell")
     failed = write_comparison(tmp_path / "f", [], [("cecum", "3dgs", 0, "no <memory>")])
-    (failed / "results").mkdir()
+    plan(failed, [], ("cecum", "3dgs", 0))
     refuses([failed], "none of the 1 cells of .* has a result; 3dgs on cecum: no <memory>")
 
 
@@ -228,8 +191,6 @@ def test_what_was_not_evaluated_is_refused(tmp_path):
     run = write_run(tmp_path / "run", result_of("coliags"))
     refuses([run], f"Run `coliags eval {run} --protocol authors-code` first", protocol="authors-code")
     refuses([run, run / ".." / "run"], "twice")
-    (run / "eval/paper/result.json").rename(run / "eval/paper/metrics.json")
-    refuses([run], "older release.*Run `coliags eval .*` again")
 
 
 def test_a_comparison_under_another_protocol_says_which(tmp_path):
