@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -92,7 +91,7 @@ class Run:
         Raises:
             InputError: The log cannot be read.
         """
-        return _columns(self.folder.log_rows())
+        return self.folder.history()
 
     @property
     def results(self) -> dict[str, Result]:
@@ -417,22 +416,3 @@ def load_run(path: str | Path, *, data: str | Path | None = None, device: str = 
         InputError: This is no run folder.
     """
     return Run(path, data=data, device=device)
-
-
-def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float[np.ndarray, "T"]]:
-    """Numbers of the rows of a training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
-    import numpy as np
-
-    numbers = [_numbers(row) for row in rows]
-    names = dict.fromkeys(name for row in numbers for name in row)
-    return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
-
-
-def _numbers(row: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    numbers: dict[str, float] = {}
-    for name, value in row.items():
-        if isinstance(value, Mapping):
-            numbers |= _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            numbers[prefix + name] = float(value)
-    return numbers

@@ -24,6 +24,9 @@ from coliags_plugin.results.hashing import code_key
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from coliags_plugin.core.scenes import Scene  # with torch, which commands about runs do without
 
 logger = logging.getLogger(__name__)
@@ -266,6 +269,24 @@ class RunFolder:
             return []
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
+
+    def history(self) -> dict[str, Float[np.ndarray, "T"]]:
+        """Numbers of the training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
+        import numpy as np
+
+        numbers = [_numbers(row) for row in self.log_rows()]
+        names = dict.fromkeys(name for row in numbers for name in row)
+        return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
+
+
+def _numbers(row: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
+    numbers: dict[str, float] = {}
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            numbers |= _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            numbers[prefix + name] = float(value)
+    return numbers
 
 
 def _last_lines(file: Path) -> list[str]:

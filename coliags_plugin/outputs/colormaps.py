@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.image_files import as_array, checked_rgb
+from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 
 if TYPE_CHECKING:
@@ -51,8 +50,8 @@ def colorize_depth(
 
     The limits are the depths of the first and the last colour, mm; values beyond them are clipped.
     """
-    depth = _map(depth_mm, "depth_mm")
-    low, high = _interval(limits)
+    depth = as_array(depth_mm).astype(np.float64)
+    low, high = limits
     known = np.isfinite(depth)
     image = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
     image[~known] = hatch(*known.shape)[~known] if hatched else UNKNOWN_GREY
@@ -105,13 +104,10 @@ def depth_error(
 
     The error is infinite where only the rendering is not finite, and 0 where the truth is unknown.
     """
-    rendered, true = _map(rendered_mm, "rendered_mm"), _map(true_mm, "true_mm")
+    rendered, true = (as_array(depth).astype(np.float64) for depth in (rendered_mm, true_mm))
     known = np.isfinite(true)
     if valid is not None:
-        mask = as_array(valid).astype(bool)
-        _same_shape(mask, true, "valid")
-        known = known & mask
-    _same_shape(rendered, true, "rendered_mm")
+        known = known & as_array(valid).astype(bool)
     error = np.zeros_like(true)
     error[known] = np.abs(rendered[known] - true[known])
     error[known & ~np.isfinite(rendered)] = np.inf
@@ -131,7 +127,6 @@ def colorize_rgb_error(
     """
     error = rgb_error(rendered, true)
     known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
-    _same_shape(known, error, "valid")
     return colorize_error(error, known, limit)
 
 
@@ -139,8 +134,6 @@ def colorize_error(
     error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped error of 0 to ``limit`` and more; pixels without ground truth are hatched in grey."""
-    if not (math.isfinite(limit) and limit > 0.0):
-        raise InputError(f"an error scale that ends at {limit}", "a positive number")
     image = _colored(np.where(known, error, 0.0) / limit, "error")
     image[~known] = hatch(*known.shape)[~known]
     return image
@@ -148,9 +141,7 @@ def colorize_error(
 
 def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
     """Mean over the channels of |rendered - true|, as a fraction of full scale. [H, W]"""
-    first, second = _unit_rgb(rendered, "rendered"), _unit_rgb(true, "true")
-    _same_shape(first, second, "rendered")
-    error: np.ndarray = np.abs(first - second).mean(axis=2)
+    error: np.ndarray = np.abs(_unit_rgb(rendered) - _unit_rgb(true)).mean(axis=2)
     return error
 
 
@@ -158,10 +149,7 @@ def color_bar(
     limits: tuple[float, float], unit: str, color_map: ColorMap = "error", width: int = 480
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Horizontal colour bar with ticks and unit (ASCII, as OpenCV's font has no other characters), on white."""
-    low, high = _interval(limits)
-    if width < 120:
-        raise InputError(f"a colour bar {width} px wide", "at least 120 px")
-    size = 18
+    (low, high), size = limits, 18
     left, right, top = 24, width - text_width(unit) - 32, 8
     image = np.full((top + size + 26, width, 3), 255, np.uint8)
     image[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
@@ -179,15 +167,6 @@ def side_by_side(
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
     """Images of one height in a row on white, ``gap`` px apart, each under its ASCII label, shortened to its width."""
     arrays = [as_array(image) for image in images]
-    if not arrays or len(arrays) != len(labels):
-        raise InputError(f"{len(arrays)} images with {len(labels)} labels", "one label for each image")
-    for label, array in zip(labels, arrays, strict=True):
-        checked_rgb(array, f"image '{label}'")
-        if array.shape[0] != arrays[0].shape[0]:
-            raise InputError(
-                f"image '{label}' is {array.shape[0]} px high, '{labels[0]}' {arrays[0].shape[0]} px",
-                "images of one height",
-            )
     band, scale = 24, 0.5
     height = band + arrays[0].shape[0]
     width = sum(array.shape[1] for array in arrays) + gap * (len(arrays) - 1)
@@ -226,30 +205,9 @@ def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:
     return image
 
 
-def _map(values: np.ndarray | Tensor, name: str) -> np.ndarray:
+def _unit_rgb(values: np.ndarray | Tensor) -> np.ndarray:
     array = as_array(values)
-    if array.ndim != 2:
-        raise InputError(f"{name} has the shape {list(array.shape)}", "[H, W]")
-    return array.astype(np.float64)
-
-
-def _unit_rgb(values: np.ndarray | Tensor, name: str) -> np.ndarray:
-    array = as_array(values)
-    if array.ndim != 3 or array.shape[2] != 3:
-        raise InputError(f"{name} has the shape {list(array.shape)}", "[H, W, 3]")
     return array.astype(np.float64) / (255.0 if array.dtype == np.uint8 else 1.0)
-
-
-def _interval(limits: tuple[float, float]) -> tuple[float, float]:
-    low, high = limits
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError(f"colour limits {low} to {high}", "two finite numbers, the lower first")
-    return low, high
-
-
-def _same_shape(array: np.ndarray, like: np.ndarray, name: str) -> None:
-    if array.shape != like.shape:
-        raise InputError(f"{name} has the shape {list(array.shape)}", f"{list(like.shape)}, as the truth")
 
 
 def _shortened(label: str, width: int, scale: float) -> str:

@@ -93,7 +93,7 @@ def evaluate(context: StageContext) -> StageOutcome:
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:
     """Mean PSNR of at most 16 training views, as the protocol has it; empty where it has none."""
-    from coliags_plugin.comparison.report.view_pixels import evenly
+    from coliags_plugin.comparison.report.views import evenly
     from coliags_plugin.engine.scoring import Scorer
 
     scorer, frames, values = Scorer(trained.config.protocol, ["psnr"]), trained.scene.train, list[float]()
@@ -157,7 +157,7 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
 
     Returns what the colours of depth mean.
     """
-    from coliags_plugin.comparison.report.view_pixels import evenly
+    from coliags_plugin.comparison.report.views import evenly
     from coliags_plugin.contracts import knows_lamp
     from coliags_plugin.engine.held_light import flatten
     from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import (
     HATCH_GREYS,
     UNKNOWN_GREY,
@@ -57,12 +56,6 @@ def test_infinite_depth_is_unknown():
     assert (colorize_depth(np.array([[np.inf, -np.inf]]), (0.0, 1.0)) == UNKNOWN_GREY).all()
 
 
-@pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (0.0, np.nan), (0.0, np.inf)])
-def test_depth_image_refuses_limits(limits):
-    with pytest.raises(InputError, match="limits"):
-        colorize_depth(np.zeros((2, 2)), limits)
-
-
 def test_depth_error_image():
     table = color_table("error")
     true = np.full((2, 4), 30.0, np.float32)
@@ -81,19 +74,6 @@ def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_render
     error, known = depth_error(np.array([[1.0, np.nan, np.inf]]), np.array([[np.nan, 2.0, 2.0]]))
     np.testing.assert_array_equal(error, [[0.0, np.inf, np.inf]])
     np.testing.assert_array_equal(known, [[False, True, True]])
-
-
-def test_depth_error_image_refuses():
-    map_ = np.zeros((2, 3))
-    for limit in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="error scale"):
-            colorize_depth_error(map_, map_, None, limit)
-    with pytest.raises(InputError, match="rendered_mm"):
-        colorize_depth_error(np.zeros((3, 2)), map_, None, 1.0)
-    with pytest.raises(InputError, match="valid"):
-        colorize_depth_error(map_, map_, np.ones((3, 2), bool), 1.0)
-    with pytest.raises(InputError, match=r"\[H, W\]"):
-        colorize_depth_error(map_[None], map_, None, 1.0)
 
 
 def test_rgb_error_image():
@@ -120,8 +100,6 @@ def test_color_bar_runs_through_the_map_and_is_labelled():
     assert (bar[34:] < 128).any(), "no tick labels"
     assert not np.array_equal(bar, color_bar((0.0, 2.0), "cm", "error", width=480)), "the unit is not drawn"
     assert not np.array_equal(bar, color_bar((0.0, 5.0), "mm", "error", width=480)), "the limits are not drawn"
-    with pytest.raises(InputError, match="wide"):
-        color_bar((0.0, 1.0), "mm", width=50)
 
 
 def test_side_by_side():
@@ -139,15 +117,6 @@ def test_a_long_label_stays_over_its_image():
     image = np.zeros((4, 60, 3), np.uint8)
     sheet = side_by_side([image, image], ["a label much longer than its image", ""])
     assert (sheet[:-4, 60:] == 255).all()
-
-
-def test_side_by_side_refuses():
-    image = np.zeros((4, 4, 3), np.uint8)
-    for images, labels in (([], []), ([image], ["a", "b"]), ([image, image[:2]], ["a", "b"])):
-        with pytest.raises(InputError):
-            side_by_side(images, labels)
-    with pytest.raises(InputError, match="uint8"):
-        side_by_side([image.astype(float)], ["a"])
 
 
 def test_nearly_transparent_pixels_are_hatched_on_demand():

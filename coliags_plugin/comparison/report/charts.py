@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import parse_json, read_json
-from coliags_plugin.core.text_files import text_lines
+from coliags_plugin.core.json_files import read_json
+from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.reporting.model import Block, Chart, FactList, Figures, Folded, Paragraph, Section, Template
 from coliags_plugin.results.light import LIGHT_FILE, light_charts, light_facts
@@ -30,7 +27,6 @@ _MOST_POINTS = 120
 _MOST_BANDS = 3
 #: Columns of the log against which curves are drawn: group of the charts, and label of the axis.
 _TRAINING_AXES = {"step": ("by-step", "step"), "seconds": ("by-seconds", "training time [s]")}
-_COLUMNS = ("step", "loss", "psnr", "seconds")
 
 
 def profile_section(study: Study) -> Section:
@@ -117,7 +113,7 @@ def _logs(study: Study, scene: str) -> list[_Log]:
         _Log(method, style, columns)
         for style, (method, runs) in enumerate(study.by_method.items())
         for run in runs
-        if run.scene == scene and run.run is not None and (columns := read_training_log(run.run))
+        if run.scene == scene and run.run is not None and (columns := RunFolder(run.run).history())
     ]
 
 
@@ -222,32 +218,3 @@ def _spans(lines: Sequence[Series], ratio: float) -> bool:
     """Whether all values are positive, and the largest is so many times the smallest."""
     values = [value for line in lines for value in line.y if math.isfinite(value)]
     return bool(values) and min(values) > 0.0 and max(values) / min(values) >= ratio
-
-
-def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
-    """The logged steps of a run by column: step, loss, psnr, and seconds since training began.
-
-    NaN where a line lacks the column; without the columns that no line has; empty where there is no log.
-    """
-    path = run / "metrics.jsonl"
-    if not path.is_file():
-        return {}
-    rows = [_row(path, number, line) for number, line in text_lines(path, "the training log") if line.strip()]
-    table = {name: np.array([_number(values.get(name)) for values in rows], dtype=np.float64) for name in _COLUMNS}
-    return {name: values for name, values in table.items() if np.isfinite(values).any()}
-
-
-def _row(path: Path, number: int, line: str) -> dict[str, Any]:
-    try:
-        values = parse_json(line)
-    except ValueError as error:
-        raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
-    if not isinstance(values, dict):
-        raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")
-    return values
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return math.nan
-    return float(value) if math.isfinite(value) else math.nan

@@ -157,12 +157,12 @@ def statistics_text(study: Study, compared: Sequence[RivalComparison], reference
     text = [
         f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
         f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or {smallest_p_text(most, rivals)} "
-        f"after Holm's adjustment for {counted(rivals, 'rival')}: all that were planned or given."
+        f"after Holm's adjustment for {counted(rivals, 'rival')}."
     ]
     if min(1.0, rivals * smallest_p(most)) >= LEVELS[0]:
         needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
         text.append(f"No star is possible, as that is not below {p_text(LEVELS[0])}; it takes {needed} scenes.")
-    text.append(_decision_text(study, reference))
+    text += ["The adjustment counts every method that was planned or given.", _decision_text(study, reference)]
     if not chosen:
         text.append(
             f"{reference} is the reference because it came out best, so that the p-values are too small: choose one "

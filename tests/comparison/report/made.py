@@ -178,14 +178,30 @@ def write_comparison(
         file = folder / "failures" / scene / method / f"s{seed}-{digest(scene, method)[:8]}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"reason": reason}))
+    if failures:
+        write_plan(folder, results, *(failure[:3] for failure in failures))
     return folder
+
+
+def write_plan(
+    folder: Path, results: Sequence[Result], *more: tuple[str, str, int], decided: Mapping[str, object] | None = None
+) -> None:
+    """The plan of results, and of cells (scene, method, seed) without one."""
+    cells = [(result.scene.name, result.method, result.seed, result.key) for result in results]
+    cells += [(scene, method, seed, digest(scene, method)) for scene, method, seed in more]
+    places = [f"{scene}/{method.replace('/', '-')}/s{seed}-{key[:8]}" for scene, method, seed, key in cells]
+    entries = [
+        {"scene": scene, "method": method, "seed": seed, "protocol": "paper", "key": "", "run": f"runs/{place}",
+         "result": f"results/{place}.json"}
+        for (scene, method, seed, _), place in zip(cells, places, strict=True)
+    ]  # fmt: skip
+    content = {"format": "coliags-comparison", "decided": decided, "cells": entries}
+    (folder / "plan.json").write_text(json.dumps(content))
 
 
 def decided(study: Study, *primary: str, reference: str = "coliags") -> Study:
     """The study as of a comparison that decided its reference and primary metrics before the first run."""
-    runs = tuple(replace(run, planned=True) for run in study.runs)
-    decision = Decision(reference=reference, primary=primary, date="2026-11-01")
-    return replace(study, runs=runs, decided=decision)
+    return replace(study, decided=Decision(reference=reference, primary=primary, date="2026-11-01"))
 
 
 def made_scenes(methods: Mapping[str, float], scenes: int = 8, seeds: int = 1, **options) -> list[Result]:

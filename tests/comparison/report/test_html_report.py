@@ -15,13 +15,21 @@ import pytest
 
 from coliags_plugin.comparison.report.page import Choices
 from coliags_plugin.comparison.report.report import write_report
-from coliags_plugin.comparison.report.view_pixels import evenly
-from coliags_plugin.comparison.report.views import error_limit
+from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch
 from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
 from coliags_plugin.reporting import html_page
-from tests.comparison.report.made import FRAMES, HEIGHT, WIDTH, made_scenes, result_of, write_comparison, write_run
+from tests.comparison.report.made import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    made_scenes,
+    result_of,
+    write_comparison,
+    write_plan,
+    write_run,
+)
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -340,6 +348,7 @@ def test_results_files_alone_give_everything_but_pictures_and_curves(tmp_path):
 def test_every_scene_of_a_comparison_is_folded(tmp_path):
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=2)
     folder = write_comparison(tmp_path / "c", results)
+    write_plan(folder, results)
     for result in results:
         write_run(folder / f"runs/{result.scene.name}/{result.method}/s0-{result.key[:8]}", result)
     page = report(tmp_path, [folder], choices=Choices(frames=1))
@@ -351,6 +360,7 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
 def test_a_method_without_run_on_a_scene_is_left_out_of_its_views(tmp_path):
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=1)
     folder = write_comparison(tmp_path / "c", results)
+    write_plan(folder, results)
     write_run(folder / f"runs/scene-1/3dgs/s0-{results[1].key[:8]}", results[1])
     page = report(tmp_path, [folder])
     assert {attributes["data-method"] for attributes in page.all("figure") if "data-method" in attributes} == {
@@ -409,8 +419,6 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
 @pytest.mark.parametrize(
     ("file", "content", "match"),
     [
-        ("metrics.jsonl", '{"step": 1}\n{"step": ', r"metrics\.jsonl, line 2 is not JSON"),
-        ("metrics.jsonl", "3\n", "line 1 holds a int"),
         ("eval/paper/result.json", "{", r"result\.json is cut off"),
         ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png .*cannot be decoded"),
         ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff .*cannot be decoded"),

@@ -288,17 +288,6 @@ def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
     assert stars(best, "psnr") == {"coliags": "*", "3dgs": "*"} and "came out best" not in paragraphs(best)
 
 
-def test_what_was_planned_after_the_first_result_is_exploratory(study_of):
-    study = decided(study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0})), "psnr")
-    runs = tuple(replace(run, planned=(run.method, run.scene) != ("2dgs", "scene-8")) for run in study.runs)
-    page = text_page(replace(study, runs=runs), Choices())
-    assert stars(page, "psnr") == {"3dgs": "*"}
-    assert entries(tables(page)["lead-test-psnr"], "over")["2dgs"].note.startswith("planned or changed after")
-    assert page.cautions == [
-        "Planned or changed after the first result, so that comparisons with them are exploratory: 2dgs (1 result)."
-    ]
-
-
 @pytest.mark.parametrize(
     ("p", "text"),
     [(1.0, "1"), (0.0625, ".062"), (0.03125, ".031"), (0.0078125, ".0078"), (0.5, ".5"), (9e-5, "< .0001")],
@@ -352,7 +341,7 @@ def test_cautions(study_of):
 
 
 def test_results_of_different_code_are_told_apart(study_of):
-    """Trained and evaluated by other code, or resumed; of earlier versions, the version is all that is known."""
+    """Trained and evaluated by other code, or resumed."""
 
     def result(scene, code, /, **training):
         made = result_of("coliags", scene, software={"code": code, "git": None})
@@ -361,11 +350,10 @@ def test_results_of_different_code_are_told_apart(study_of):
     changes = [{"at_step": 3, "code": "c2"}]
     results = [
         result("p", "c1", code="c1"), result("q", "c2", code="c1"), result("r", "c2", code="c1", code_changes=changes),
-        result("s", None, package_version="0.1.0"),
     ]  # fmt: skip
     assert of(study_of, results).cautions == [
-        "The results come from different code: c1: coliags (1 of 4); c1, evaluated by c2: coliags (1 of 4); "
-        "c1, then c2, evaluated by c2: coliags (1 of 4); version 0.1.0: coliags (1 of 4)."
+        "The results come from different code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
+        "c1, then c2, evaluated by c2: coliags (1 of 3)."
     ]
 
 
