@@ -107,10 +107,6 @@ class Strategy(ABC, Generic[SettingsT, FieldT]):
     def plan(self) -> str:
         """One sentence for the log: the steps at which it grows or prunes, or why it will not."""
 
-    def most_added(self, pixels: int) -> int | None:
-        """Elements that it can add in a whole run, with images of at most so many pixels; None: without a limit."""
-        return None
-
     def before_step(self, step: int, field: FieldT, rows: ParameterRows) -> None:
         """Called before step ``step`` renders."""
 

@@ -28,8 +28,6 @@ from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.following import Followers
-from coliags_plugin.engine.heap import HeapTrimmer
-from coliags_plugin.engine.memory import LESS, check_memory, forecast, frames_size
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
@@ -44,6 +42,11 @@ logger = logging.getLogger(__name__)
 BLANK_ALPHA = 1e-3
 #: Blank views in a row after which a run stops.
 MAX_BLANK_VIEWS = 10
+#: What takes less memory on a device.
+LESS = (
+    "Fewer initial points (--set datamanager.points_count=50000), slower growth (a higher strategy.gradient_threshold) "
+    "or smaller images (datamanager.width and height) take less; --device cpu has the computer's memory"
+)
 #: So that the PSNR of a perfect view stays a number, dB.
 MAX_PSNR = 100.0
 
@@ -78,13 +81,16 @@ class Trainer:
             module.prepare(scene)
         self.model = Model(field, self.chosen.renderer, modules, config.near_plane)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
-        self.frames = self._prepare_device()
+        self.step = 0
+        try:
+            self.frames = self._prepare_device()
+        except torch.OutOfMemoryError as error:
+            raise self._out_of_memory(error) from error
         self.model.check_outputs(self.wants, "the losses")
         for loss in self.losses.values():
             loss.check(self.model)
         self.chosen.renderer.check_field(field, config.near_plane)
         self.optimizers = self._optimizers()
-        self.step = 0
         self.blank_views = 0  # in a row, up to this step
         self.costs = CostMeter(device)
 
@@ -137,7 +143,7 @@ class Trainer:
         logger.info("%s", self.strategy.plan())
         for name, module in self.model.view_modules.items():
             logger.info("module %s: %s", name, module.untrained_views)
-        saved, heap = time.monotonic(), HeapTrimmer()
+        saved = time.monotonic()
         with (
             self.costs.running(),
             deferred_stop() as interrupted,
@@ -156,7 +162,6 @@ class Trainer:
                     following.logged(row)
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
                 following.stepped(self.step)
-                heap.trim_if_grown()
                 stop = interrupted() or self.step == self.steps
                 late = time.monotonic() - saved >= save_seconds
                 if self.step % schedule.checkpoint_every == 0 or stop or late:
@@ -253,7 +258,7 @@ class Trainer:
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
         count, first = self.model.field.element_count, str(error).partition("\n")[0]
         at = f"step {self.step + 1}, {count:,} elements: the memory of {self.device} ran out"
-        return DeviceMemoryError(f"{at} ({first.rstrip('.')}). The last checkpoint is whole. {LESS}.")
+        return DeviceMemoryError(f"{at} ({first.rstrip('.')}). Checkpoints stay whole. {LESS}.")
 
     def _check_drawn(self, alpha: float, step: int) -> None:
         self.blank_views = 0 if alpha >= BLANK_ALPHA else self.blank_views + 1
@@ -266,18 +271,14 @@ class Trainer:
             )
 
     def _prepare_device(self) -> list[Frame]:
-        """Move the model to the device if it fits, and the frames if they fill at most half of what it leaves free.
+        """Move the model to the device, and the frames if they fill at most a quarter of what is free there.
 
         Images stay uint8 there too. Returns the frames.
         """
         frames, device = self.scene.train, self.device
-        if device.type == "cuda":
-            needed = forecast(self.model, self.wants, frames)
-            pixels = max(frame.camera.width * frame.camera.height for frame in frames)
-            check_memory(needed, self.strategy.most_added(pixels), device)
-            if frames_size(frames) < (torch.cuda.mem_get_info(device)[0] - needed.total) / 2:
-                frames = [frame.to(device) for frame in frames]
         self.model.to(device)
+        if device.type == "cuda" and sum(map(_size, frames)) < torch.cuda.mem_get_info(device)[0] / 4:
+            frames = [frame.to(device) for frame in frames]
         return frames
 
     def _optimizers(self) -> Optimizers:
@@ -290,6 +291,12 @@ class Trainer:
         rows = self.run.log_rows(self.step)
         atomic_write(self.run.log_file, "".join(f"{json.dumps(row)}\n" for row in rows))
         return rows
+
+
+def _size(frame: Frame) -> int:
+    """Bytes of a frame's pixels."""
+    kept = (frame.image, frame.depth, frame.depth_at_least, frame.mask, frame.seen, frame.depth_confidence)
+    return sum(tensor.nbytes for tensor in kept if tensor is not None)
 
 
 def _check_finite(sums: dict[str, float], terms: dict[str, float], step: int, frame: str) -> None:

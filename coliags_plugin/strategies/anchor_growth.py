@@ -94,13 +94,6 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
             )
         return f"this run grows and prunes anchors {steps_text(events)}"
 
-    def most_added(self, pixels: int) -> int:
-        """The births of all events."""
-        return len(self.events) * self._most_births(pixels)
-
-    def _most_births(self, pixels: int) -> int:
-        return max(1, pixels // self.settings.pixels_per_birth)
-
     @torch.no_grad()
     def after_backward(self, step: TrainingStep[Anchors], rows: ParameterRows) -> dict[str, int]:
         """Accumulate statistics; at event steps grow and prune."""
@@ -112,7 +105,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         self._count(step.output, children)
         if step.step not in self.events:
             return {}
-        most_births = self._most_births(step.output.alpha.numel())
+        most_births = max(1, step.output.alpha.numel() // self.settings.pixels_per_birth)
         grown = self._grow(field, rows, children, most_births)
         pruned = self._prune(field, rows, children)
         return {"grown": grown, "pruned": pruned}

@@ -21,7 +21,3 @@ class NoStrategy(Strategy[NoStrategySettings]):
     def plan(self) -> str:
         """The sentence for the log: no growing, no pruning."""
         return "this run neither grows nor prunes: strategy none"
-
-    def most_added(self, pixels: int) -> int:
-        """None are."""
-        return 0
