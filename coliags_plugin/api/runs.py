@@ -183,7 +183,6 @@ class Run:
         channels: Sequence[str] = (),
         depth_kind: DepthKind = "expected",
         depth_tiff: bool = False,
-        light_map: bool = False,
         along: str | Path | None = None,
         overwrite: bool = False,
     ) -> Path:
@@ -197,7 +196,6 @@ class Run:
             channels: Feature channels to write as images too.
             depth_kind: ``accumulated``, ``expected`` or ``median`` (docs/conventions.md 3).
             depth_tiff: Also write depth as float32 TIFF, scene units.
-            light_map: Also write the learned light, beside a phantom's: ``light.html`` and ``light.json``.
             along: File of a camera path, as the browser view saves it (docs/viewer.md 6): its video alone is written.
             overwrite: Replace the folder where it exists.
 
@@ -215,7 +213,7 @@ class Run:
         trained = self.load()
         name = "path" if path is not None else "relit" if trained.relit else "renders"
         folder = Path(output) if output is not None else self.path / name
-        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, light_map, path)
+        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, path)
         return folder
 
     def mesh(

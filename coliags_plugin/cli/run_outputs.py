@@ -38,8 +38,6 @@ class RenderCommand:
     (factor)."""
     flatten: bool = False
     """Render every wall point as at one distance and angle from the lamp, without gain: default folder RUN/relit."""
-    light_map: bool = False
-    """Also write the light that the method has learned, beside a phantom's: light.html and light.json."""
     channel: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = ()
     """Also write a feature channel of the method's Gaussians, for instance albedo."""
     data: arguments.MovedData = None
@@ -69,7 +67,6 @@ class RenderCommand:
             channels=self.channel,
             depth_kind=self.depth_kind,
             depth_tiff=self.depth_tiff,
-            light_map=self.light_map,
             along=self.along,
             overwrite=self.overwrite,
         )

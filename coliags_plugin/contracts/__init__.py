@@ -19,7 +19,7 @@ from coliags_plugin.contracts.fields import (
 )
 from coliags_plugin.contracts.following import Follower, Logger, scalars
 from coliags_plugin.contracts.losses import Loss, LossSettings
-from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
+from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear, steps_text
 from coliags_plugin.contracts.training import Draw, ParameterRows, Sampler, Strategy, TrainedModel, TrainingStep
 
@@ -48,7 +48,6 @@ __all__ = [
     "RadianceLevel",
     "RadianceSamples",
     "Renderer",
-    "ResponseModule",
     "Sampler",
     "Schedule",
     "Strategy",

@@ -191,11 +191,3 @@ class GainModule(ViewModule[SettingsT]):
     @abstractmethod
     def log_gains(self) -> Float[Tensor, "F C"]:
         """Logarithm of every training frame's gain, for all colours or for each of three. [F, C]"""
-
-
-class ResponseModule(ViewModule[SettingsT]):
-    """Base class of view modules with a response curve of the camera, shared by all frames."""
-
-    @abstractmethod
-    def curve(self, colors: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-        """Pixel values of colours, both relative to full scale: increasing. [*S]"""

@@ -15,7 +15,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
-from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.pose_refinement import refined_scores
 from coliags_plugin.engine.progress import ProgressReport
@@ -31,7 +30,6 @@ from coliags_plugin.outputs.colormaps import (
     common_limits,
 )
 from coliags_plugin.outputs.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
-from coliags_plugin.results.light import LIGHT_FILE
 from coliags_plugin.results.reading import RESULT_FILE, write_result
 from coliags_plugin.results.summaries import means_summary
 from coliags_plugin.results.tables import per_frame_table
@@ -47,11 +45,11 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
 
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and
     of it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available,
-    with the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains;
-    and the images. An earlier evaluation under the same protocol is replaced once the new one is complete. Frames of
-    another scene with the true depth take the place of the run's own (:mod:`coliags_plugin.engine.truth`); the folder
-    is then ``eval/<protocol>-truth/``. With ``refine_poses`` there are also metrics of views from poses refined on the
-    held-out images themselves, under names of their own (:mod:`coliags_plugin.engine.pose_refinement`).
+    with the reason) and ``per_frame.csv``; and the images. An earlier evaluation under the same protocol is replaced
+    once the new one is complete. Frames of another scene with the true depth take the place of the run's own
+    (:mod:`coliags_plugin.engine.truth`); the folder is then ``eval/<protocol>-truth/``. With ``refine_poses`` there are
+    also metrics of views from poses refined on the held-out images themselves, under names of their own
+    (:mod:`coliags_plugin.engine.pose_refinement`).
     """
     if trained.relit:
         raise InputError(
@@ -86,8 +84,6 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
-        if (light := light_map(trained)) is not None:
-            write_json(scratch / LIGHT_FILE, light)
     return target
 
 

@@ -19,7 +19,6 @@ from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import render_held
-from coliags_plugin.engine.light_map import write_light_map
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import (
@@ -51,7 +50,6 @@ def render_run(
     channels: Sequence[str] = (),
     depth_kind: DepthKind = "expected",
     depth_tiff: bool = False,
-    light_map: bool = False,
     along: CameraPath | None = None,
 ) -> None:
     """Render colour, depth and error images of a set of frames, and a video along the trajectory.
@@ -91,8 +89,6 @@ def render_run(
         for light in (trained.lamp, trained.held):
             if light is not None:
                 atomic_write(folder / "lamp.yaml", dump(light.described))
-        if light_map:
-            write_light_map(trained, folder)
         if video:
             name = "trajectory.mp4" if along is None else "path.mp4"
             write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, fps)

@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.contracts import ResponseModule
+from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
@@ -32,7 +32,7 @@ class ResponseSettings(Settings):
     segments: int = Field(default=8, ge=1, le=64)  # of equal length between the knee and 1.5, each of one slope
 
 
-class CameraResponse(ResponseModule[ResponseSettings]):
+class CameraResponse(ViewModule[ResponseSettings]):
     """Learned increasing curve from colours to pixel values, one for all frames and colours (docs/methods.md 4.9).
 
     Cameras compress what is bright. A gain of a frame multiplies colours before that, so in a method config this module

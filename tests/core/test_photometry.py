@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -12,7 +14,6 @@ import torch
 from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.engine.light_map import find_true_light
 from coliags_plugin.lighting.photometry import fit_light
 from coliags_plugin.modules.gain import FrameGain
 from coliags_plugin.phantom.generate import generate
@@ -150,13 +151,15 @@ def test_a_wall_that_lights_itself(tmp_path):
     size = {"width": 96, "height": 77, "supersampling": 1, "mesh_spacing": 1.0, "texture_spacing": 0.4}
     settings = PhantomSettings(seed=4, trajectory="inspection", frames=30, rotation_views=0, specular=0.0, **size)
     generate(settings, tmp_path / "phantom")
-    scene, truth = load_scene(tmp_path / "phantom"), find_true_light(tmp_path / "phantom")
-    expected = torch.tensor([truth.gains[frame.index][1] for frame in scene.train]).log() / truth.gamma
+    scene, truth = load_scene(tmp_path / "phantom"), json.loads((tmp_path / "phantom/truth/light.json").read_text())
+    with (tmp_path / "phantom/truth/gain.csv").open() as rows:
+        gains = {int(row["frame"]): float(row["gain_g"]) for row in csv.DictReader(rows)}
+    expected = torch.tensor([gains[frame.index] for frame in scene.train]).log() / truth["gamma"]
     found = fit_light(scene)
     assert fit_light(scene.with_near_plane(scene.train[0].camera.near_plane)) is found, "once for all of its runs"
     errors = found.log_gains - expected
     assert float((errors - errors.mean()).square().mean().sqrt()) < 0.015
-    torch.testing.assert_close(found.lamp_offset, torch.tensor(truth.offset).float(), atol=0.5, rtol=0.0)
+    torch.testing.assert_close(found.lamp_offset, torch.tensor(truth["lamp"]["offset"]).float(), atol=0.5, rtol=0.0)
     # Albedo of green .29; mutual visibility of folds is neglected.
     assert found.albedo == pytest.approx(0.35, abs=0.1)
 

@@ -1,4 +1,4 @@
-"""Charts of a report: errors against distance and angle, training curves, PSNR along the video, and learned light."""
+"""Charts of a report: errors against distance and angle, training curves, and PSNR along the video."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.outputs.charts import Series
-from coliags_plugin.reporting.model import Block, Chart, FactList, Figures, Folded, Paragraph, Section, Template
-from coliags_plugin.results.light import LIGHT_FILE, light_charts, light_facts
+from coliags_plugin.reporting.model import Block, Chart, Figures, Folded, Paragraph, Section, Template
 from coliags_plugin.results.record import ProfileRecord
 
 #: Bins with a smaller share of the pixels are left out.
@@ -182,32 +179,6 @@ def _frame_chart(part: Part, scene: str) -> Chart:
             along = [float(index) for index in range(len(names))]
             lines.append(Series(method, style, along, [values.get(name, math.nan) for name in names]))
     return Chart(lines, "frame", "PSNR [dB]", part.title, x_names=names, markers=True)
-
-
-def light_section(study: Study) -> Section:
-    """Light that methods have learned, beside the true one of phantoms; without blocks where none has learned any."""
-    runs = [(run, blocks) for runs in study.by_method.values() for run in runs if (blocks := _light_blocks(run))]
-    explanation = Paragraph(
-        "What a learned law makes of the light over distance and angle, relative to the optical axis at the median "
-        "distance, the gain of every training frame, with a geometric mean of 1, and the camera's response curve. True "
-        "curves are those of a phantom: of its direct light, its gains and its camera."
-    )
-    folded = [Folded(run.title, blocks, is_open=index == 0) for index, (run, blocks) in enumerate(runs)]
-    return Section("Learned light", [explanation, *folded] if folded else [], screen_only=True)
-
-
-def _light_blocks(run: StudyRun) -> list[Block]:
-    """Facts and charts of one run; empty without a record."""
-    file = None if run.evaluation is None else run.evaluation / LIGHT_FILE
-    if file is None or not file.is_file():
-        return []
-    values = read_json(file, "the light that a run has learned")
-    try:
-        return [FactList(light_facts(values)), Figures(light_charts(values))]
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            f"{file}: {error!r}", "what `coliags eval` writes", "Run `coliags eval` on that run again"
-        ) from error
 
 
 def _log_label(label: str, log: bool) -> str:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from coliags_plugin.comparison.report.charts import light_section, profile_section, training_blocks
+from coliags_plugin.comparison.report.charts import profile_section, training_blocks
 from coliags_plugin.comparison.report.comparability import cautions
 from coliags_plugin.comparison.report.costs import cost_table
 from coliags_plugin.comparison.report.frame_tables import frame_section
@@ -72,7 +72,6 @@ def screen_page(text: Page, study: Study, choices: Choices, scene: Section | Non
         view_section(study, reference, choices.frames),
         *([] if scene is None else [scene]),
         profile_section(study),
-        light_section(study),
         Section("Training", [*costs.blocks, *training_blocks(study)]),
         scenes,
         frame_section(study, choices.columns, reference),
