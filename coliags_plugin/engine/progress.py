@@ -13,106 +13,20 @@ from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from coliags_plugin.engine.pace import Pace
 from coliags_plugin.reporting.numbers import duration
 
 #: Between plain lines, seconds.
 PLAIN_LINE_EVERY = 10.0
 #: Between changes of a notebook's line, seconds.
 NOTEBOOK_LINE_EVERY = 0.5
-
-
-def open_display(
-    console: Console, title: str, total: int, start: int, plain_every: float = PLAIN_LINE_EVERY
-) -> TerminalBar | TextDisplay:
-    """The display that fits where the console writes to; plain lines come every ``plain_every`` seconds."""
-    if console.is_terminal:
-        return TerminalBar(console, title, total, start)
-    if console.is_jupyter:
-        return TextDisplay(title, total, start, NOTEBOOK_LINE_EVERY, NotebookLine().show, at_once=True)
-    return TextDisplay(title, total, start, plain_every, lambda text: console.print(text, highlight=False))
-
-
-class TerminalBar:
-    """A bar with the remaining time, once it is known."""
-
-    def __init__(self, console: Console, title: str, total: int, start: int) -> None:
-        columns = [
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.fields[facts]}"),
-        ]
-        self._bar = Progress(*columns, console=console)
-        self._bar.start()
-        self._task = self._bar.add_task(title, total=total, completed=start, left="", facts="")
-        self._pace = Pace(total, start)
-
-    def update(self, done: int, facts: str) -> None:
-        """Show how much is done, with facts."""
-        self._pace.update(done)
-        self._bar.update(self._task, completed=done, left=_to_go(self._pace), facts=facts)
-
-    def close(self) -> None:
-        """Leave what was shown last."""
-        self._bar.stop()
-
-
-class TextDisplay:
-    """A line of text every so many seconds, the first one at once or not, and one at the end."""
-
-    def __init__(
-        self, title: str, total: int, start: int, every: float, show: Callable[[str], None], at_once: bool = False
-    ) -> None:
-        self._title, self._total, self._every, self._show = title, total, every, show
-        self._pace, self._began = Pace(total, start), time.monotonic()
-        self._last = -math.inf if at_once else self._began
-
-    def update(self, done: int, facts: str) -> None:
-        """Show how much is done, with facts, where it is time to."""
-        self._pace.update(done)
-        now = time.monotonic()
-        if now - self._last >= self._every or done == self._total:
-            self._last = now
-            self._show(self._line(done, facts, now - self._began))
-
-    def close(self) -> None:
-        """Nothing: what was shown last stays."""
-
-    def _line(self, done: int, facts: str, seconds: float) -> str:
-        """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
-        timing = f"took {duration(seconds)}" if done == self._total else _to_go(self._pace)
-        return f"{', '.join(filter(None, (f'{self._title} {done}/{self._total}', timing)))}  {facts}".rstrip()
-
-
-def _to_go(pace: Pace) -> str:
-    left = pace.left
-    return "" if left is None else f"{duration(left)} to go"
-
-
-class NotebookLine:
-    """Text in the output of a notebook's cell that can be replaced."""
-
-    def __init__(self) -> None:
-        self._shown: Any = None
-
-    def show(self, text: str) -> None:
-        """Show a text instead of the one before."""
-        if self._shown is None:
-            from IPython import display
-
-            show: Any = display.display  # which has no types
-            self._shown = show({"text/plain": text}, raw=True, display_id=True)
-        else:
-            self._shown.update({"text/plain": text}, raw=True)
+#: Over which the speed is estimated, seconds: one slow step does not change the remaining time by much.
+SPEED_OVER = 120.0
 
 
 class ProgressReport:
-    """Progress from ``start`` towards a total, with facts and the remaining time (:class:`Pace`), as a context manager.
+    """Progress from ``start`` towards a total, with facts and the remaining time, as a context manager.
 
     Where there is neither a terminal nor a notebook, a line appears every ``plain_every`` seconds. The console is
     standard error by default.
@@ -127,24 +41,65 @@ class ProgressReport:
         console: Console | None = None,
     ) -> None:
         self.title = title
-        self._total, self._start, self._plain_every, self._console = total, start, plain_every, console
-        self._display: TerminalBar | TextDisplay | None = None
+        self._console = console or Console(file=sys.stderr)
+        self._every = NOTEBOOK_LINE_EVERY if self._console.is_jupyter else plain_every
+        self._last = -math.inf if self._console.is_jupyter else time.monotonic()
+        self._notebook_line: Any = None
+        columns = [
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[facts]}"),
+        ]
+        self._bar = Progress(
+            *columns,
+            console=self._console,
+            disable=not self._console.is_terminal,
+            speed_estimate_period=SPEED_OVER,
+            get_time=time.monotonic,
+        )
+        self._task = self._bar.add_task(title, total=total, completed=start, facts="")
 
     def __enter__(self) -> ProgressReport:
-        console = self._console or Console(file=sys.stderr)
-        self._display = open_display(console, self.title, self._total, self._start, self._plain_every)
+        self._bar.start()
         return self
 
     def update(self, done: int, facts: str = "") -> None:
         """Report ``done`` of the total, with ``facts`` behind it."""
-        if self._display is not None:
-            self._display.update(done, facts)
+        self._bar.update(self._task, completed=done, facts=facts)
+        now = time.monotonic()
+        if self._bar.disable and (now - self._last >= self._every or self._bar.finished):
+            self._last = now
+            self._show(self._line())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._display is not None:
-            self._display.close()
+        if not self._bar.disable:
+            self._bar.stop()
+
+    def _line(self) -> str:
+        """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
+        (task,) = self._bar.tasks
+        told = [f"{self.title} {task.completed}/{task.total}"]
+        if task.finished:
+            told.append(f"took {duration(task.elapsed or 0.0)}")
+        elif task.time_remaining is not None:
+            told.append(f"{duration(task.time_remaining)} to go")
+        return f"{', '.join(told)}  {task.fields['facts']}".rstrip()
+
+    def _show(self, text: str) -> None:
+        if not self._console.is_jupyter:
+            self._console.print(text, highlight=False)
+        elif self._notebook_line is not None:
+            self._notebook_line.update({"text/plain": text}, raw=True)
+        else:
+            from IPython import display
+
+            show: Any = display.display  # which has no types
+            self._notebook_line = show({"text/plain": text}, raw=True, display_id=True)
 
 
 @contextmanager

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
+
 import pytest
 from rich.console import Console
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
 from coliags_plugin.engine.data_formats import load_scene
-from coliags_plugin.engine.progress import open_display, progress_callback
+from coliags_plugin.engine.progress import ProgressReport, progress_callback
 from tests.scenes import write_wall
 
 
@@ -50,6 +52,24 @@ def test_what_takes_long_is(clock, capsys):
     assert "36.0 s to go" in said[0]
 
 
+def test_the_first_step_and_a_slow_one_do_not_count_for_much(clock, capsys):
+    """Kernels are compiled in the first: 25 s then would promise hours."""
+    with ProgressReport("train", 1001, plain_every=0.0) as report:
+        for done in range(1, 502):
+            clock[0] += 25.4 if done == 1 else 5.0 if done == 400 else 0.1
+            report.update(done)
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "train 1/1001"
+    assert said[1] == "train 2/1001, 1 min 40 s to go" and said[-1] == "train 501/1001, 55.0 s to go"
+
+
+def test_a_terminal_shows_the_facts_and_the_end(clock):
+    console = Console(force_terminal=True, width=120, file=io.StringIO())
+    with ProgressReport("train", 4, 2, console=console) as report:
+        report.update(4, "loss 0.1")
+    assert all(text in console.file.getvalue() for text in ("train", "4/4", "loss 0.1"))
+
+
 def test_reading_a_small_scene_says_nothing(tmp_path, capsys):
     config = load_method("coliags", ["datamanager.name=c3vd"]).config
     assert load_scene(config, write_wall(tmp_path / "wall")).train
@@ -76,11 +96,10 @@ def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
     shown = Shown()
     monkeypatch.setattr("IPython.display.display", shown)
     console = Console(force_jupyter=True)
-    display = open_display(console, "train", 1000, 0)
-    for done in range(1, 1001):
-        clock[0] += 0.01
-        display.update(done, f"loss {done}")
-    display.close()
+    with ProgressReport("train", 1000, console=console) as report:
+        for done in range(1, 1001):
+            clock[0] += 0.01
+            report.update(done, f"loss {done}")
     assert shown.text == "train 1000/1000, took 10.0 s  loss 1000"
     assert 15 <= shown.changes <= 22  # two a second
     assert capsys.readouterr() == ("", "")
