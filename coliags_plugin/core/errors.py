@@ -63,15 +63,9 @@ class UnavailableError(Exception):
     """
 
 
-#: Former and present names of options ("Renamed options" in the changelog); hints name the new ones.
-RENAMED_OPTIONS = {"far": "far_plane", "low_pass": "eps2d"}
-
-
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Hint with the known word most similar to an unknown one; empty where none is similar."""
-    words = list(known)
-    renamed = RENAMED_OPTIONS.get(word, "")
-    close = [renamed] if renamed in words else get_close_matches(word, words, n=1, cutoff=0.5)
+    close = get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f"Did you mean '{close[0]}'?" if close else ""
 
 

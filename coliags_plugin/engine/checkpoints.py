@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.checksums import differing_files, write_checksums
@@ -30,9 +31,7 @@ from coliags_plugin.engine.run_folder import checkpoint_step, checkpoints_in_ord
 
 logger = logging.getLogger(__name__)
 
-#: Written. Format 3 lacks checksums, format 2 view modules too; otherwise they are the same.
 FORMAT = 4
-READABLE = (2, 3, FORMAT)
 
 
 class DamagedCheckpointError(InputError):
@@ -47,7 +46,7 @@ class Checkpoint:
     method: str
     frame_queue: list[NonNegativeInt]  # that the sampler has planned, the last being next
     tensors: dict[str, Tensor]  # by ``<part>/<name>``: field, modules, optimizer, strategy and generator
-    cost: TrainingCost | None = None  # of the run so far; None where it was not measured
+    cost: TrainingCost | None = None  # of the run so far; None before the first step of a training loop
 
     def part(self, name: str) -> dict[str, Tensor]:
         """The tensors of one part."""
@@ -160,10 +159,11 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
         content = parse_json(json_text(path / "state.json"), finite=True)
-        if (version := content["format"]) not in READABLE:
-            known = " or ".join(map(str, READABLE))
+        if (version := content["format"]) != FORMAT:
             raise InputError(
-                f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version"
+                f"checkpoint {path} has format {version}",
+                f"format {FORMAT}, of version {__version__}",
+                "Train again, or use the version of this package that wrote it",
             )
         tensors = load_file(path / "state.safetensors")
         placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}

@@ -75,8 +75,8 @@ class CostMeter:
         return TrainingCost(
             device=device_name(self._device),
             threads=torch.get_num_threads(),
-            seconds=_sum(earlier.seconds, seconds),
-            processor_seconds=_sum(earlier.processor_seconds, processor_seconds),
+            seconds=(earlier.seconds or 0.0) + seconds,
+            processor_seconds=(earlier.processor_seconds or 0.0) + processor_seconds,
             peak_memory_mib=None if peak is None or before is None else max(peak, before),
         )
 
@@ -89,10 +89,6 @@ class CostMeter:
 
 def _clocks() -> tuple[float, float]:
     return time.monotonic(), time.process_time()
-
-
-def _sum(earlier: float | None, now: float) -> float | None:
-    return None if earlier is None else earlier + now
 
 
 def peak_memory_mib(device: torch.device) -> float | None:

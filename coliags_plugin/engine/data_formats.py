@@ -78,7 +78,7 @@ def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
 
 
 def recorded_scale(provenance: Mapping[str, Any]) -> float:
-    """Factor on the lengths of a scene in training, from its provenance; runs before there was one have 1."""
+    """Factor on the lengths of a scene in training, from its provenance; 1 where none is recorded."""
     return float(provenance.get(SCALE_KEY, 1.0))
 
 

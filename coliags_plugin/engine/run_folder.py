@@ -15,6 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 #: Of the end of a training log, more than a row has.
 _TAIL_BYTES = 8192
 
@@ -161,6 +162,12 @@ class RunFolder:
     def provenance(self) -> JsonObject:
         """Content of the provenance file."""
         found: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
+        if (written := found.get("format")) != FORMAT:
+            raise InputError(
+                f"{self.path} is a run of coliags_plugin {found.get('package_version', '?')}, in format {written}",
+                f"format {FORMAT}, of version {__version__}",
+                "Train again, or use the version that wrote it",
+            )
         return found
 
     def identity(self) -> RunIdentity:

@@ -218,10 +218,7 @@ def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
     rows = trained.run.log_rows(trained.step)
-    training = trained.cost
-    if training is None:  # of a version that measured seconds alone
-        device, seconds = str(trained.provenance.get("device")), rows[-1]["seconds"] if rows else None
-        training = TrainingCost(device=device, seconds=seconds)
+    training = trained.cost or TrainingCost(device=str(trained.provenance["device"]))  # of a run that was imported
     checkpoint = checkpoint_folder(trained.run.checkpoints, trained.step)
     return CostRecord(
         device=training.device,
@@ -246,7 +243,7 @@ def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> Js
         for change in provenance.get("schedule_changes", [])
         if any(change["from"][name] != change["to"][name] for name in lengths)
     ]
-    trained_with = provenance.get("code", provenance.get("package_version", code_key()))
+    trained_with = provenance.get("code", code_key())
     return {
         **({} if step == configured else {"step": step}),
         **({"schedule_changes": jumps} if jumps else {}),

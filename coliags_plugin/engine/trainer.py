@@ -26,7 +26,6 @@ from coliags_plugin.core.transfers import sent
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
-from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.following import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
@@ -109,9 +108,7 @@ class Trainer:
         self.run.record_schedule(self.method.config, self.step, self.strategy.plan())
         if self.step < self.steps:
             self.run.record_code(self.step)
-        rows = self._cut_log()
-        if cost is None and saved is not None:  # of a version that measured seconds alone
-            cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)
+        self._cut_log()
         self.costs = CostMeter(self.device, cost)
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
 
@@ -284,13 +281,11 @@ class Trainer:
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
 
-    def _cut_log(self) -> list[JsonObject]:
-        """Remove log rows of steps after the checkpoint, which will be repeated; those that stay."""
-        if not self.run.log_file.is_file():
-            return []
-        rows = self.run.log_rows(self.step)
-        atomic_write(self.run.log_file, "".join(f"{json.dumps(row)}\n" for row in rows))
-        return rows
+    def _cut_log(self) -> None:
+        """Remove log rows of steps after the checkpoint, which will be repeated."""
+        if self.run.log_file.is_file():
+            rows = self.run.log_rows(self.step)
+            atomic_write(self.run.log_file, "".join(f"{json.dumps(row)}\n" for row in rows))
 
 
 def _size(frame: Frame) -> int:

@@ -187,7 +187,7 @@ def test_bases_may_be_paths_beside_the_file(method_file):
         ("a: &a {b: *a}\n", ["nested too deeply"]),
         (f"a: {'9' * 5000}\n", ["4300 digits"]),
         ("base: coliags\nnear_plane: -1.0\n", ["mine.yaml:2", "near_plane", "greater than or equal to 0"]),
-        ("base: coliags\nrenderer: {name: cpu, low_pass: 1.0}\n", ["unknown key 'low_pass'", "Did you mean 'eps2d'"]),
+        ("base: coliags\nrenderer: {name: cpu, eps: 1.0}\n", ["unknown key 'eps'", "Did you mean 'eps2d'"]),
         ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
         ("base: coliags\nschedule:\n  steps: 1.5\n", ["mine.yaml:3", "schedule.steps", "1.5"]),
         ("base: coliags\nschedule:\n  steps: 0\n", ["mine.yaml:3", "greater than or equal to 1"]),

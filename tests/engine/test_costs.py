@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -80,14 +79,6 @@ def test_earlier_parts_of_the_run_are_added(clocks):
     found = meter.cost()
     assert (found.seconds, found.processor_seconds, found.peak_memory_mib) == (13.0, 25.0, 1e9)
     assert found.device == device_name(CPU) and found.threads == torch.get_num_threads()
-
-
-def test_what_was_not_measured_before_stays_unmeasured(clocks):
-    meter = CostMeter(CPU, TrainingCost(device="old", seconds=10.0))
-    with meter.running():
-        clocks.go_on(3, 5)
-    found = meter.cost()
-    assert (found.seconds, found.processor_seconds, found.peak_memory_mib) == (13.0, None, None)
 
 
 def test_processor_time_counts_work_and_not_waiting():
@@ -173,24 +164,6 @@ def test_seconds_between_the_last_logged_row_and_the_checkpoint_are_not_lost(tmp
     second = make_trainer(tmp_path / "run", steps=8, overrides=rare)
     second.resume()
     assert second.seconds == 3.0 and second.run.log_rows(3) == []
-
-
-def test_a_checkpoint_without_cost_goes_on_from_the_log(tmp_path, clocks):
-    trainer = make_trainer(tmp_path / "run", steps=3)
-    trainer.start()
-    _tick(trainer, clocks)
-    trainer.train()
-    state = checkpoint_folder(trainer.run.checkpoints, 3) / "state.json"
-    content = json.loads(state.read_text())
-    del content["cost"]
-    state.write_text(json.dumps(content))
-    write_checksums(state.parent)
-    longer = make_trainer(tmp_path / "run", steps=5)
-    longer.resume()
-    _tick(longer, clocks)
-    longer.train()
-    found = final_state(longer).cost
-    assert found.seconds == 5.0 and found.processor_seconds is None and found.peak_memory_mib is None
 
 
 def test_steps_taken_outside_the_loop_have_no_cost(tmp_path):

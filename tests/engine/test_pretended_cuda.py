@@ -220,7 +220,7 @@ def test_a_loaded_run_launches_on_its_own_device(tmp_path):
 def test_a_step_waits_for_its_losses_and_for_lists_only(method, tmp_path):
     pytest.importorskip("triton")  # without it, anchors are decoded by PyTorch, with more lists
     # The device has no room for the frames: they are sent at every step.
-    with mock.patch("coliags_plugin.engine.trainer.frames_size", lambda frames: 2**40):
+    with mock.patch("coliags_plugin.engine.trainer._size", lambda frame: 2**40):
         found = waits_of_a_step(tmp_path / "run", method, *STEPS[method])
     found = Counter({place: count for place, count in found.items() if "renderers/" not in place})
     assert found <= WAITS and found["tolist engine/trainer.py"] == 1

@@ -1,9 +1,13 @@
+"""Run folders: names, and runs of other versions."""
+
 from __future__ import annotations
 
+import json
 from datetime import datetime
 
 import pytest
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.run_folder import RunFolder
 
@@ -30,3 +34,14 @@ def test_runs_begun_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch
     assert names[:2] == ["20260102-030405", "20260102-030405-02"]
     assert names == sorted(set(names))
     assert RunFolder.newest("wall", "coliags") == folder
+
+
+@pytest.mark.parametrize("written", [{}, {"format": 1}])
+def test_a_run_of_another_version_is_refused_by_name(tmp_path, written):
+    folder = RunFolder(tmp_path / "run")
+    folder.create("name: coliags\n", {"method": "coliags"}, overwrite=False)
+    assert folder.provenance()["method"] == "coliags"
+    folder.provenance_file.write_text(json.dumps({**written, "package_version": "0.1.0"}))
+    for read in (folder.provenance, folder.identity):
+        with pytest.raises(InputError, match=r"run of coliags_plugin 0\.1\.0.*Train again, or use the version"):
+            read()

@@ -127,20 +127,3 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
     export, export_mm = (record["cost"]["test"] for record in records)
     assert export["export"]["psnr"] == pytest.approx(export_mm["export"]["psnr"], abs=0.05)
     assert factor**2 * export["export"]["depth_mse"] == pytest.approx(export_mm["export"]["depth_mse"], rel=0.02)
-
-
-@pytest.mark.thorough
-def test_a_run_without_a_recorded_scale_is_as_it_was(small, tmp_path):
-    """Runs of versions that did not scale lie in the unit of their scene."""
-    path = tmp_path / "mm"
-    run = trained_on(with_unit(small, "mm"), path)  # not scaled, as its unit is known
-    record = json.loads(run.run.provenance_file.read_text())
-    del record["scene"]["provenance"][SCALE_KEY]
-    record["scene"]["provenance"]["unit"] = "unknown"
-    run.run.provenance_file.write_text(json.dumps(record))
-    patch = pytest.MonkeyPatch()
-    patch.setattr(trained_module, "load_scene", lambda config, _: small)
-    again = load_trained(path / "run", CPU)
-    patch.undo()
-    assert again.model.scale == 1.0 and not again.scene.is_metric
-    torch.testing.assert_close(render_view(again, again.scene.train[0]).rgb, render_view(run, run.scene.train[0]).rgb)
