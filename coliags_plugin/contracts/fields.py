@@ -108,14 +108,6 @@ class LampAware(ABC):
     def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
         """:meth:`GaussianField.gaussians` with the lamp held instead of moving with the camera."""
 
-    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
-        """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
-
-        Args:
-            points: In camera axes, scene units. [N, 3]
-        """
-        return None
-
 
 def gaussians_under(field: GaussianField, camera: Camera, light: HeldLight | None) -> Gaussians:
     """The Gaussians that a camera sees, lit by a held light where their colours depend on the lamp.
@@ -331,10 +323,6 @@ class AppearanceHead(Head[SettingsT]):
             light: The lamp that lights them, if it does not move with the camera.
         """
         return colors
-
-    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
-        """See :meth:`LampAware.attenuation`."""
-        return None
 
     @property
     def learned(self) -> JsonObject:

@@ -151,10 +151,6 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         """The numbers of the appearance head."""
         return self.appearance_head.learned
 
-    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
-        """That of the appearance head."""
-        return self.appearance_head.attenuation(points)
-
     def child_positions(self) -> Float[Tensor, "M K 3"]:
         """Positions of all children (paper, Eq. 3), scene units."""
         return self.anchors[:, None] + self.offsets * self.scalings[:, None, :3].exp()

@@ -140,22 +140,6 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             logs.append(facing.log())
         return (torch.stack(logs, dim=1) @ self.exponents.T).exp()
 
-    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-        """That of a wall which faces the lamp; see :meth:`AppearanceHead.attenuation`."""
-        rays = points - self.offset
-        return self._along(rays, rays[:, 2], None)
-
-    def _along(
-        self, rays: Float[Tensor, "N 3"], depths: Float[Tensor, "N"], normals: Float[Tensor, "N 3"] | None
-    ) -> Float[Tensor, "N C"]:
-        """The law at the ends of rays from the lamp, in any axes, scene units; without normals, the wall faces it.
-
-        ``depths`` are the rays' components along the optical axis.
-        """
-        distances = rays.norm(dim=1).clamp_min(1e-9)
-        incidences = None if normals is None else (normals * rays).sum(1).abs() / distances
-        return self.law(distances, depths / distances, incidences)
-
     def apply_light(
         self,
         colors: Float[Tensor, "N 3"],
@@ -178,7 +162,9 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
             attenuated: Tensor = _Attenuate.apply(colors, *seen)  # type: ignore[no-untyped-call]
             return attenuated
         rays = positions - lamp
-        return colors * self._along(rays, rays @ camera.optical_axis, facing)
+        distances = rays.norm(dim=1).clamp_min(1e-9)
+        incidences = None if facing is None else (facing * rays).sum(1).abs() / distances
+        return colors * self.law(distances, rays @ camera.optical_axis / distances, incidences)
 
     @property
     def learned(self) -> JsonObject:

@@ -74,7 +74,6 @@ def test_incidence_counts_on_either_side_of_the_wall_and_not_under_a_flattened_l
     torch.testing.assert_close(flattened, torch.ones(3, 3))
     beside = head.apply_light(torch.ones(3, 3), points, turned, camera_at(0, 0, 0), LightOfCamera(camera))
     torch.testing.assert_close(beside, lit)
-    torch.testing.assert_close(head.attenuation(local), torch.ones(3, 1))
 
 
 def test_normals_of_anchors_are_the_walls():

@@ -1,4 +1,4 @@
-"""Surfels drawn by the torch renderer, against closed forms and against an independent naive renderer."""
+"""Surfels drawn by the torch renderer, against closed forms and a naive renderer; and what both primitives share."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRende
 from tests.renderers.naive import splat_surfels
 from tests.renderers.test_torch_renderer import (
     INPUTS,
+    SUMS,
     cast,
     make,
     moved,
@@ -33,6 +34,8 @@ from tests.renderers.test_torch_renderer import (
     rigid,
     with_gradients,
 )
+from tests.renderers.test_torch_renderer import OUTPUTS as SOLID_OUTPUTS
+from tests.renderers.test_torch_renderer import SCENES as SCENES_OF_GAUSSIANS
 from tests.renderers.test_torch_renderer import scene as scene_of_gaussians
 
 BACKGROUND = (0.3, 0.1, 0.9)
@@ -43,6 +46,14 @@ GRAZING = 50.0
 
 def as_surfels(gaussians):
     return dataclasses.replace(gaussians, scales=gaussians.scales[:, :2].contiguous())
+
+
+def solid(gaussians):
+    return gaussians
+
+
+#: Makes of 3D Gaussians what is to be drawn.
+of_each = pytest.mark.parametrize("primitive", [solid, as_surfels], ids=["gaussians3d", "surfels"])
 
 
 def make_surfels(means, scales, opacities, colors=None, quats=None):
@@ -105,10 +116,15 @@ SCENES = {
 }
 
 
+def outputs_of(gaussians):
+    return OUTPUTS if gaussians.scales.shape[1] == 2 else SOLID_OUTPUTS
+
+
 def ours(**options):
     def draw(gaussians, camera):
-        output = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(background=BACKGROUND, **options))
-        return {name: output[name] for name in OUTPUTS}, output.splats
+        wants = outputs_of(gaussians)
+        output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(background=BACKGROUND, **options))
+        return {name: output[name] for name in wants}, output.splats
 
     return draw
 
@@ -117,8 +133,9 @@ def naive(gaussians, camera):
     return splat_surfels(gaussians, camera, BACKGROUND)
 
 
-def cotangents_of(camera, seed=1):
-    return random_cotangents(camera, OUTPUTS, seed, torch.float64)
+def cotangents_of(gaussians, camera, seed=1):
+    names = OUTPUTS if gaussians.scales.shape[1] == 2 else SUMS
+    return random_cotangents(camera, names, seed, torch.float64)
 
 
 def without(pixels, cotangents):
@@ -136,7 +153,7 @@ def test_agrees_with_the_naive_renderer(name):
     exact, exact_camera = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
     grazing = naive(exact, exact_camera)[0]["farthest"] > GRAZING
     assert grazing.float().mean() <= 0.05
-    cotangents = without(grazing, cotangents_of(camera))
+    cotangents = without(grazing, cotangents_of(gaussians, camera))
     true, centers, true_gradients = with_gradients(naive, exact, exact_camera, cotangents)
     assert all(true[key].any() for key in OUTPUTS if (name, key) != ("one pixel", "depth_median"))
     for dtype, bounds in ((torch.float64, (1e-11, 1e-9)), (torch.float32, SCENES[name])):
@@ -197,26 +214,29 @@ def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
     assert missed < 1e-6  # of 1/255 at least, if any
 
 
-@pytest.mark.parametrize("elements", [1, 2000])
-def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
-    gaussians, camera = scene("in front of one another")
-    cotangents = cotangents_of(camera)
+@of_each
+@pytest.mark.parametrize("elements", [1, 2000, 2**22])
+def test_the_size_of_the_working_set_changes_nothing(primitive, elements, monkeypatch):
+    gaussians, camera = scene("in front of one another") if primitive is as_surfels else scene_of_gaussians("opaque")
+    cotangents = cotangents_of(gaussians, camera)
     plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
     monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
     monkeypatch.setattr(sweeping, "_MIN_RANKS", 3)
     monkeypatch.setattr(sweeping, "_MAX_RANKS", 7)
     other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
-    for key in OUTPUTS:
+    for key in cotangents:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
     for key, gradient in gradients.items():
         torch.testing.assert_close(other_gradients[key], gradient, rtol=1e-8, atol=1e-8)
 
 
-def test_two_calls_agree_to_the_bit():
-    gaussians = cast(as_surfels(random_gaussians(3000, 12, scale=(0.01, 0.08))), torch.float32)
+@of_each
+def test_two_calls_agree_to_the_bit(primitive):
+    gaussians = cast(primitive(random_gaussians(3000, 12, scale=(0.01, 0.08))), torch.float32)
     camera = pinhole(64, 48, 55.0, 55.0, dtype=torch.float32)
-    first, second = (with_gradients(ours(), gaussians, camera, cotangents_of(camera)) for _ in range(2))
-    assert all(torch.equal(first[0][k], second[0][k]) for k in OUTPUTS)
+    cotangents = cotangents_of(gaussians, camera)
+    first, second = (with_gradients(ours(), gaussians, camera, cotangents) for _ in range(2))
+    assert all(torch.equal(first[0][k], second[0][k]) for k in cotangents)
     assert all(torch.equal(first[2][k], second[2][k]) for k in first[2])
 
 
@@ -237,7 +257,7 @@ def smooth_scene():
 
 def test_gradcheck_of_everything_in_the_surfels_and_the_pose():
     gaussians, camera = smooth_scene()
-    cotangents = cotangents_of(camera, 4)
+    cotangents = cotangents_of(gaussians, camera, 4)
 
     def render(pose, *values):
         replaced = dataclasses.replace(gaussians, **dict(zip(INPUTS, values, strict=True)))
@@ -257,7 +277,7 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act():
     scales = depths[:, None] * torch.tensor([[0.09, 0.09], [0.2, 0.001], [0.09, 0.12], [0.002, 0.003]])
     gaussians = make_surfels(means, scales, torch.tensor([1.0, 0.995, 0.999, 0.9]))
     camera = pinhole(17, 3)
-    cotangents = cotangents_of(camera)
+    cotangents = cotangents_of(gaussians, camera)
     alone = dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[:1] for k in INPUTS})
     assert (render_gaussians(alone, camera).alpha == 0.99).any()
     whole = render_gaussians(gaussians, camera, settings=TorchRendererSettings(transmittance_min=0.0)).alpha
@@ -274,7 +294,7 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act():
 @pytest.mark.parametrize("name", ["random", "in front of one another"])
 def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
     gaussians, camera = scene(name)
-    cotangents = cotangents_of(camera)
+    cotangents = cotangents_of(gaussians, camera)
     _, splats, _ = with_gradients(ours(), gaussians, camera, cotangents)
     shifts = torch.zeros(len(gaussians), 2, dtype=torch.float64, requires_grad=True)
     outputs, centers = splat_surfels(gaussians, camera, BACKGROUND, shifts=shifts)
@@ -425,12 +445,16 @@ def test_what_is_not_drawn_gets_no_gradient(mean, scales, quat):
         assert not gradient.any()
 
 
+@of_each
+@pytest.mark.parametrize("size", [(1, 1), (9, 7)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_surfels_leave_the_background_and_a_graph(dtype):
-    gaussians = cast(make_surfels(torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0)), dtype, grad=True)
-    output = render_gaussians(gaussians, pinhole(), OUTPUTS, TorchRendererSettings(background=BACKGROUND))
-    assert torch.equal(output.rgb[0, 0], torch.tensor(BACKGROUND, dtype=dtype))
-    sum(output[name].sum() for name in OUTPUTS).backward()
+def test_no_gaussians_leave_the_background_and_a_graph(primitive, size, dtype):
+    gaussians = cast(primitive(make(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))), dtype, grad=True)
+    wants = outputs_of(gaussians)
+    output = render_gaussians(gaussians, pinhole(*size), wants, TorchRendererSettings(background=BACKGROUND))
+    assert torch.equal(output.rgb, torch.tensor(BACKGROUND, dtype=dtype).expand_as(output.rgb))
+    assert not any(output[name].any() for name in wants if name != "rgb")
+    sum(output[name].sum() for name in wants).backward()
     assert gaussians.means.grad.shape == (0, 3) and output.splats.means2d.grad.shape == (0, 2)
 
 
@@ -448,11 +472,11 @@ def test_a_disc_is_cut_off_at_the_near_plane():
         torch.testing.assert_close(output["depth_expected"][met, 1], depth[met].double())
 
 
-def test_surfels_of_equal_depth_keep_the_order_they_came_in():
-    gaussians = make_surfels([[0, 0, 4.0], [0, 0, 4.0]], 0.3, 0.8, [[1.0, 0, 0], [0, 1.0, 0]])
-    torch.testing.assert_close(
-        render_gaussians(gaussians, pinhole()).rgb[3, 4], torch.tensor([0.8, 0.16, 0.0], dtype=torch.float64)
-    )
+@of_each
+def test_equal_depths_keep_the_order_they_came_in(primitive):
+    gaussians = primitive(make([[0, 0, 4.0], [0, 0, 4.0]], 0.3, 0.8, [[1.0, 0, 0], [0, 1.0, 0]]))
+    rgb = render_gaussians(gaussians, pinhole()).rgb[3, 4]
+    torch.testing.assert_close(rgb, torch.tensor([0.8, 0.16, 0.0], dtype=torch.float64))
 
 
 # --- the component ----------------------------------------------------------------------------------------------------
@@ -492,15 +516,6 @@ def test_the_registered_component_renders_surfels_with_their_own_outputs():
         VolumeRenderer(VolumeRendererSettings()).render(field, camera, ("distortion",))
 
 
-def test_what_cannot_be_rendered_says_so():
-    gaussians, camera = smooth_scene()
-    solid = dataclasses.replace(gaussians, scales=torch.ones(4, 3).double())
-    with pytest.raises(InputError, match=r"distortion of 3D Gaussians.*surfels"):
-        render_gaussians(solid, camera, ("distortion",))
-    with pytest.raises(InputError, match=r"scales of shape \[4, 1\].*two for surfels"):
-        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
-
-
 @pytest.mark.parametrize(("far", "near"), [(0.2, 0.2), (100.0, 200.0)])
 def test_a_near_plane_beyond_the_end_of_distortion_is_refused(far, near):
     with pytest.raises(InputError, match="distortion_far beyond the near plane"):
@@ -519,22 +534,28 @@ def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):
         render_gaussians(gaussians, camera, ("depth_expected",))
 
 
+ALL_SCENES = [(solid, name) for name in SCENES_OF_GAUSSIANS] + [(as_surfels, name) for name in SCENES]
+
+
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", SCENES)
-def test_cuda_gives_the_numbers_of_the_cpu(name):
-    gaussians, camera = scene(name)
-    grazing = naive(gaussians, camera)[0]["farthest"] > GRAZING
-    cotangents = without(grazing, cotangents_of(camera))
-    for dtype, bounds in ((torch.float64, (1e-9, 1e-8)), (torch.float32, [10 * bound for bound in SCENES[name]])):
+@pytest.mark.parametrize(("primitive", "name"), ALL_SCENES)
+def test_cuda_gives_the_numbers_of_the_cpu(primitive, name):
+    gaussians, camera = (scene_of_gaussians if primitive is solid else scene)(name)
+    kept = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    of_float32 = (1e-4, 1e-4)
+    if primitive is as_surfels:
+        kept, of_float32 = naive(gaussians, camera)[0]["farthest"] <= GRAZING, [10 * bound for bound in SCENES[name]]
+    cotangents = without(~kept, cotangents_of(gaussians, camera))
+    for dtype, bounds in ((torch.float64, (1e-9, 1e-8)), (torch.float32, of_float32)):
         results = [
             with_gradients(ours(), cast(gaussians, dtype, device), camera.to(device, dtype),
                            {k: v.to(device) for k, v in cotangents.items()})
             for device in ("cpu", "cuda")
         ]  # fmt: skip
         (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results
-        for key in OUTPUTS:
+        for key in on_cpu:
             assert on_cuda[key].device.type == "cuda"
-            assert relative(on_cuda[key].cpu()[~grazing], on_cpu[key].double()[~grazing]) <= bounds[0], (dtype, key)
+            assert relative(on_cuda[key].cpu()[kept], on_cpu[key].double()[kept]) <= bounds[0], (dtype, key)
         for key, gradient in cpu_gradients.items():
             if gradient.any():
                 assert relative(cuda_gradients[key].cpu(), gradient.double()) <= bounds[1], (dtype, key)

@@ -18,7 +18,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS
 from coliags_plugin.core.render_output import SURFEL_OUTPUTS
-from coliags_plugin.renderers import sweeping
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from tests.renderers.naive import extent, splat
 
@@ -251,18 +250,6 @@ def test_the_near_plane_is_the_cameras():
     assert not render_gaussians(gaussians, dataclasses.replace(pinhole(), near_plane=1.0)).alpha.any()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (9, 7)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_gaussians_leave_the_background_and_a_graph(size, dtype):
-    gaussians = cast(make(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)), dtype, grad=True)
-    output = render_gaussians(gaussians, pinhole(*size), OUTPUTS, TorchRendererSettings(background=(1.0, 0.5, 0.0)))
-    assert output.rgb.dtype == dtype
-    assert torch.equal(output.rgb[0, 0], torch.tensor([1.0, 0.5, 0.0], dtype=dtype))
-    assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
-    (output.rgb.sum() + output["depth_expected"].sum()).backward()
-    assert gaussians.means.grad.shape == (0, 3) and output.splats.means2d.grad.shape == (0, 2)
-
-
 # --- against the naive renderer ---------------------------------------------------------------------------------------
 
 
@@ -435,33 +422,6 @@ def test_the_order_of_the_input_does_not_matter(name):
     assert torch.equal(other.splats.radii, plain.splats.radii[order])
 
 
-def test_gaussians_of_equal_depth_keep_the_order_they_came_in():
-    gaussians = make([[0, 0, 4.0], [0, 0, 4.0]], 0.3, 0.8, [[1.0, 0, 0], [0, 1.0, 0]])
-    output = render_gaussians(gaussians, pinhole())
-    torch.testing.assert_close(output.rgb[3, 4], torch.tensor([0.8, 0.16, 0.0], dtype=torch.float64))
-
-
-@pytest.mark.parametrize("elements", [1, 2000, 2**22])
-def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
-    gaussians, camera = scene("crowd in one tile")
-    cotangents = random_cotangents(camera)
-    plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
-    monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
-    other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
-    for key in OUTPUTS:
-        torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
-    for key, gradient in gradients.items():
-        torch.testing.assert_close(other_gradients[key], gradient, rtol=1e-8, atol=1e-8)
-
-
-def test_two_calls_agree_to_the_bit():
-    gaussians = cast(random_gaussians(6000, 12, scale=(0.01, 0.08)), torch.float32)
-    camera = pinhole(64, 48, 55.0, 55.0, dtype=torch.float32)
-    first, second = (with_gradients(ours(), gaussians, camera, random_cotangents(camera)) for _ in range(2))
-    assert all(torch.equal(first[0][k], second[0][k]) for k in OUTPUTS)
-    assert all(torch.equal(first[2][k], second[2][k]) for k in first[2])
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     n=st.integers(0, 12),
@@ -548,23 +508,3 @@ def test_a_pose_of_another_precision_is_cast():
     gaussians, camera = smooth_scene()
     output = render_gaussians(cast(gaussians, torch.float32), camera)
     assert output.rgb.dtype == torch.float32
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("name", SCENES)
-def test_cuda_gives_the_numbers_of_the_cpu(name):
-    gaussians, camera = scene(name)
-    cotangents = random_cotangents(camera)
-    for dtype, bound in ((torch.float64, 1e-9), (torch.float32, 1e-4)):
-        results = []
-        for device in ("cpu", "cuda"):
-            moved_cotangents = {k: v.to(device) for k, v in cotangents.items()}
-            results.append(
-                with_gradients(ours(), cast(gaussians, dtype, device), camera.to(device, dtype), moved_cotangents)
-            )
-        (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results
-        for key in OUTPUTS:
-            assert on_cuda[key].device.type == "cuda"
-            assert relative(on_cuda[key].cpu(), on_cpu[key].double()) <= bound, (dtype, key)
-        for key, gradient in cpu_gradients.items():
-            assert relative(cuda_gradients[key].cpu(), gradient.double()) <= bound, (dtype, key)

@@ -241,41 +241,32 @@ class HasADetachedGroup(Balls):
         return replace(super().gaussians(camera), means=self.means.detach())
 
 
-class LacksNormals(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        output = super().render(field, camera, wants, pixels)
-        output.maps.pop("normals", None)
-        return output
-
-
-class DepthInMetres(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        output = super().render(field, camera, wants, pixels)
-        if "depth_median" in output.maps:
-            output.maps["depth_median"] = output.maps["depth_median"] / 1000.0
-        return output
-
-
-class FlatNormals(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        output = super().render(field, camera, wants, pixels)
-        if "normals" in output.maps:
-            output.maps["normals"] = output.maps["normals"][..., 0]
-        return output
-
-
-class AlphaAboveOne(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        output = super().render(field, camera, wants, pixels)
-        return replace(output, alpha=1.5 * output.alpha)
-
-
 class NaNFeature(Balls):
     feature_channels = frozenset({"albedo"})
 
     def gaussians(self, camera):
         albedo = torch.full((len(self.means), 1), torch.nan)
         return replace(super().gaussians(camera), features={"albedo": albedo})
+
+
+def spoiling(name, spoil):
+    """A renderer whose output is spoilt: by a function of a map, where that is there, or of the whole output."""
+
+    class Spoilt(CpuRenderer):
+        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+            output = super().render(field, camera, wants, pixels)
+            if name is None:
+                return spoil(output)
+            kept = {key: spoil(values) if key == name else values for key, values in output.maps.items()}
+            return replace(output, maps={key: values for key, values in kept.items() if values is not None})
+
+    return Spoilt
+
+
+LacksNormals = spoiling("normals", lambda values: None)
+DepthInMetres = spoiling("depth_median", lambda values: values / 1000.0)
+FlatNormals = spoiling("normals", lambda values: values[..., 0])
+AlphaAboveOne = spoiling(None, lambda output: replace(output, alpha=1.5 * output.alpha))
 
 
 class FixedSize(CpuRenderer):
