@@ -226,7 +226,10 @@ def restore_sampling(checkpoint: Checkpoint, sampler: Sampler, generators: Mappi
         raise InputError(f"the checkpoint plans frame {max(queue)}", f"one of {count} frames")
     sampler.queue = queue
     with _fitting("the checkpoint's random state does not fit"):
-        for name, state in checkpoint.part("generator").items():
+        states = checkpoint.part("generator")
+        if states.keys() != generators.keys():
+            raise KeyError(f"generators {', '.join(states)}")
+        for name, state in states.items():
             generators[name].set_state(state)
 
 

@@ -119,6 +119,7 @@ def test_colors_do_not_move_gaussians():
     assert not field.offsets.grad.any() and field.appearance_head.exponents.grad.abs().max() > 0
 
 
+@pytest.mark.thorough
 def test_the_law_of_a_lamp_is_found():
     """Gaussians of one albedo under an inverse-square lamp 3.6 mm behind the lens, spread as cos^1.2, at gamma 2.2."""
     generator = torch.Generator().manual_seed(0)

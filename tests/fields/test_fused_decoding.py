@@ -57,8 +57,6 @@ def make(name, **options):
 
 
 NUMBA, CUDA = "numba", pytest.param("cuda", marks=pytest.mark.gpu)
-#: Of the quick suite; all else takes long in triton's interpreter.
-by_each = pytest.mark.parametrize("made", [NUMBA, "triton", CUDA], indirect=True)
 
 
 @pytest.fixture(params=[NUMBA, pytest.param("triton", marks=pytest.mark.thorough), CUDA])
@@ -125,7 +123,6 @@ def test_all_or_none_of_the_children_are_drawn(opacity, share, made):
     assert len(drawn.visible_sources) > 0
 
 
-@by_each
 def test_a_single_anchor(made):
     field = made("scaffold", voxel_size=100.0)
     assert field.element_count == 1

@@ -261,14 +261,7 @@ def test_noise_and_jitter_are_of_training_alone(tmp_path):
     assert torch.equal(silent.rgb, still.rgb)
 
 
-def test_a_checkpoint_from_before_rendering_had_a_generator_still_loads(tmp_path):
-    run = trainer(tmp_path / "run")
-    run.start()
-    del run.generators["rendering"]
-    run.save()
-    trainer(tmp_path / "run").resume()
-
-
+@pytest.mark.thorough
 def test_every_term_falls(tmp_path):
     run = trainer(tmp_path / "run", ["losses.depth.share=1.0", "losses.depth-coarse.share=1.0"], steps=40)
     rows = [run.take_step() for _ in range(40)]

@@ -119,6 +119,7 @@ def test_the_axis_is_that_of_the_smallest_scale():
     assert value(turned_field(0.0, scales=(1.0, 0.1, 1.0))).item() == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.thorough
 def test_its_gradient_turns_gaussians_towards_the_surface():
     field = turned_field(30.0)
     for _ in range(400):

@@ -119,6 +119,7 @@ def test_a_plane_of_surfels_is_consistent(depth, tilt):
     assert expected < 0.3
 
 
+@pytest.mark.thorough
 def test_inconsistent_surfels_are_turned_into_their_surface():
     surfels, term = plane(0.0, count=9, spacing=0.6), make("normal-consistency")
     half = math.radians(25) / 2

@@ -189,6 +189,7 @@ def trainer(folder, scene, overrides=SPARSE, steps=40):
     return Trainer(method, scene, "wall", RunFolder(folder), 0, torch.device("cpu"))
 
 
+@pytest.mark.thorough
 def test_any_method_can_be_given_the_term(tmp_path):
     run = trainer(tmp_path / "run", sparse_scene())
     rows = [run.take_step() for _ in range(40)]

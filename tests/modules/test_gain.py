@@ -191,13 +191,14 @@ def fitted_response(answer, noise, kind, gap, seed):
     return module.metering.response(torch.from_numpy(gains), 40, 40 + gap), naive
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("answer", [0.0, -0.3, -0.7, -1.0])
-@pytest.mark.parametrize(("gap", "tolerance"), [(2, 0.03), (20, 0.03)])
+@pytest.mark.parametrize("gap", [2, 20])
 @pytest.mark.parametrize("kind", ["opposite", "own"])
-def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer, gap, tolerance, kind):
+def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer, gap, kind):
     for noise in (0.0, 0.01, 0.03):
         found = np.mean([fitted_response(answer, noise, kind, gap, seed)[0] for seed in range(12)])
-        assert found == pytest.approx(answer, abs=tolerance if noise else 1e-5), noise
+        assert found == pytest.approx(answer, abs=0.03 if noise else 1e-5), noise
 
 
 def test_least_squares_takes_errors_for_a_response():

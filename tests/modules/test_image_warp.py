@@ -60,6 +60,7 @@ def test_held_out_frames_move_as_the_frames_around_them(untrained, moves):
     assert torch.equal(module.shade(picture(), None).rgb, picture().rgb)
 
 
+@pytest.mark.thorough
 def test_a_motion_is_learned():
     scene, module = make(cells=2)
     smooth = torch.linspace(0.0, 6.0, WIDTH).sin()[None, :] * torch.linspace(0.0, 5.0, HEIGHT).cos()[:, None]

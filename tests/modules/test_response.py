@@ -94,6 +94,7 @@ class _Curve(torch.nn.Module):
         return self.module.curve(colors)
 
 
+@pytest.mark.thorough
 def test_a_known_shoulder_is_found():
     """Colours under five gains through the phantom's tone curve: the curve is found to half a percent."""
     generator = torch.Generator().manual_seed(0)

@@ -217,7 +217,9 @@ def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
 @of_each
 @pytest.mark.parametrize("elements", [1, 2000, 2**22])
 def test_the_size_of_the_working_set_changes_nothing(primitive, elements, monkeypatch):
-    gaussians, camera = scene("in front of one another") if primitive is as_surfels else scene_of_gaussians("opaque")
+    gaussians, camera = (
+        scene("in front of one another") if primitive is as_surfels else scene_of_gaussians("one pixel wide")
+    )
     cotangents = cotangents_of(gaussians, camera)
     plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
     monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
