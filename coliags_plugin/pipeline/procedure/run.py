@@ -133,6 +133,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         deinterlace=source.span.deinterlace,
         segments=shifted,
         skipped=left_out,
+        joins=(),
     )
     procedure.write(out)
     survey.write(out)  # last: the folder is known for a procedure's from the record on, and surveyed anew without this
