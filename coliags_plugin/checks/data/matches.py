@@ -20,7 +20,7 @@ from coliags_plugin.reconstruction.structure.point_tracks import track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
 #: Features that are matched; largest ratio in Lowe's test, and largest distance of descriptors.
-_FEATURES, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE = FeatureSettings(max_features=2000), 0.8, 0.7
+_FEATURES, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE = FeatureSettings(upright=False), 0.8, 0.7
 #: Smallest number of matches of a usable pair.
 _MIN_MATCHES = 8
 #: An epipolar geometry passes through seven matches whatever they are. Smallest share of the others that it explains if
