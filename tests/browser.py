@@ -10,12 +10,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-#: Draws WebGL in software, which `--disable-gpu` alone forbids.
-SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 #: Makes two descriptors those that the browser expects, and becomes the browser.
 _LAUNCH = """
 import fcntl, os, sys
@@ -38,10 +35,9 @@ class Browser:
 
     Args:
         executable: The browser.
-        flags: Further options of its command line.
     """
 
-    def __init__(self, executable: str, flags: Sequence[str] = ()) -> None:
+    def __init__(self, executable: str) -> None:
         self._profile = tempfile.mkdtemp(prefix="chromium-")
         their_in, self._out = os.pipe()
         self._in, their_out = os.pipe()
@@ -54,12 +50,14 @@ class Browser:
                 "--remote-debugging-pipe",
                 "--no-sandbox",
                 "--disable-gpu",
+                "--use-angle=swiftshader",  # draws WebGL in software, which the option above alone forbids
+                "--enable-unsafe-swiftshader",
+                "--ignore-gpu-blocklist",
                 "--disable-dev-shm-usage",
                 "--hide-scrollbars",
                 "--no-first-run",
                 "--disable-background-networking",
                 "--disable-component-update",
-                *flags,
                 f"--user-data-dir={self._profile}",
                 "about:blank",
             ],
@@ -72,10 +70,10 @@ class Browser:
         os.close(their_in)
         os.close(their_out)
         self._read = b""
-        self._count = 0
+        self._count, self._session = 0, None
         self.events: list[dict[str, Any]] = []
         target = self._call("Target.createTarget", url="about:blank")["targetId"]
-        self._session: str | None = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._call(f"{domain}.enable")
 
@@ -88,8 +86,6 @@ class Browser:
         os.close(self._out)
         os.close(self._in)
         shutil.rmtree(self._profile, ignore_errors=True)
-
-    _session = None
 
     def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
         self._count += 1

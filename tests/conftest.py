@@ -17,6 +17,9 @@ from filelock import FileLock
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
 
+from tests.browser import Browser, find_chromium
+from tests.scenes import write_wall
+
 torch.set_num_threads(1)  # as many processes run as there are CPUs, and the order of sums depends on it
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -46,6 +49,22 @@ def compile_once(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CPUDispatcher, "compile", compile_alone)
         yield
+
+
+@pytest.fixture(scope="session")
+def wall(shared_folder):
+    """The folder of :func:`tests.scenes.wall_scene`; never changed."""
+    return shared_folder("wall", write_wall)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless browser; the test skips where there is none."""
+    executable = find_chromium()
+    if executable is None:
+        pytest.skip("no Chromium on this machine")
+    with Browser(executable) as opened:
+        yield opened
 
 
 @pytest.fixture

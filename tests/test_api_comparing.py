@@ -12,15 +12,9 @@ from coliags_plugin.execution import queue
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
 from tests.engine.test_progress import Shown
-from tests.scenes import write_wall
 
 SETTINGS = parse_assignments(TINY)
 WITHOUT_DEPTH = ("without depth", "coliags", {"losses.depth": None})
-
-
-@pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
 
 
 @pytest.fixture

@@ -4,13 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from tests.scenes import write_wall
-
-
-@pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
-
 
 @pytest.fixture
 def written(tmp_path):

@@ -134,11 +134,10 @@ def test_resume_is_bit_exact_with_noise_and_growth(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    scene = write_wall(tmp_path_factory.mktemp("data") / "wall")
+def trained(wall, tmp_path_factory):
     settings = {"datamanager.points_count": 2000, "schedule.written_for": 5, "losses.diffuse-factor": None}
     output = tmp_path_factory.mktemp("runs") / "run"
-    return coliags_plugin.train("pr-endo", scene, output, steps=5, settings=settings).path
+    return coliags_plugin.train("pr-endo", wall, output, steps=5, settings=settings).path
 
 
 def test_a_relit_run_renders_the_field_under_that_lamp(trained):

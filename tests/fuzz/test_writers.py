@@ -101,7 +101,9 @@ def _work(words, when, kind, folder):
 def run():
     """Runs a command in a process forked from one that has imported everything and has no threads."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["coliags_plugin.api", "coliags_plugin.cli", "cv2", "kornia", "numba", "open3d", "pycolmap", "torch"])
+    context.set_forkserver_preload(
+        ["coliags_plugin.api", "coliags_plugin.cli", "cv2", "kornia", "numba", "open3d", "pycolmap", "torch"]
+    )
 
     def run(words, folder, when=-1, kind=no_space):
         process = context.Process(target=_work, args=(words.split(), when, kind, folder))

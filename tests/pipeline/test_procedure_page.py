@@ -15,7 +15,6 @@ from coliags_plugin.pipeline.procedure import page as procedure_page
 from coliags_plugin.pipeline.procedure.contents import common_frames, read_procedure
 from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.timeline import frame_states, timeline
-from tests.browser import Browser, find_chromium
 from tests.pipeline.procedures import FAILURE, FRAMES, SUBMAPS, join, procedure_content, similarity
 
 
@@ -308,9 +307,8 @@ def test_sub_maps_are_brought_into_the_frame_of_the_first_they_are_joined_to(out
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1400, 390])
-def test_the_page_in_a_browser(out, monkeypatch, width):
+def test_the_page_in_a_browser(browser, out, monkeypatch, width):
     monkeypatch.setattr(procedure_page, "_SCENES", 2500)
     monkeypatch.setattr(procedure_page, "_LISTED", 30)
     file = out / "segment-001" / "poses" / "atlas.json"
@@ -319,29 +317,26 @@ def test_the_page_in_a_browser(out, monkeypatch, width):
     content["submaps"] = content["submaps"][:1]
     write_json(file, content)
     write_procedure_page(out)
-    with Browser(str(find_chromium())) as browser:
-        browser.open(out / "index.html", width, phone=width < 500)
-        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
-        browser.run(
-            "document.querySelector('.ribbon i').dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))"
-        )
-        assert browser.run("document.querySelector('.readout').textContent").startswith("segment-000/0: frames 0 to 13")
-        rows = "[...document.querySelectorAll('[data-name=reasons] tbody tr')].filter(r => !r.hidden).length"
-        assert browser.run(rows) > 16
-        browser.run(
-            "(input => (input.value = 'WASHED', input.dispatchEvent(new Event('input'))))"
-            "(document.querySelector('.filter input'))"
-        )
-        assert browser.run(rows) == 1
-        loaded = (
-            "new Promise(done => { const frames = [...document.querySelectorAll('iframe')]; const look = () => "
-            "{ const shown = frames.find(f => !f.hidden), title = shown.contentDocument?.title; title ? done(title)"
-            " : shown.src ? done(shown.getAttribute('src')) : setTimeout(look, 20); }; look(); })"
-        )
-        assert browser.run(loaded).startswith("segment-000")
-        browser.run(
-            "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
-            "(document.querySelector('.scenes select'))"
-        )
-        assert browser.run(loaded) == "segment-001/run/scene.html"
-        assert browser.errors() == []
+    browser.open(out / "index.html", width, phone=width < 500)
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    browser.run("document.querySelector('.ribbon i').dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))")
+    assert browser.run("document.querySelector('.readout').textContent").startswith("segment-000/0: frames 0 to 13")
+    rows = "[...document.querySelectorAll('[data-name=reasons] tbody tr')].filter(r => !r.hidden).length"
+    assert browser.run(rows) > 16
+    browser.run(
+        "(input => (input.value = 'WASHED', input.dispatchEvent(new Event('input'))))"
+        "(document.querySelector('.filter input'))"
+    )
+    assert browser.run(rows) == 1
+    loaded = (
+        "new Promise(done => { const frames = [...document.querySelectorAll('iframe')]; const look = () => "
+        "{ const shown = frames.find(f => !f.hidden), title = shown.contentDocument?.title; title ? done(title)"
+        " : shown.src ? done(shown.getAttribute('src')) : setTimeout(look, 20); }; look(); })"
+    )
+    assert browser.run(loaded).startswith("segment-000")
+    browser.run(
+        "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
+        "(document.querySelector('.scenes select'))"
+    )
+    assert browser.run(loaded) == "segment-001/run/scene.html"
+    assert browser.errors() == []

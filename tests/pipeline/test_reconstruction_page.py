@@ -13,7 +13,6 @@ from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table, write_index
 from coliags_plugin.pipeline.stages import StageRecord
 from coliags_plugin.reporting.terminal import terminal_text
-from tests.browser import Browser, find_chromium
 from tests.pipeline.records import FOLDER, SCENE_FILE, done, record_in
 
 
@@ -97,26 +96,24 @@ def test_the_page_does_without_atlas_and_scenes(page, atlas, tmp_path):
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1400, 390])
-def test_another_scene_is_chosen_in_a_browser(page, tmp_path, width):
+def test_another_scene_is_chosen_in_a_browser(browser, page, tmp_path, width):
     page()
-    with Browser(str(find_chromium())) as browser:
-        browser.open(tmp_path / "out" / "index.html", width, phone=width < 500)
+    browser.open(tmp_path / "out" / "index.html", width, phone=width < 500)
 
-        def titles():
-            """Of the frames, '' of hidden ones, once the shown one is loaded."""
-            return browser.run(
-                "new Promise(done => { const look = () => { const frames = [...document.querySelectorAll('iframe')]"
-                ".map(f => f.hidden ? '' : f.contentDocument.title); frames.some(Boolean) ? done(frames)"
-                " : setTimeout(look, 20); }; look(); })"
-            )
-
-        assert titles() == ["scene 0", ""]
-        browser.run(
-            "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
-            "(document.querySelector('.scenes select'))"
+    def titles():
+        """Of the frames, '' of hidden ones, once the shown one is loaded."""
+        return browser.run(
+            "new Promise(done => { const look = () => { const frames = [...document.querySelectorAll('iframe')]"
+            ".map(f => f.hidden ? '' : f.contentDocument.title); frames.some(Boolean) ? done(frames)"
+            " : setTimeout(look, 20); }; look(); })"
         )
-        assert titles() == ["", "scene 1"]
-        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
-        assert browser.errors() == []
+
+    assert titles() == ["scene 0", ""]
+    browser.run(
+        "(select => (select.selectedIndex = 1, select.dispatchEvent(new Event('change'))))"
+        "(document.querySelector('.scenes select'))"
+    )
+    assert titles() == ["", "scene 1"]
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    assert browser.errors() == []

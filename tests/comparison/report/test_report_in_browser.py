@@ -6,20 +6,12 @@ import pytest
 
 from coliags_plugin.comparison.report.page import Choices
 from coliags_plugin.comparison.report.report import write_report
-from tests.browser import Browser, find_chromium
 from tests.comparison.report.made import made_scenes, write_comparison, write_run
 
-CHROMIUM = find_chromium()
-pytestmark = [pytest.mark.thorough, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+pytestmark = pytest.mark.thorough
 
 METHODS = {"coliags": 2.0, "gaussian-pancakes": 0.0, "pr-endo": -0.4}
 DESKTOP, PHONE = 1400, 390
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(CHROMIUM) as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,6 @@ import pytest
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors
 from coliags_plugin.export.splats.files import write_splats
-from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 PROGRAM = shutil.which("splat-transform")
@@ -101,8 +100,7 @@ def test_glb_has_what_the_program_writes(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
-def test_supersplat_draws_the_gaussians_where_and_as_they_are(tmp_path):
+def test_supersplat_draws_the_gaussians_where_and_as_they_are(browser, tmp_path):
     """Red to the right of the optical axis, green below, blue straight ahead; seen along z from the origin."""
     places = np.array([[3.0, 0.0, 10.0], [0.0, 3.0, 10.0], [0.0, 0.0, 10.0]], np.float32)
     cloud = SplatCloud(
@@ -118,14 +116,13 @@ def test_supersplat_draws_the_gaussians_where_and_as_they_are(tmp_path):
     settings = {"camera": view, "background": {"color": [0, 0, 0]}, "animTracks": []}
     (tmp_path / "view.json").write_text(json.dumps(settings))
     transform(tmp_path / "a.ply", "--viewer-settings", tmp_path / "view.json", tmp_path / "a.html")
-    with Browser(str(find_chromium()), SOFTWARE_WEBGL) as browser:
-        browser.open(f"{(tmp_path / 'a.html').as_uri()}?noui&noanim", 400, 400)
-        for _ in range(30):
-            time.sleep(2.0)
-            browser.screenshot(tmp_path / "seen.png")
-            seen = read_rgb(tmp_path / "seen.png")
-            if seen[195:205, 195:205, 2].mean() > 100:
-                break
+    browser.open(f"{(tmp_path / 'a.html').as_uri()}?noui&noanim", 400, 400)
+    for _ in range(30):
+        time.sleep(2.0)
+        browser.screenshot(tmp_path / "seen.png")
+        seen = read_rgb(tmp_path / "seen.png")
+        if seen[195:205, 195:205, 2].mean() > 100:
+            break
     assert seen[200, 200].argmax() == 2 and seen[200, 200, 2] > 150
     assert seen[200, 260].argmax() == 0 and seen[200, 260, 0] > 150
     assert seen[260, 200].argmax() == 1 and seen[260, 200, 1] > 150

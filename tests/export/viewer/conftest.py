@@ -6,14 +6,9 @@ import pytest
 
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
-from tests.scenes import SMALL, write_wall
+from tests.scenes import SMALL
 
 FRAMES = 9
-
-
-@pytest.fixture(scope="session")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=FRAMES)
 
 
 @pytest.fixture(scope="session")

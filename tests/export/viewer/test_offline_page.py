@@ -23,10 +23,8 @@ from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
-from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 from tests.export.viewer.made import some_gaussians
 
-CHROMIUM = find_chromium()
 CUBE = TriangleMesh(
     np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (8, 10)], np.float32),
     np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 4, 2], [2, 4, 6]]),
@@ -125,12 +123,6 @@ def test_a_mesh_is_quantised_in_its_box():
     np.testing.assert_array_equal(np.frombuffer(data[8 * 9 :], "<u4").reshape(-1, 3), CUBE.triangles)
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(CHROMIUM, SOFTWARE_WEBGL) as one:
-        yield one
-
-
 def drawn(browser, path):
     """What the canvas shows, and the lens it is drawn with, once Gaussians are sorted."""
     browser.run(
@@ -161,7 +153,6 @@ def as_canvas(camera, shape):
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize(("degree", "light"), [(0, replace), (1, replace), (2, attenuated), (3, attenuated)])
 def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree, light):
     cloud = light(cloud_of(400, degree, seed=degree))
@@ -182,7 +173,6 @@ def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree, ligh
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [900, 390])
 def test_layers_path_and_looking_around(browser, tmp_path, width):
     page = tmp_path / "page.html"

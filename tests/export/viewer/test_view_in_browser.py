@@ -9,22 +9,14 @@ import pytest
 
 import coliags_plugin as cp
 from coliags_plugin.core.images import read_rgb
-from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 
 pytest.importorskip("viser")
 
-CHROMIUM = find_chromium()
-pytestmark = [pytest.mark.thorough, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+pytestmark = pytest.mark.thorough
 
 WIDTH, HEIGHT = 900, 420
 #: Where neither the panel nor a notice is, px.
 FREE = (slice(220, 400), slice(20, 460))
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with Browser(CHROMIUM, SOFTWARE_WEBGL) as one:
-        yield one
 
 
 def until(browser, file, condition, seconds=90.0):
