@@ -291,7 +291,6 @@ class Run:
         *,
         settings: Mapping[str, Any] | None = None,
         mesh: str | Path | None = None,
-        truth: str | Path | None = None,
         overwrite: bool = False,
     ) -> MeasuredCoverage:
         """Measure what the recording shows of the wall and what it misses, and write it. Research use only.
@@ -304,8 +303,6 @@ class Run:
             settings: What counts as seen, by name (docs/coverage.md 3), for instance ``{"far": 40.0}``.
             mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses; None: ``mesh/mesh.ply`` in the run
                 folder, or else the fused depth of the run.
-            truth: True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with
-                one; None: that of the scene, where there is one.
             overwrite: Replace the folder where it exists.
 
         Raises:
@@ -328,7 +325,7 @@ class Run:
 
             trained = self.load()
             wall, scene = fuse_run(trained).mesh, trained.scene
-        return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
+        return measure_scene(scene, wall, folder, chosen, overwrite)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the run to browsers (docs/viewer.md), until the viewer is closed.

@@ -60,7 +60,6 @@ def measure_scene_coverage(
     output: str | Path,
     *,
     settings: Mapping[str, Any] | None = None,
-    truth: str | Path | None = None,
     overwrite: bool = False,
 ) -> MeasuredCoverage:
     """Measure what a scene's recording shows of a mesh of the wall, without a run. Research use only.
@@ -70,12 +69,11 @@ def measure_scene_coverage(
         mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses.
         output: Folder to make.
         settings: What counts as seen, by name (docs/coverage.md 3).
-        truth: See :meth:`Run.coverage`.
         overwrite: Replace the folder where it exists.
 
     Raises:
-        InputError: An option is unknown or invalid; the scene, the mesh or the truth cannot be read or do not belong
-            together; or the folder exists or cannot be written.
+        InputError: An option is unknown or invalid; the scene or the mesh cannot be read or do not belong together; or
+            the folder exists or cannot be written.
     """
     from coliags_plugin.core.settings import validated
     from coliags_plugin.geometry.meshes.files import read_mesh
@@ -84,5 +82,4 @@ def measure_scene_coverage(
 
     chosen, folder = validated(CoverageSettings, settings or {}, "coverage option"), Path(output)
     check_free(folder, overwrite)
-    other = None if truth is None else Path(truth)
-    return measure_scene(open_recording(Path(data)), read_mesh(Path(mesh)), folder, chosen, other, overwrite)
+    return measure_scene(open_recording(Path(data)), read_mesh(Path(mesh)), folder, chosen, overwrite)

@@ -87,9 +87,6 @@ class CoverageCommand:
     mesh: arguments.OptionalPath = None
     """The wall, PLY, OBJ or GLB, in the world and unit of the poses; default: RUN/mesh/mesh.ply, or else the fused
     depth of the run."""
-    truth: arguments.OptionalPath = None
-    """True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with one;
-    default: that of the scene, where there is one."""
     set: arguments.Assignments = ()
     """An option, for instance region_diameter=10 (docs/coverage.md)."""
     data: arguments.MovedData = None
@@ -108,9 +105,7 @@ class CoverageCommand:
         is_run = (self.path / "config.yaml").is_file()
         if is_run:
             run = load_run(self.path, data=self.data, device=self.device)
-            measured = run.coverage(
-                self.output, settings=settings, mesh=self.mesh, truth=self.truth, overwrite=self.overwrite
-            )
+            measured = run.coverage(self.output, settings=settings, mesh=self.mesh, overwrite=self.overwrite)
         elif self.mesh is None or self.output is None:
             raise InputError(
                 f"{self.path} is not a run folder",
@@ -118,7 +113,7 @@ class CoverageCommand:
             )
         else:
             measured = measure_scene_coverage(
-                self.path, self.mesh, self.output, settings=settings, truth=self.truth, overwrite=self.overwrite
+                self.path, self.mesh, self.output, settings=settings, overwrite=self.overwrite
             )
         print_summary(
             "\n".join(measured.summary),
@@ -199,8 +194,8 @@ class ExportCommand:
     """Time limit, seconds, of the fit of baked Gaussians to the run's renderings, done where baking loses much."""
     measure: arguments.DoneByDefault = True
     """Do not compare each file with the run on the held-out views, for the record and the terminal."""
-    format: tuple[Literal["ply", "spz", "splat", "glb"], ...] = ("ply",)
-    """Formats, all of one baking: PLY as 3DGS writes it, SPZ, .splat, glTF with KHR_gaussian_splatting. Lengths stay
+    format: tuple[Literal["ply", "spz", "glb"], ...] = ("ply",)
+    """Formats, all of one baking: PLY as 3DGS writes it, SPZ, glTF with KHR_gaussian_splatting. Lengths stay
     those of the scene (mm)."""
     data: arguments.MovedData = None
     device: arguments.Device = "auto"

@@ -36,12 +36,11 @@ def find_true_surface(scene: Path) -> Path | None:
     return next((scene / name for name in _PLACES if (scene / name).is_file()), None)
 
 
-def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
+def read_true_surface(path: Path) -> TrueSurface:
     """Read a true surface, of a mesh or of the folder of a scene with one, and what was seen of it.
 
     Seen are, of a phantom, the triangles of ``face_seen`` in ``mesh_seen.npz`` beside it: those that are the first hit
-    of a pixel of a training frame; or, with ``any_frame``, those of ``face_seen_by_any_frame``, held out or not. Of
-    C3VD's ``coverage_mesh.obj``, those of texture index 1: observed in any frame.
+    of a pixel of a training frame. Of C3VD's ``coverage_mesh.obj``, those of texture index 1: observed in any frame.
     """
     if path.is_dir():
         surface = find_true_surface(path)
@@ -51,8 +50,8 @@ def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
     mesh, textures = read_flagged_mesh(path)
     flags = path.parent / "mesh_seen.npz"
     if path.suffix.lower() == ".ply" and flags.is_file():
-        of, key = ("any", "face_seen_by_any_frame") if any_frame else ("a training", "face_seen")
-        return TrueSurface(path, mesh, _phantom_flags(flags, key, mesh), f"first hit of a pixel of {of} frame")
+        seen = _phantom_flags(flags, "face_seen", mesh)
+        return TrueSurface(path, mesh, seen, "first hit of a pixel of a training frame")
     if textures is not None and set(np.unique(textures)) <= {_OBSERVED, _UNOBSERVED}:
         seen = textures == _OBSERVED
         if not seen.any():

@@ -22,7 +22,6 @@ from coliags_plugin.reporting.model import (
     simple_table,
 )
 from coliags_plugin.reporting.numbers import area_text
-from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation
 from coliags_plugin.surface.coverage.map import legend_entries
 from coliags_plugin.surface.coverage.measure import MissedRegion, PartialCoverage, SeenWall, WallCoverage
 from coliags_plugin.surface.coverage.settings import CoverageSettings
@@ -42,7 +41,6 @@ def coverage_page(
     picture: UInt8[np.ndarray, "H W 3"],
     views: Sequence[CoverageView],
     name: str,
-    evaluation: CoverageEvaluation | None = None,
 ) -> Page:
     """The page of a measurement, with its map and frames it was measured from, named after the scene or run."""
     map_note = (
@@ -61,7 +59,6 @@ def coverage_page(
         Section("Map", [Paragraph(map_note), Figures([unrolled]), _level_table(coverage)]),
         Section("Missed regions", list(_missed_regions(coverage, views))),
         Section("Along the lumen", [_segment_table(coverage)]),
-        Section("Against the truth", [] if evaluation is None else _against_truth(evaluation)),
         Section("How it is measured", [Paragraph(method_note), record("Settings", coverage.settings.model_dump())]),
     ]
     return Page(f"{name}: coverage", sections, _facts(coverage), note=RESEARCH_USE)
@@ -111,16 +108,12 @@ def _level_lines(coverage: SeenWall, metric: bool = True) -> list[str]:
     return [f"{100.0 * area / total:>5.1f} %  {label} ({area_text(area, metric)})" for label, area in areas.items()]
 
 
-def summary(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> list[str]:
+def summary(coverage: WallCoverage) -> list[str]:
     """A few lines for a terminal."""
     missed = sum(region.area for region in coverage.regions)
     lines = [f"section of {coverage.section.length:.0f} mm, {len(coverage.names)} frames", *_level_lines(coverage)]
     limit = f"{coverage.settings.region_diameter:g} mm"
     lines.append(f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²")
-    if evaluation is not None:
-        scores = evaluation.surface.main_scores
-        known = ", ".join(f"{name} {value:.3f}" for name, value in scores.items() if value is not None)
-        lines.append(f"against the truth: {known}")
     return [*lines, RESEARCH_USE]
 
 
@@ -204,33 +197,6 @@ def _segment_table(coverage: WallCoverage) -> Table:
             rows.append([f"{start:.0f} to {end:.0f}", f"{total / 100.0:.1f}", *(f"{share:.0f}" for share in shares)])
         start = end
     return simple_table(["along, mm", "area, cm²", *(f"{level.label}, %" for level in levels)], rows)
-
-
-def _against_truth(evaluation: CoverageEvaluation) -> list[Block]:
-    """Scores beside those of the baselines."""
-    note = (
-        f"On the true surface, of which {100.0 * evaluation.unseen_share:.0f} % of the section is unseen. "
-        "Recall: share of the unseen surface that is called unseen; region recall: of the regions, at least half of "
-        "which is. Precision: share of the surface called unseen that is. False positive rate: share of the seen "
-        "surface that is called unseen. Calling everything unseen has perfect recall, which says nothing alone. "
-        "Measured wall stands for true wall within 1 mm in place and normal together: at one place, for normals "
-        "within 29 degrees."
-    )
-    kinds = {
-        "measured wall": evaluation.surface,
-        "measured distance along viewing rays": evaluation.rays,
-        "all unseen": evaluation.all_unseen,
-        "random cells of the same area": evaluation.random,
-    }
-    rows = [
-        [
-            name,
-            *(None if value is None else f"{value:.3f}" for value in scores.main_scores.values()),
-            f"{scores.predicted_regions} of {scores.true_regions}",
-        ]
-        for name, scores in kinds.items()
-    ]
-    return [Paragraph(note), simple_table(["unseen by", *evaluation.surface.main_scores, "regions"], rows)]
 
 
 def region_picture(

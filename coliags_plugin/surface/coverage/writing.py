@@ -1,4 +1,4 @@
-"""Coverage of a scene's recording, measured, compared with the truth where there is one, and written."""
+"""Coverage of a scene's recording, measured and written."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.geometry.meshes.truth import find_true_surface, read_true_surface
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
-from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation, evaluate_coverage
 from coliags_plugin.surface.coverage.map import draw_map, draw_partial, face_colors
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
 from coliags_plugin.surface.coverage.page import (
@@ -45,7 +43,6 @@ class MeasuredCoverage:
     coverage: WallCoverage | PartialCoverage = field(repr=False)
     values: dict[str, Any] = field(repr=False)  # the contents of ``coverage.json``
     summary: list[str] = field(repr=False)  # a few lines for a terminal
-    evaluation: CoverageEvaluation | None = field(repr=False, default=None)  # against the truth, where there is one
 
 
 def measure_scene(
@@ -53,33 +50,23 @@ def measure_scene(
     mesh: TriangleMesh,
     output: Path,
     settings: CoverageSettings,
-    truth: Path | None = None,
     overwrite: bool = False,
 ) -> MeasuredCoverage:
     """Measure the coverage of a recording and write it; the mesh is the wall in the world and unit of the scene.
 
-    Where no section of a lumen can be measured, what was seen of the wall is written alone, and why. ``truth`` is a
-    true surface, in that world and mm, or the folder of a scene with one; None: that of the scene, where there is one.
+    Where no section of a lumen can be measured, what was seen of the wall is written alone, and why.
     """
     check_free(output, overwrite)
     views = recorded_views(scene)
-    source = truth or (None if scene.folder is None else find_true_surface(scene.folder))
-    true = None if source is None else read_true_surface(source, any_frame=True)
     with progress_callback() as progress:
         coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)
-    evaluation = None
     if isinstance(coverage, PartialCoverage):
         values, lines = partial_values(coverage), partial_summary(coverage)
         picture = draw_partial(coverage, views)
         page = partial_page(coverage, picture, scene.name)
     else:
-        evaluation = None if true is None else evaluate_coverage(coverage, true, views)
-        values, lines, picture = (
-            coverage_values(coverage, evaluation),
-            summary(coverage, evaluation),
-            draw_map(coverage),
-        )
-        page = coverage_page(coverage, picture, views, scene.name, evaluation)
+        values, lines, picture = coverage_values(coverage), summary(coverage), draw_map(coverage)
+        page = coverage_page(coverage, picture, views, scene.name)
     with atomic_folder(output, overwrite) as folder:
         write_json(folder / "coverage.json", values)
         if values["regions"] is not None:
@@ -87,7 +74,7 @@ def measure_scene(
         write_png(folder / "map.png", picture)
         write_mesh(folder / "coverage.ply", colored_mesh(coverage))
         write_html(page, folder / "coverage.html")
-    return MeasuredCoverage(output, coverage, values, lines, evaluation)
+    return MeasuredCoverage(output, coverage, values, lines)
 
 
 def open_recording(path: Path) -> Scene:
@@ -109,7 +96,7 @@ def colored_mesh(coverage: SeenWall) -> TriangleMesh:
     return TriangleMesh(vertices, np.arange(3 * len(mesh)).reshape(-1, 3), colors)
 
 
-def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> dict[str, Any]:
+def coverage_values(coverage: WallCoverage) -> dict[str, Any]:
     """Everything that is measured of a section, as JSON values."""
     return _seen_values(coverage) | {
         "unit": "mm",
@@ -137,7 +124,6 @@ def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | Non
             }
             for number, region in enumerate(coverage.regions, start=1)
         ],
-        "truth": None if evaluation is None else evaluation.as_json(),
     }
 
 
@@ -152,7 +138,6 @@ def partial_values(coverage: PartialCoverage) -> dict[str, Any]:
         "no_section": coverage.reason,
         "guessed_share": None,
         "regions": None,
-        "truth": None,
     }
 
 

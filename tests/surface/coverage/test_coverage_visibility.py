@@ -9,6 +9,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import validated
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.measure import connected, large_regions, near_pairs, neighbours
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import RayGrid
 from coliags_plugin.surface.coverage.visibility import Level, classify, facing_cameras, see_faces
@@ -140,3 +141,19 @@ def test_input_that_cannot_be_measured_is_refused():
         see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))])
     with pytest.raises(InputError, match="'far'"):
         validated(CoverageSettings, {"far": -3.0}, "coverage option")
+
+
+def test_neighbours_share_edges_and_regions_are_what_is_connected():
+    mesh = plane(0.0, 2.0, 1.0)
+    pairs = neighbours(mesh)
+    # 4 x 4 squares: a diagonal in each, and 2 * 4 * 3 inner edges.
+    assert len(pairs) == 16 + 24
+    left, right = mesh.centers[:, 0] < -1.0, mesh.centers[:, 0] > 1.0
+    numbers = connected(left | right, pairs)
+    assert set(numbers[left]) != set(numbers[right]) and set(numbers[~left & ~right]) == {-1}
+    assert [len(region) for region in large_regions(left | right, pairs, mesh.areas, 3.9)] == [8, 8]
+    assert large_regions(left, pairs, mesh.areas, 4.1) == []
+    bridged = np.concatenate([pairs, near_pairs(mesh.centers, left, right, 3.0)])
+    assert len(large_regions(left | right, bridged, mesh.areas, 0.0)) == 1
+    assert len(near_pairs(mesh.centers, left, right, 0.5)) == 0
+    assert len(near_pairs(mesh.centers, left, np.zeros(32, bool), 9.0)) == 0
