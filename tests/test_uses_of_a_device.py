@@ -127,7 +127,7 @@ def test_meshes_and_coverage(method, trained, tmp_path):
 @pytest.mark.parametrize("method", OF_GAUSSIANS)
 @pytest.mark.parametrize("light", ["mean", "flattened", "recorded"])
 def test_exports(method, light, trained, wall, tmp_path):
-    formats = ("ply", "spz", "splat", "glb")
+    formats = ("ply", "spz", "glb")
     argv = ["export", trained(method), "--light", light, "--seconds", 1, "--no-measure", "--format", *formats]
     with PretendedCuda():
         for device in ("cuda", "cpu"):

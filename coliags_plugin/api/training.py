@@ -108,7 +108,7 @@ def import_splats(
     """Make a run of a file of 3D Gaussians on a scene, at step 0, to evaluate, render and mesh.
 
     Args:
-        file: PLY, SPZ or ``.splat``, in the world frame and unit of the scene.
+        file: PLY or SPZ, in the world frame and unit of the scene.
         data: The scene's folder.
         output: Run folder; None: ``runs/SCENE/imported/STAMP``.
         data_format: Name of a data manager; None: the one that recognises the folder.

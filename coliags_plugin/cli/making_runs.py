@@ -106,7 +106,7 @@ class ImportCommand:
     """Make a run folder of anyone's file of 3D Gaussians, which eval, render, mesh and report take like any other."""
 
     file: tyro.conf.Positional[Path]
-    """PLY (3DGS's attributes; 2DGS's, without scale_2), SPZ or .splat, in the world frame and unit of the scene."""
+    """PLY (3DGS's attributes; 2DGS's, without scale_2) or SPZ, in the world frame and unit of the scene."""
     data: arguments.SceneFolder
     output: arguments.OptionalOutput = None
     """Run folder; default runs/SCENE/imported/STAMP."""

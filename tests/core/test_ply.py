@@ -34,7 +34,10 @@ def test_every_form(tmp_path, order, faces):
     more = "element face 1\nproperty list uchar int vertex_indices\n" if faces else ""
     body = made.tobytes() + faces * b"\x03" + faces * bytes(12)
     if order == "a":
-        body = "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in made).encode() + b"3 0 1 2\n"
+        body = (
+            "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in made).encode()
+            + faces * b"3 0 1 2\n"
+        )
     (tmp_path / "p.ply").write_bytes(header(FORMATS[order], more=more).encode() + body)
     found = read_vertices(tmp_path / "p.ply")
     assert list(found) == [name for name, _ in FIELDS]
@@ -68,18 +71,18 @@ def test_open3d_agrees(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", r"\(0 bytes\) has no PLY header"),
-        (b"plenty of text", "has no PLY header"),
-        (header("binary_little_endian").encode() + vertices().tobytes()[:-1], "says it has 5 vertices, but holds 4"),
-        (header("ascii").encode() + b"1 2 3 4 5 6 7\n", "says it has 5 vertices, but holds 1"),
-        (header("ascii", 1).encode() + b"1 2 3\n", "a vertex row that is not numbers"),
-        (header("ascii", 1).encode() + b"1 2 3 4 five 6 7\n", "a vertex row that is not numbers"),
-        (header("binary").encode(), "header line 'format binary 1.0'"),
-        (header("ascii").replace("format ascii 1.0\n", "").encode(), "names no format"),
-        (header("ascii").replace("float x", "half x").encode(), "header line 'property half x'"),
-        (header("ascii").replace("float x", "float u").encode(), "but no x"),
-        (header("ascii").replace("vertex", "face").encode(), "does not begin with vertices"),
-        (header("ascii").replace("float x", "list uchar int x").encode(), "vertices of plain numbers"),
+        (b"", r"\(0 bytes\) cannot be read as PLY"),
+        (b"plenty of text", "cannot be read as PLY"),
+        (header("binary_little_endian").encode() + vertices().tobytes()[:-1], "cannot be read as PLY"),
+        (header("ascii").encode() + b"1 2 3 4 5 6 7\n", "not a number x for each vertex"),
+        (header("ascii", 1).encode() + b"1 2 3\n", "cannot be read as PLY"),
+        (header("ascii", 2).encode() + b"1 2 3 4 5 6 7\n1 2 3\n", "not a number red for each vertex"),
+        (header("ascii", 2).encode() + b"1 2 3 4 5 6 7\n1 2 3 4 five 6 7\n", "cannot be read as PLY"),
+        (header("binary").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("format ascii 1.0\n", "").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("float x", "half x").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("vertex", "face").encode(), "no x, y, z"),
+        (header("ascii").replace("float x", "list uchar int x").encode(), "not a number x for each vertex"),
     ],
 )
 def test_refused(tmp_path, content, message):

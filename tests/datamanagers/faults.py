@@ -370,7 +370,7 @@ a crop
   c3vd-raw, c3vd-v2: <0>\.png is 30 x 30.*undistorted layout
 another file cut short
   colmap: points3D\.bin \(\d+ bytes\) is damaged or cut short
-  rotatecolon: init_point_cloud\.ply says it has \d+ vertices, but holds
+  rotatecolon: init_point_cloud\.ply \(\d+ bytes\) cannot be read as PLY
   reim-nerf: rgb_mask\.png \(\d+ bytes\) cannot be decoded
   c3vd: rotation/camera_pose\.txt, line \d: '
   c3vd-v2: rotation/rgb/0000\.png \(\d+ bytes\) cannot be decoded
@@ -422,7 +422,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (remove("rotation/pose.txt"), "rotation has images, but it has no pose.txt"),
     ],
     "pr-endo": [
-        (cut(f"{_CLOUD}.ply"), r"point_cloud\.ply says it has 200 vertices, but holds \d+"),
+        (cut(f"{_CLOUD}.ply"), r"point_cloud\.ply \(\d+ bytes\) cannot be read as PLY"),
         (
             write(
                 f"{_CLOUD}.ply",

@@ -87,7 +87,7 @@ def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
     ("name", "content", "message"),
     [
         ("none.ply", None, "no file"),
-        ("bad.ply", "not a ply", "no PLY header"),
+        ("bad.ply", "not a ply", "cannot be read as PLY"),
         ("bad.npz", "not an npz", "cannot read"),
         ("other.npz", {"xyz": np.ones((2, 3))}, "positions"),
         ("flat.npz", {"positions": np.ones((2, 2))}, "shape"),

@@ -111,7 +111,7 @@ def _meshes(folder: Path, surface: TriangleMesh) -> None:
 
 def _splats(folder: Path, scene: Path) -> None:
     folder.mkdir()
-    for name in ("ply", "spz", "splat"):
+    for name in ("ply", "spz"):
         write_splats(folder / f"cloud.{name}", random_cloud(20, degree=1), name, "a comment")
     shutil.copytree(scene, folder / "scene", ignore=shutil.ignore_patterns("truth", "rotation"))
 

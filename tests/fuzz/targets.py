@@ -208,8 +208,8 @@ TARGETS: dict[str, Target] = {
         f"mesh-{name}": Target("meshes", (name, "mesh_seen.npz"), _mesh(name))
         for name in ("mesh.ply", "mesh.obj", "mesh.glb", "text.ply")
     },
-    **{f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name)) for name in ("ply", "spz", "splat")},
-    **{f"import-{name}": Target("splats", (f"cloud.{name}",), _import(name), True) for name in ("ply", "spz", "splat")},
+    **{f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name)) for name in ("ply", "spz")},
+    **{f"import-{name}": Target("splats", (f"cloud.{name}",), _import(name), True) for name in ("ply", "spz")},
     "resume": Target("run", _RUN, _resume, True),
     "load-run": Target("run", _RUN, _load_run, True),
     "results": Target("results", ("run/*.*", "run/eval/*/*.*", "run/eval/*/*/*/*"), _results, True),

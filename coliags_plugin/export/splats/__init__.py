@@ -1,1 +1,1 @@
-"""Files of Gaussians as other programs read and write them: PLY, SPZ, splat, glTF."""
+"""Files of Gaussians as other programs read and write them: PLY, SPZ, glTF."""

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.core.glb import GlbArray, encode_glb
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.packed import read_dot_splat, read_splat_spz, write_dot_splat, write_spz
 from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
+from coliags_plugin.export.splats.spz import read_splat_spz, write_spz
 
 EXTENSION = "KHR_gaussian_splatting"
-#: glTF's number of a primitive of points.
-_POINTS = 0
+#: glTF's numbers of a primitive of points, of float32 and of a buffer of vertices, and its shapes by their channels.
+_POINTS, _FLOAT32, _VERTICES = 0, 5126, 34962
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
@@ -28,20 +31,37 @@ def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     without the extension see plain points in the colours of ``COLOR_0``.
     """
     attributes = _attributes(cloud)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    size = 0
+    for index, values in enumerate(attributes.values()):
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": _VERTICES})
+        shape = {"count": len(values), "type": _SHAPES[values.shape[1]]}
+        accessors.append({"bufferView": index, "componentType": _FLOAT32, **shape})
+        size += values.nbytes
+    accessors[0] |= {"min": cloud.means.min(axis=0).tolist(), "max": cloud.means.max(axis=0).tolist()}
     primitive = {
         "attributes": {name: index for index, name in enumerate(attributes)},
         "mode": _POINTS,
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     document = {
+        "asset": {"version": "2.0", "generator": "coliags_plugin", "extras": {"comment": comment}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "accessors": accessors,
     }
-    arrays = [GlbArray(values, bounds=name == "POSITION") for name, values in attributes.items()]
-    atomic_write(path, encode_glb(document, arrays, comment))
+    text = json.dumps(document, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    body = b"".join(np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values())
+    # Version 2; each chunk has its length and kind.
+    header = struct.pack("<4sIII4s", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body), len(text), b"JSON")
+    atomic_write(path, header + text + struct.pack("<I4s", len(body), b"BIN\0") + body)
 
 
 def _attributes(cloud: SplatCloud) -> dict[str, np.ndarray]:
@@ -83,11 +103,6 @@ FORMATS: Mapping[str, SplatFormat] = {
         write_spz,
         read_splat_spz,
         "positions to 1/4096 unit, log scales to 1/16, colours, opacities and harmonics to 8 bits",
-    ),
-    "splat": SplatFormat(
-        write_dot_splat,
-        read_dot_splat,
-        "positions and scales as float32, colours of degree 0, opacities and rotations to 8 bits",
     ),
     "glb": SplatFormat(write_splat_glb, None, "all numbers as float32"),
 }

@@ -22,7 +22,7 @@ from typing_extensions import Self
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.packed import read_splat_spz, write_spz
+from coliags_plugin.export.splats.spz import read_splat_spz, write_spz
 from coliags_plugin.fields.explicit_gaussians import FARTHEST
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array, encode_jpeg

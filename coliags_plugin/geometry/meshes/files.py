@@ -1,8 +1,7 @@
-"""Files of triangle meshes: PLY, OBJ and GLB.
+"""Files of triangle meshes: PLY and GLB by trimesh, and OBJ.
 
-OBJ is read by hand, with the texture indices that C3VD uses as flags: open3d 0.20 gives texture coordinates in place of
-their indices, which are lost where two coordinates are equal, splits vertices there, and of a damaged file returns an
-empty mesh without an error.
+OBJ is read by hand, with the texture indices that C3VD uses as flags: trimesh gives texture coordinates in place of
+their indices, which are lost where two coordinates are equal, and splits vertices there.
 """
 
 from __future__ import annotations
@@ -18,9 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.core.glb import GlbArray, encode_glb
-from coliags_plugin.core.images import encode_image, write_image
-from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, read_triangles, write_ply
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 
@@ -28,8 +25,6 @@ from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 MESH_FORMATS = ("ply", "obj", "glb")
 
 _COLORS = ("red", "green", "blue")
-#: glTF's number of a primitive of triangles.
-_TRIANGLES = 4
 
 
 def read_mesh(path: Path) -> TriangleMesh:
@@ -94,50 +89,42 @@ def _read_ply(path: Path) -> TriangleMesh:
 
 
 def _read_glb(path: Path) -> TriangleMesh:
-    open3d = import_open3d("reads meshes")
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        read = open3d.io.read_triangle_mesh(str(path))
-    triangles = np.asarray(read.triangles)
-    vertices = np.asarray(read.vertices).astype(np.float32)
+    import trimesh
+
+    try:
+        read = trimesh.load_mesh(path, process=False, skip_materials=True)
+        vertices, triangles = np.asarray(read.vertices, np.float32), np.asarray(read.faces, np.int64)
+        colors = np.asarray(read.visual.vertex_colors)[:, :3] if read.visual.kind == "vertex" else None
+    except Exception as error:  # trimesh raises whatever it meets
+        raise InputError(f"{path} cannot be read as GLB: {error}", "a complete GLB file", "Fetch it again") from error
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
-    linear = np.rint(np.asarray(read.vertex_colors) * 255.0).clip(0, 255) / 255.0
-    return TriangleMesh(vertices, triangles.astype(np.int64), _encoded(linear) if len(linear) else None)
+    return TriangleMesh(vertices, triangles, None if colors is None else _encoded(colors / 255.0))
 
 
 def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
-    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours or a texture.
+    """Bytes of a GLB file: one primitive, seen from both sides, with 8-bit colours or a texture."""
+    import trimesh
+    from PIL import Image
+    from trimesh.exchange.gltf import export_glb
 
-    By hand: open3d 0.20 writes 16-bit indices at an offset that its own reader then refuses.
-    """
-    places, material = None, dict[str, Any](metallicFactor=0.0, roughnessFactor=1.0)
+    material: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    visual = None
     if texture is not None:
         mesh, places = _split(mesh, texture)
+        image = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(texture.image))
+        visual = trimesh.visual.TextureVisuals(uv=places, material=image)
         material["baseColorTexture"] = {"index": 0}
-    arrays = [
-        GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
-        GlbArray(mesh.vertices.astype(np.float32), bounds=True),
-    ]
-    attributes = {"POSITION": 1}
-    if mesh.colors is not None:
-        attributes["COLOR_0"] = 2
-        # Of four bytes each, as glTF aligns the elements of a vertex attribute.
-        rgba = np.full((len(mesh.vertices), 4), 255, np.uint8)
-        rgba[:, :3] = np.rint(_linear(mesh.colors) * 255.0)
-        arrays.append(GlbArray(rgba, normalized=True))
-    if places is not None:
-        attributes["TEXCOORD_0"] = 2
-        arrays.append(GlbArray(np.stack([places[:, 0], 1.0 - places[:, 1]], axis=1).astype(np.float32)))
-    document = {
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": _TRIANGLES}]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": material}],
-    }
-    if texture is None:
-        return encode_glb(document, arrays)
-    return encode_glb({**document, "textures": [{"source": 0}]}, arrays, png=encode_image(texture.image))
+    elif mesh.colors is not None:
+        linear = np.rint(_linear(mesh.colors) * 255.0).astype(np.uint8)
+        visual = trimesh.visual.ColorVisuals(vertex_colors=linear)
+
+    def both_sides(document: dict[str, Any]) -> None:
+        document["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": material}]
+        document["meshes"][0]["primitives"][0]["material"] = 0
+
+    made = trimesh.Trimesh(mesh.vertices, mesh.triangles, visual=visual, process=False)
+    return bytes(export_glb(trimesh.Scene(made), tree_postprocessor=both_sides))
 
 
 def _split(mesh: TriangleMesh, texture: Texture) -> tuple[TriangleMesh, Float[np.ndarray, "V 2"]]:

@@ -74,15 +74,6 @@ def test_spz(tmp_path):
     np.testing.assert_allclose(found, turn @ covariances(cloud) @ turn, atol=0.01 * cloud.scales.max() ** 2)
 
 
-def test_dot_splat(tmp_path):
-    cloud = random_cloud(60, 0)
-    write_splats(tmp_path / "a.splat", cloud, "splat")
-    columns = read_back(tmp_path / "a.splat", 0)
-    means = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    np.testing.assert_allclose(means.min(axis=0), cloud.means.min(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(means.max(axis=0), cloud.means.max(axis=0), rtol=1e-6)
-
-
 def test_glb_has_what_the_program_writes(tmp_path):
     """It writes GLB and does not read it: the same attributes of the same Gaussians, but for its turn about z."""
     cloud = random_cloud(60)

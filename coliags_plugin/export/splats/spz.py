@@ -1,17 +1,16 @@
-"""Quantised files of Gaussians: SPZ, about 64 bytes each, by the library gsply, and splat, 32 bytes each."""
+"""SPZ files of Gaussians, about 64 bytes each, by the library gsply."""
 
 from __future__ import annotations
 
 import math
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors, sigmoid
+from coliags_plugin.export.splats.cloud import SplatCloud, sigmoid
 
 #: Bits of a coordinate, its sign apart; and the most of them behind the binary point: 1/4096 of a scene unit.
 _COORDINATE_BITS, _MOST_FRACTIONAL_BITS = 23, 12
@@ -29,7 +28,8 @@ def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     SPZ's axes are right, up, back: what is written is turned by half a turn about x, and turned back when read. Clouds
     of more than 2048 units from the origin get coarser positions. The format has no place for a comment.
     """
-    gsply = _library()
+    import gsply
+
     reach = float(np.abs(cloud.means).max())
     bits = min(_MOST_FRACTIONAL_BITS, _COORDINATE_BITS - max(0, math.floor(math.log2(max(reach, 1.0))) + 1))
     if bits < 1:
@@ -54,7 +54,8 @@ def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
 
 def read_splat_spz(path: Path) -> SplatCloud:
     """Read Gaussians, turned from SPZ's axes as :func:`write_spz` turned them."""
-    gsply = _library()
+    import gsply
+
     try:
         data = gsply.read_spz(path)
     except OSError as error:
@@ -84,51 +85,4 @@ def _half_turn(cloud: SplatCloud) -> SplatCloud:
         scales=cloud.scales,
         opacities=cloud.opacities,
         harmonics=cloud.harmonics * _TURNED[: cloud.harmonics.shape[1], None],
-    )
-
-
-def _library() -> Any:
-    try:
-        import gsply
-    except ImportError as error:
-        raise InputError(
-            f"gsply cannot be imported ({error})", "gsply, which reads and writes SPZ", "pip install gsply"
-        ) from error
-    return gsply
-
-
-_ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-
-
-def write_dot_splat(path: Path, cloud: SplatCloud, comment: str = "") -> None:
-    """Write means, scales, 8-bit colours and opacities, and 8-bit rotations (w first, 128 (q + 1)), most visible first.
-
-    The order is that of opacity times volume, falling, as viewers that draw while loading expect it. The format has no
-    place for a comment.
-    """
-    order = np.argsort(-cloud.opacities * cloud.scales.prod(axis=1), kind="stable")
-    rows = np.empty(len(cloud), _ROW)
-    rows["mean"], rows["scales"] = cloud.means[order], cloud.scales[order]
-    rgba = np.concatenate([cloud.colors, cloud.opacities[:, None]], axis=1)[order]
-    rows["rgba"] = np.clip(np.round(255.0 * rgba), 0, 255)
-    rows["quat"] = np.clip(np.round(128.0 * cloud.unit_quats_wxyz[order] + 128.0), 0, 255)
-    atomic_write(path, rows.tobytes())
-
-
-def read_dot_splat(path: Path) -> SplatCloud:
-    """Read Gaussians with harmonics of degree 0."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a .splat file") from error
-    if len(data) % _ROW.itemsize:
-        raise InputError(f"{path} has {len(data)} bytes", f"a multiple of {_ROW.itemsize}, a .splat file")
-    rows = np.frombuffer(data, _ROW)
-    rgba = rows["rgba"].astype(np.float32) / 255.0
-    return SplatCloud(
-        means=rows["mean"].astype(np.float32),
-        quats_wxyz=(rows["quat"].astype(np.float32) - 128.0) / 128.0,
-        scales=rows["scales"].astype(np.float32),
-        opacities=rgba[:, 3],
-        harmonics=harmonics_of_colors(rgba[:, :3]),
     )
