@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ def try_renderer(renderer_class: type[SplattingRenderer], device: torch.device) 
     Errors are those in float32 on the device against the definition in float64 on the CPU, each relative to the largest
     value of the output or gradient; CheckFailedError where one is larger than its tolerance.
     """
-    renderer, exact = (kind(kind.Settings(**CUTS)) for kind in (renderer_class, TorchRenderer))
+    renderer, exact = _without_thresholds(renderer_class), _without_thresholds(TorchRenderer)
     told, wrong = [], []
     for primitive in sorted(renderer_class.primitives):
         wants = [name for name in OUTPUTS if name in renderer.outputs_of(primitive) - {"depth_median"}]  # which jumps
@@ -47,6 +48,10 @@ def try_renderer(renderer_class: type[SplattingRenderer], device: torch.device) 
     if wrong:
         raise CheckFailedError(f"wrong: {', '.join(wrong)}")
     return "; ".join(told)
+
+
+def _without_thresholds(kind: Any) -> SplattingRenderer:
+    return kind(kind.Settings(**CUTS))
 
 
 def strewn(count: int, width: int, height: int, primitive: str) -> tuple[Gaussians, Camera]:
