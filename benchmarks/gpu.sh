@@ -70,7 +70,7 @@ if [[ $device == cpu ]]; then
   fast=cpu pytest=(--collect-only -m gpu tests/checks)
 elif timeout 60 "$python" -c 'import gsplat' 2>/dev/null; then
   fast+=,gsplat
-  export COLIAGS_PLUGIN_PATH=docs/example_renderer/coliags_gsplat.py
+  export COLIAGS_PLUGIN_PATH=$PWD/docs/example_renderer/coliags_gsplat.py
 fi
 part tests 600 "$python" -m pytest -q "${pytest[@]}"
 part rasterizer 300 "$python" benchmarks/rasterizer.py --device "$device" --backends "$fast" \
