@@ -30,6 +30,7 @@ COMPONENTS = {"losses": {"sharp": SharpLoss}}
 SMALL = ("--steps", 10, "--set", "datamanager.points_count=500")
 
 
+@pytest.mark.thorough
 def test_a_sound_method(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert run("check", "3dgs", *SMALL) == 0

@@ -107,7 +107,9 @@ def test_sound_poses_without_depth_are_not_suspected(scene):
     assert whats(changed(scene, depth=lambda depth: None)) == ""
 
 
-@pytest.mark.parametrize("factor", [0.001, 0.5, 25.4])
+@pytest.mark.parametrize(
+    "factor", [25.4, *(pytest.param(factor, marks=pytest.mark.thorough) for factor in (0.001, 0.5))]
+)
 def test_depth_in_another_unit_than_poses(scene, factor):
     findings = whats(changed(scene, depth=lambda depth: depth * factor))
     assert "depth and poses are in different units" in findings
@@ -145,7 +147,9 @@ def test_estimated_depth_is_judged_where_it_is_confident(estimate):
     assert "frames do not agree on the surface" in whats(replace(estimate, train=true["train"], test_sets=test))
 
 
-@pytest.mark.parametrize("wrong", ["scaled", "late", "reversed", "inverted"])
+@pytest.mark.parametrize(
+    "wrong", ["reversed", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("scaled", "late", "inverted"))]
+)
 def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
     poses = [frame.camera.camera_to_world for frame in estimate.video]
     given = {
