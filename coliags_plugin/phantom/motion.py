@@ -50,13 +50,8 @@ def poses_during(
 
 
 def times(settings: PhantomSettings) -> Float[np.ndarray, "T"]:
-    """Time of every frame along the path, from 0 to 1: even steps, and none during pauses."""
-    pauses = settings.pauses
-    moving = settings.frames - pauses * settings.pause_frames
-    frames = np.ones(moving, dtype=np.int64)
-    for pause in range(pauses):
-        frames[round((pause + 1) / (pauses + 1) * (moving - 1))] += settings.pause_frames
-    return np.repeat(np.linspace(0.0, 1.0, moving), frames)
+    """Time of every frame along the path, from 0 to 1, in even steps."""
+    return np.linspace(0.0, 1.0, settings.frames)
 
 
 def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:

@@ -24,10 +24,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
 from coliags_plugin.lighting.beams import SpreadLaw
 
-#: Fewest frames in which the camera moves.
-_MOVING = 9
-#: Settings that only count with pauses.
-_OF_PAUSES = ("pauses", "pause_frames")
 #: Settings that are recorded only where they differ from their defaults, which earlier versions had.
 _LATER = (
     "preset",
@@ -307,8 +303,6 @@ class PhantomSettings(Settings):
     )
 
     polyps: int = Field(4, ge=0, le=20, description="Sessile polyps, 3 to 10 mm wide.")
-    pauses: int = Field(0, ge=0, le=50, description="How often the camera stops, at even intervals of its path.")
-    pause_frames: int = Field(10, ge=1, le=500, description="Frames of each pause beyond the one that reaches it.")
     path_length: float = Field(50.0, ge=0.0, le=60.0, description="Length of the pullback, mm; C3VD's median is 47.")
     frame_rate: float = Field(15.0, ge=1.0, le=120.0, description="Frames per second, for all that moves in time.")
     turns: int = Field(4, ge=0, le=50, description="Fast turns of an examination, 30 to 50 degrees within 0.35 s.")
@@ -386,16 +380,6 @@ class PhantomSettings(Settings):
         return albedo
 
     @model_validator(mode="after")
-    def _pauses_leave_motion(self) -> Self:
-        moving = self.frames - self.pauses * self.pause_frames
-        if moving < _MOVING:
-            raise ValueError(
-                f"{self.pauses} pauses of {self.pause_frames} of {self.frames} frames leave {moving} that move; must "
-                f"be {_MOVING} or more"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _a_share_for_each_lamp(self) -> Self:
         if self.lamp_shares and len(self.lamp_shares) != len(self.lamps):
             raise ValueError(f"{len(self.lamp_shares)} lamp_shares of {len(self.lamps)} lamps; must be one of each")
@@ -403,12 +387,10 @@ class PhantomSettings(Settings):
 
     @model_serializer(mode="wrap")
     def _records_of_earlier_versions(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # A phantom without pauses is recorded as it was before there were any: it is the same phantom.
         record: dict[str, Any] = serialize(self)
         fields = type(self).model_fields
         later = _LATER_IN_PRESETS if self.preset else (*_LATER, *_LATER_IN_PRESETS)
         left_out = {key for key in later if getattr(self, key) == fields[key].default}
-        left_out.update(() if self.pauses else _OF_PAUSES)
         # Before there was a choice, views had the exposure of their frame, although that is no longer the default.
         left_out.update(("rotation_exposure",) if not self.rotation_views or self.rotation_exposure == "frame" else ())
         return {key: record[key] for key in record if key not in left_out}

@@ -202,8 +202,8 @@ def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written):
     file = tmp_path / "made" / "one" / "phantom.json"
     file.write_text(json.dumps({"settings": scene.phantom_record}))
     assert find_scenes([name], tmp_path / "made")[0].is_there
-    file.write_text(json.dumps({"settings": {**scene.phantom_record, "pauses": 2, "pause_frames": 1}}))
-    with pytest.raises(InputError, match="pauses 2 instead of None"):
+    file.write_text(json.dumps({"settings": {**scene.phantom_record, "wave": 2.0}}))
+    with pytest.raises(InputError, match=r"wave 2\.0 instead of None"):
         find_scenes([name], tmp_path / "made")
     file.write_text(json.dumps({"settings": {**scene.phantom_record, "seed": 4}}))
     with pytest.raises(InputError, match="another phantom than the benchmark's: seed 4 instead of 3"):

@@ -319,22 +319,6 @@ def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, traject
         assert np.degrees(np.arccos(np.clip(looks @ looks[0], -1, 1))).max() > 20.0
 
 
-@pytest.mark.parametrize("trajectory", ["pullback", "rotation", "inspection"])
-def test_a_camera_that_pauses_goes_the_same_way(colon, trajectory):
-    anatomy, _, tracer = colon
-    going = PhantomSettings(trajectory=trajectory, frames=31, **COARSE)
-    stopping = going.model_copy(update={"frames": 31 + 2 * 7, "pauses": 2, "pause_frames": 7})
-    path = camera_path(anatomy.centre_line, going, tracer)
-    stopped = camera_path(anatomy.centre_line, stopping, tracer)
-    np.testing.assert_array_equal(stopped, np.repeat(path, np.where(np.isin(np.arange(31), (10, 20)), 8, 1), axis=0))
-
-
-def test_settings_without_pauses_are_recorded_as_before_there_were_any():
-    assert not {"pauses", "pause_frames"} & set(PhantomSettings().model_dump())
-    assert PhantomSettings(pauses=1).model_dump()["pause_frames"] == 10
-    assert PhantomSettings(**PhantomSettings(pauses=1).model_dump()) == PhantomSettings(pauses=1)
-
-
 def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(colon):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(frames=41, rotation_views=12, **COARSE)
@@ -411,7 +395,6 @@ def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
         ({"seed": -1}, "seed"),
         ({"layout": "c3vd_raw"}, "phantom setting layout: .*unknown layout; known are c3vd, .*colmap"),
         ({"polypes": 3}, "polyps"),
-        ({"frames": 60, "pauses": 6}, "leave 0 that move"),
     ],
 )
 def test_bad_settings_are_named(options, named):
