@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float32
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
@@ -65,13 +64,6 @@ class SplatCloud:
         """Logits of the opacities, finite. [N]"""
         inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
         return np.log(inside / (1.0 - inside)).astype(np.float32)
-
-    @property
-    def covariances(self) -> Float32[np.ndarray, "N 3 3"]:
-        """Covariance matrices, squared scene units. [N, 3, 3]"""
-        turns = rotation_matrices(torch.from_numpy(self.quats_wxyz)).numpy()
-        axes = turns[:, :, : self.scales.shape[1]] * self.scales[:, None]
-        return axes @ axes.transpose(0, 2, 1)
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> SplatCloud:
