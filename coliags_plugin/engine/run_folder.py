@@ -126,7 +126,6 @@ class RunFolder:
     def create(self, config_yaml: str, provenance: JsonObject, overwrite: bool) -> None:
         """Create the folder atomically with config and provenance."""
         self.check_free(overwrite)
-        provenance = {"format": FORMAT, **provenance}
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.rewrite(config_yaml, provenance)  # perhaps somebody's working directory, which must not be replaced
             return
@@ -135,7 +134,7 @@ class RunFolder:
 
     def rewrite(self, config_yaml: str, provenance: JsonObject) -> None:
         """Write config and provenance again."""
-        write_json(self.provenance_file, provenance)
+        write_json(self.provenance_file, {"format": FORMAT, **provenance})
         atomic_write(self.config_file, config_yaml)
 
     def check_free(self, overwrite: bool) -> None:

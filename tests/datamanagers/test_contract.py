@@ -258,7 +258,7 @@ def test_every_fault_meets_every_layout_that_it_can_befall():
 
 def table(page: str, header: str) -> list[list[str]]:
     """Cells of a table in the documentation."""
-    rows = (ROOT / "docs" / page).read_text().split(header)[1].split("\n\n")[0].splitlines()[2:]
+    rows = (ROOT / page).read_text().split(header)[1].split("\n\n")[0].splitlines()[2:]
     return [[cell.strip().replace("`", "") for cell in row.strip("|").split("|")] for row in rows]
 
 
@@ -273,7 +273,7 @@ def test_the_pages_examples_are_what_is_said(walls, tmp_path, page):
             with pytest.raises(InputError) as caught:
                 load(folder, name)
             said.append(re.sub(r"\d+", "1", str(caught.value).replace(f"{folder}/", "")))
-    for _, example in table(f"layouts/{page}.md", "| found | example of the message |"):
+    for _, example in table(f"docs/layouts/{page}.md", "| found | example of the message |"):
         assert any(re.sub(r"\d+", "1", example) in message for message in said), example
 
 
@@ -363,7 +363,7 @@ def test_the_default_size_is_the_one_published_as_the_page_says(format):
     assert kind.seen_split == kind.Settings().split
     fits = {
         name: size
-        for formats, size, _ in table("data.md", "| format | default size | published by |")
+        for formats, size, _ in table("docs/data.md", "| format | default size | published by |")
         for name in formats.split(", ")
     }
     size = fits.get(format, fits["others"])
