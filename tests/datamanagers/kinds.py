@@ -1,4 +1,7 @@
-"""Every layout that is read, and forms of it: where its files are, and ways to damage them."""
+"""Every layout that is read, and forms of it: where its files are, and the faults that can befall a folder.
+
+A fault is the damage and what is said of it: a message names the file, what was seen in it and what would be right.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import json
 import re
 import shutil
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -303,3 +306,525 @@ def change_binary_pose(place: int, change: Callable[[np.ndarray], np.ndarray]) -
         path.write_bytes(bytes(data))
 
     return spoil
+
+
+# Faults
+
+#: Kinds by what they have in common: poses of sixteen numbers a line or in frames of a JSON file, TUM's trajectory and
+#: whether line n of it belongs to image n, a camera.json, EndoGSLAM's result, and depth for every image of a number.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "all": tuple(KINDS),
+    "matrices": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam"),
+    "json": ("rotatecolon", "nerfstudio", "reim-nerf"),
+    "tum": ("rgbd", "rgbd-by-order", "endomapper"),
+    "by-order": ("rgbd-by-order", "endomapper"),
+    "camera.json": ("c3vd", "rgbd", "rgbd-by-order"),
+    "both-colmap": ("colmap", "colmap-text"),
+    "params": ("c3vd-endogslam", "pr-endo"),
+    "paired": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "pr-endo"),
+    "depth": tuple(name for name, kind in KINDS.items() if kind.depths),
+    "depth-16": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "endomapper", "nerfstudio", "rgbd", "reim-nerf"),
+}
+RUBBISH = bytes(range(256))
+
+
+def image_name(name: str, place: int) -> str:
+    """What the image of a place is called, as a pattern."""
+    if name == "rgbd":
+        return f"{1_305_031_102 + place / 30:.6f}"
+    return f"frame_{place + 1:05d}" if name == "nerfstudio" else rf"0*{place}(_color|_depth)?"
+
+
+def expanded(table: str, damages: Mapping[str, Callable[[Kind], Spoil]]) -> dict[tuple[str, str], tuple[Spoil, str]]:
+    """Damage and pattern by fault and kind.
+
+    Behind or below each fault stand the kinds that it befalls, or their groups, and the pattern of the message. In it,
+    ``<3>`` is the name of image 3, ``<size>`` the file that says how large images are and ``<poses>`` the pose file.
+    """
+    result, fault = {}, ""
+    for line in table.splitlines():
+        if not line.startswith(" "):
+            fault = line.partition(" | ")[0]
+        groups, _, message = line.removeprefix(f"{fault} | ").removeprefix(fault).strip().partition(": ")
+        for name in [name for group in filter(None, groups.split(", ")) for name in GROUPS.get(group, (group,))]:
+            kind = KINDS[name]
+            pattern = message.replace("<size>", kind.size or r"<0>\.png").replace("<poses>", kind.poses)
+            pattern = re.sub(r"<(\d)>", lambda match, name=name: image_name(name, int(match[1])), pattern)
+            result[fault, name] = damages[fault](kind), pattern
+    return result
+
+
+def doubled(*keys: str) -> Callable[[dict], None]:
+    return lambda content: content.update({key: 2 * content[key] for key in keys if key in content})
+
+
+TWICE = ("fx", "fy", "cx", "cy", "fl_x", "fl_y")
+TURNED = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def scaled(factor: float, *place: int | slice) -> Callable[[np.ndarray], None]:
+    """Multiply a part of a matrix, in place: 2 leaves no rotation, -1 of one axis a left-handed one."""
+
+    def change(matrix: np.ndarray) -> None:
+        matrix[place] *= factor
+
+    return change
+
+
+MIRROR = scaled(-1.0, slice(3), 0)
+
+
+def one_pose(matrix: Callable[[np.ndarray], None], factor: float) -> Callable[[Kind], Spoil]:
+    """Change a matrix, in place, or, where poses are quaternions, multiply one."""
+
+    def damage(kind: Kind) -> Spoil:
+        if kind.format in GROUPS["json"]:
+            return change_frame(kind.poses, 1, matrix)
+        if kind.format in ("rgbd", "endomapper"):
+            return change_row(kind.poses, 3, 4, lambda quaternion: factor * quaternion)
+        if kind is KINDS["colmap-text"]:
+            return change_row(kind.poses, 6, 1, lambda quaternion: factor * quaternion)
+        if kind is KINDS["colmap"]:
+            return change_binary_pose(3, lambda values: factor * values)
+        if matrix is MIRROR and kind is not KINDS["c3vd-raw-old"]:
+            return change_matrices(lambda matrices: MIRROR(matrices[3].T), kind.poses)
+        return change_matrices(lambda matrices: matrix(matrices[3]), kind.poses)
+
+    return damage
+
+
+def result(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Kind], Spoil]:
+    """Change the arrays of EndoGSLAM's result."""
+    return lambda kind: change_npz(kind.params, change)
+
+
+def cameras(change: Callable[[pycolmap.Camera], object]) -> Callable[[pycolmap.Reconstruction], None]:
+    return lambda model: [change(camera) for camera in model.cameras.values()] and None
+
+
+def unregistered(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A model of which no image was registered."""
+    empty = pycolmap.Reconstruction()
+    for camera in model.cameras.values():
+        empty.add_camera_with_trivial_rig(camera)
+    return empty
+
+
+def shorten(arrays: dict[str, np.ndarray]) -> None:
+    """EndoGSLAM's result without its last frames."""
+    arrays |= {key: arrays[key][..., :-2] for key in ("cam_unnorm_rots", "cam_trans")}
+    arrays["gt_w2c_all_frames"] = arrays["gt_w2c_all_frames"][:-2]
+
+
+def confident(spoil: Callable[[int, dict], object] = lambda index, frame: None, dtype: str = "uint8") -> Spoil:
+    """Every frame of nerfstudio's gets a confidence, then the frames are spoilt."""
+
+    def change(folder: Path) -> None:
+        def add(index: int, frame: dict) -> None:
+            frame["confidence_file_path"] = frame["depth_file_path"].replace("depth/", "confidence/")
+            pixels = np.zeros((32, 40), dtype if index == 2 else "uint8")
+            (folder / "confidence").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / frame["confidence_file_path"]), pixels)
+            spoil(index, frame)
+
+        change_frames("transforms.json", add)(folder)
+
+    return change
+
+
+def fourth_without(key: str) -> Callable[[int, dict], object]:
+    return lambda index, frame: index == 3 and frame.pop(key)
+
+
+def frame(place: int, pattern: str, **values: object) -> Spoil:
+    """Set keys of a frame."""
+    return change_frames(pattern, lambda index, entry: entry.update(values) if index == place else None)
+
+
+#: Intrinsics, with the sizes of their images, of twice the resolution.
+_TWICE_RESOLVED = {
+    "c3vd-v2": edit("camera_intrinsics.txt", "cx = 677", "cx = 338"),
+    "c3vd-endogslam": change_npz("params.npz", lambda arrays: scaled(2.0, slice(2))(arrays["intrinsics"])),
+    "rotatecolon": change_json("transforms.json", camera_angle_x=80.0),
+    "colmap": change_model(cameras(lambda camera: camera.rescale(2.0))),
+    "endomapper": edit("calibration.xml", "> 40 <", "> 80 <"),
+}
+#: Other files than images and poses.
+_OTHER = {
+    "colmap": "sparse/0/points3D.bin",
+    "rotatecolon": "init_point_cloud.ply",
+    "reim-nerf": "rgb_mask.png",
+    "c3vd": "rotation/camera_pose.txt",
+    "c3vd-v2": "rotation/rgb/*.png",
+    "c3vd-endogslam": "rotation/pose.txt",
+}
+_CAMERAS = {"c3vd-v2": "camera_intrinsics.txt", "colmap": "sparse/0/cameras.bin"}
+
+#: Faults that can befall several layouts.
+DAMAGES: dict[str, Callable[[Kind], Spoil]] = {
+    "an image of another size": lambda k: repaint(k.images, 4, half_size),
+    "the first image of another size": lambda k: repaint(k.images, 0, half_size),
+    "depth of another size": lambda k: repaint(k.depths, 0, half_size),
+    "an image cut short": lambda k: cut(k.images, 4),
+    "an empty image": lambda k: cut(k.images, 4, 0.0),
+    "an image of one channel": lambda k: repaint(k.images, 4, lambda pixels: pixels[..., 0].copy()),
+    "depth cut short": lambda k: cut(k.depths, 5),
+    "depth of three channels": lambda k: repaint(k.depths, 5, three_channels),
+    "depth of 8 bits": lambda k: repaint(k.depths, 5, lambda depth: (depth // 256).astype(np.uint8)),
+    "depth of 16 bits": lambda k: repaint(k.depths, 5, lambda depth: depth.astype(np.uint16)),
+    "depth missing for a frame": lambda k: remove(k.depths, 3),
+    "no depth and no points": lambda k: remove(k.depths),
+    "an empty folder": lambda k: clear,
+    "no images": lambda k: remove(k.images),
+    "an image that is gone": lambda k: remove(k.images, 3),
+    "two images of one number": lambda k: lambda folder: copy(k.images, f"00{files(folder, k.images)[0].name}")(folder),
+    "numbers from one on": lambda k: renumber(k.images, k.depths, change=lambda number: number + 1),
+    "no pose file": lambda k: remove(k.poses),
+    "fewer poses than images": lambda k: change_lines(k.poses, lambda rows: rows[:-1]),
+    "a shorter result": result(shorten),
+    "more poses than images": lambda k: change_lines(k.poses, lambda rows: [*rows, rows[-1]]),
+    "more frames than images": lambda k: change_json(
+        k.poses, lambda content: content["frames"].append({**content["frames"][-1], "file_path": "images/99"})
+    ),
+    "no poses": lambda k: write(k.poses, ""),
+    "no frames": lambda k: change_json(k.poses, frames=[]),
+    # The last observation of COLMAP's text loses its point; cut between two, the file is a whole one of fewer images.
+    "poses cut short": lambda k: (
+        edit(k.poses, r" \S+\s*\Z", "") if "sparse" in k.poses else cut(k.poses or "sparse/0/images.bin")
+    ),
+    "a result cut short": lambda k: cut(k.params, share=0.3),
+    "poses of something else": lambda k: write(k.poses, RUBBISH),
+    "poses of another format": lambda k: write(k.poses, "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n"),
+    "a result of something else": lambda k: write(k.params, "PK nonsense"),
+    "a number that is none": one_pose(scaled(np.nan, 0, 0), np.nan),
+    "a result of no numbers": result(lambda arrays: arrays.update(cam_trans=arrays["cam_trans"] * np.nan)),
+    "a word for a pose": lambda k: change_lines(k.poses, lambda rows: [*rows[:2], "none", *rows[3:]]),
+    "no matrix": lambda k: change_json(k.poses, lambda content: content["frames"][1].pop("transform_matrix")),
+    "a rotation that is none": one_pose(scaled(2.0, slice(3), slice(3)), 2.0),
+    "a quaternion of length 0": one_pose(MIRROR, 0.0),
+    "a result of no rotation": result(lambda arrays: arrays["cam_unnorm_rots"][..., 3].fill(0.0)),
+    "a left-handed pose": one_pose(MIRROR, 0.0),
+    "a left-handed result": result(lambda arrays: MIRROR(arrays["gt_w2c_all_frames"][3])),
+    "intrinsics of another resolution": lambda k: _TWICE_RESOLVED.get(
+        k.format, change_json(k.size.replace("train", "*"), doubled(*TWICE, "w", "h"))
+    ),
+    "no camera file": lambda k: remove(k.size),
+    "a camera cut short": lambda k: cut(_CAMERAS.get(k.format, k.size)),
+    "a crop": lambda k: repaint(k.images, 0, lambda pixels: pixels[:30, :30].copy()),
+    "another file cut short": lambda k: cut(_OTHER[k.format]),
+    "a model without points": lambda k: change_lines("sparse/0/points3D.txt", lambda rows: rows[:100]),
+    "a model without images": lambda k: change_model(unregistered),
+    "no folder of images": lambda k: lambda folder: shutil.rmtree(folder / "images"),
+    "no depth scale": lambda k: (
+        change_json(k.size, depth_scale=None) if k.format == "rgbd" else edit(k.size, "<depth_.*", "")
+    ),
+}
+SAID = r"""
+an image of another size | all: <4>\.png is 20 x 16, but \S*<size> says 40 x 32.*of one size
+the first image of another size | all: (20 x 16.*40 x 32|40 x 32.*20 x 16)
+depth of another size | depth: <0>\.(png|tiff|exr) is 20 x 16, but \S*<size> says 40 x 32
+an image cut short | all: <4>\.png \(\d+ bytes\) cannot be decoded.*a complete image
+an empty image | all: <4>\.png \(0 bytes\) cannot be decoded
+an image of one channel | all: <4>\.png is an image of 1 channel of uint8
+depth cut short | depth: <5>\.(png|tiff|exr) \(\d+ bytes\) cannot be decoded.*complete
+depth of three channels
+  params, depth-16: <5>\.(png|tiff) is an image of 3 channels of uint(8|16).*one-channel (8|16)-bit
+depth of 8 bits | depth-16: <5>\.(png|tiff) is an image of 1 channel of uint8
+depth of 16 bits | params: <5>\.tiff is an image of 1 channel of uint16
+depth missing for a frame
+  paired, by-order: 11 images and 10 depth files; frame 3 has only one of the two.*for every image
+  rotatecolon: depth_train has 10 depth files for 11 frames; frame 3 has none.*for every image
+  nerfstudio: transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png
+  reim-nerf: names \S*distmaps/0003_color\.png, which does not exist
+no depth and no points
+  c3vd, c3vd-raw, c3vd-v2, tum: neither depth files nor points3D\.ply.*points3D\.ply \(world of the poses\)
+an empty folder | all: (holds nothing|holds no COLMAP model|no file .*transforms.json).*Expected
+no images | all: (holds nothing|holds 0000_depth|have no image|are not in|has no image|does not exist).*Expected
+an image that is gone
+  paired: has 10 images, numbers 0 to 10, but none is 3.*without gaps
+  rotatecolon: transforms\.json: frame 3 has no image \S*0003\.png
+  both-colmap: 1 of the 11 images of \S*sparse/0 are not in \S*images: 0003\.png
+  nerfstudio: transforms\.json: 1 of 11 frames have no image in .*images/frame_00004\.png
+  by-order: <poses> has 11 poses for 10 images
+  reim-nerf: names \S*images/0003_color\.png, which does not exist
+two images of one number | c3vd, c3vd-raw-old, c3vd-v2, c3vd-endogslam, by-order: have the same number
+numbers from one on | c3vd, c3vd-v2: numbers 1 to 11, but none is 0
+no pose file
+  c3vd, c3vd-raw, c3vd-v2: has images but no <poses>
+  c3vd-endogslam: no pose.txt
+  tum: has images but no groundtruth\.txt or poses\.txt
+  reim-nerf: Add transforms_train\.json
+fewer poses than images | matrices, by-order: <poses> has 10 poses for 11 images.*a pose for every image
+a shorter result | params: params\.npz has [89] poses for 11 images.*Expected 11
+more poses than images | matrices, by-order: <poses> has 12 poses for 11 images.*a pose for every image
+more frames than images
+  json: <poses>(: frame 99 has no image| names \S*images/99|: 1 of 12 frames have no image).*Expected
+no poses
+  matrices, tum, colmap-text: <poses> holds no poses.*Expected
+  json: <poses> is not JSON.*Expected
+no frames | json: <poses> has no frames
+poses cut short
+  matrices, tum: <poses>, line \d+: '.*'.*\d+ finite numbers
+  json: <poses> is not JSON: .* line \d+.*Expected
+  colmap-text: images\.txt, line \d+: .*Expected X Y POINT3D_ID of each point
+  colmap: images\.bin \(\d+ bytes\) is damaged or cut short
+a result cut short | params: cannot read \S*params\.npz.*written by EndoGSLAM
+poses of something else | matrices, tum, json, colmap-text: cannot read \S*<poses>.*Expected
+poses of another format | tum: <poses>, line 1: '1,0,0,0
+a result of something else | params: cannot read \S*params\.npz
+a number that is none
+  matrices: <poses>, line 4: 'nan,.*16 finite numbers
+  json: <poses>, frame 1 \(.*\): transform_matrix.*rows of 4 finite numbers
+  tum: <poses>, line \d+: '.*8 finite numbers
+  colmap-text: images\.txt, line \d+: '4 nan.*all finite
+  colmap: images\.bin, image \d+ .*its pose is nan
+a result of no numbers | params: params\.npz: cam_trans holds numbers that are not finite
+a word for a pose | matrices: <poses>, line 3: 'none'
+no matrix | json: <poses>, frame 1 \(.*\): transform_matrix
+a rotation that is none
+  matrices: <poses>, line 4: not a rigid transform \(R\^T R is 3.*within 0\.001
+  json: <poses>, frame 1 \(.*\): not a rigid transform \(R\^T R is 3.*within 0\.001
+  tum, colmap-text: <poses>, line \d+: a quaternion of length 2.*length 1
+  colmap: images\.bin, image 4 \(0003\.png\): a quaternion of length 2.*length 1
+a quaternion of length 0 | colmap-text: is not a rotation
+a result of no rotation
+  params: params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is not a rotation
+a left-handed pose
+  matrices: <poses>, line 4: a left-handed transform \(det R = -1\).*x right, y down, z forward
+  json: <poses>, frame 1 \(.*\): a left-handed transform.*right-handed
+a left-handed result | params: params\.npz, gt_w2c_all_frames, frame 3: a left-handed transform.*right-handed
+intrinsics of another resolution
+  camera.json, nerfstudio, colmap: \.png is 40 x 32, but \S*<size> says 80 x 64
+  endomapper: 0000\.png is 40 x 32, but \S*calibration\.xml says 80 x 32
+  reim-nerf: rgb_mask\.png is 40 x 32.*80 x 64
+  c3vd-endogslam: params\.npz: the principal point .* is \d\d % of the image.*org_width
+  c3vd-v2: camera_intrinsics\.txt is ambiguous or implausible: a centre \(338\.739, 543\.058\) far
+  rotatecolon: transforms\.json: camera_angle_x is 80.*radians
+no camera file
+  c3vd: has images but no camera\.json
+  tum: but no camera\.json, intrinsics\.txt, cameras\.txt or calibration
+a camera cut short
+  endomapper: calibration\.xml is not XML: .*line \d+.*Restore
+  camera.json: camera\.json is not JSON: .* line.*JSON object
+  c3vd-v2: camera_intrinsics\.txt is ambiguous or implausible: no a3, a4
+  colmap: cameras\.bin \(\d+ bytes\) is damaged or cut short
+a crop | c3vd-raw, c3vd-v2: <0>\.png is 30 x 30.*undistorted layout
+another file cut short
+  colmap: points3D\.bin \(\d+ bytes\) is damaged or cut short
+  rotatecolon: init_point_cloud\.ply \(\d+ bytes\) cannot be read as PLY
+  reim-nerf: rgb_mask\.png \(\d+ bytes\) cannot be decoded
+  c3vd: rotation/camera_pose\.txt, line \d: '
+  c3vd-v2: rotation/rgb/0000\.png \(\d+ bytes\) cannot be decoded
+  c3vd-endogslam: rotation/pose\.txt, line \d: '
+a model without points | colmap-text: points3D\.txt has 97 points, but not \d+
+a model without images | colmap: images\.bin holds no poses.*at least one registered image
+no folder of images | colmap-text: no folder \S*images.*the images that the model was made from
+no depth scale | tum: their number of steps per unit.*5000 steps per metre.*depth_scale=5000
+"""
+
+_CLOUD = "../../C3VD_endogslam_optimized/phantom/point_cloud/iteration_30000/point_cloud"
+#: Faults of one layout: by kind, the damage and the pattern of the message.
+OWN: dict[str, list[tuple[Spoil, str]]] = {
+    "c3vd": [
+        (write("camera.json", "[]"), r"camera\.json has no fx, fy"),
+        (change_json("camera.json", fx=None, cy=None), r"camera\.json has no fx, cy"),
+        (change_json("camera.json", fx="wide"), r"camera\.json: .*'wide'"),
+        (change_json("camera.json", fy=0), r"camera\.json: .*above 0"),
+        (change_json("camera.json", w=64.5), "whole pixels"),
+        (renumber("images/*.png", change=lambda number: f"frame{number}"), "images holds frame0_color.png"),
+        (
+            lambda folder: copy("images/*.png", "x")(folder).rename(folder / "0000_color.png"),
+            r"holds both 0000_color\.png and images/",
+        ),
+        (remove("images/*.png", 10), "10 images and 11 depth files; frame 10"),
+        (copy("rotation/seen/*.png", "0007_seen.png"), r"0007_seen.png, but there are 2 frames"),
+        (remove("rotation/camera.json"), r"rotation has images but no camera\.json"),
+    ],
+    "c3vd-endogslam": [
+        (
+            change_matrices(lambda matrices: matrices[[*range(1, 11), 0]]),
+            r"params\.npz: the true pose of image \d+ is .* mm and .* degrees from that of .*pose\.txt",
+        ),
+        (change_npz("params.npz", lambda arrays: arrays.pop("means3D")), "no means3D"),
+        (change_npz("params.npz", lambda arrays: arrays.pop("org_width")), "no org_width"),
+        (
+            change_npz("params.npz", lambda arrays: arrays.update(org_width=np.array(800), org_height=np.array(540))),
+            r"0000_color\.png is 40 x 32, but .*params\.npz is for 800 x 540",
+        ),
+        (
+            remove("params.npz"),
+            r"data has no params.npz.*params_file=FILE, or --set datamanager.poses=ground-truth",
+        ),
+        (remove("pose.txt"), "rotation has images, but it has no pose.txt|C3VD's release there"),
+        (remove("rotation/pose.txt"), "rotation has images, but it has no pose.txt"),
+    ],
+    "pr-endo": [
+        (cut(f"{_CLOUD}.ply"), r"point_cloud\.ply \(\d+ bytes\) cannot be read as PLY"),
+        (
+            write(
+                f"{_CLOUD}.ply",
+                "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+                "end_header\n1 2 3\n",
+            ),
+            "vertices have x, y, z, but no f_dc_0, f_dc_1, f_dc_2",
+        ),
+    ],
+    "rotatecolon": [
+        (write("transforms.json", "{}"), r"transforms\.json has no frames"),
+        (change_json("transforms.json", camera_angle_x=None), "camera_angle_x is None"),
+        (change_json("transforms_test.json", camera_angle_x=80.0), r"transforms_test\.json: camera_angle_x is 80.0"),
+        (remove("test_views_1/*.png", 1), "frame 1 has no .*test_views_1"),
+        (frame(2, "transforms.json", file_path="r_2"), "file_path 'r_2'"),
+        (frame(2, "transforms.json", file_path="0001"), "frame 1 is repeated"),
+        (
+            lambda folder: (folder / "test_views_1").rename(folder / "test_views_2"),
+            r"transforms_test.json but no folder test_views_1.*datamanager.test_folder=",
+        ),
+        (
+            lambda folder: change_exr(
+                files(folder, "depth_train/*")[4],
+                lambda name, pixels: (name.replace("ViewLayer.Depth", "View Layer.Depth"), pixels),
+            ),
+            r"0004\.exr has the channels View Layer\.Depth\.Z, .*R.*a channel ViewLayer\.Depth\.Z.*depth_channel",
+        ),
+        *((cut("depth_train/*.exr", 0, share), r"0000\.exr \(\d+ bytes\) cannot be decoded") for share in (0.0, 0.98)),
+        (
+            lambda folder: [remove("init_point_cloud.ply")(folder), remove("depth_train/*")(folder)],
+            "neither depth files nor",
+        ),
+    ],
+    "rgbd": [
+        (lambda folder: shutil.rmtree(folder / "rgb"), r"data holds camera\.json, depth\.txt, depth/"),
+        (lambda folder: (folder / "images").mkdir(), "holds rgb/ and images/"),
+        (lambda folder: (folder / "depths").mkdir(), "holds depth/ and depths/"),
+        (
+            copy("groundtruth.txt", "slam_poses.txt"),
+            r"has the trajectories groundtruth\.txt, slam_poses\.txt.*--set datamanager\.trajectory=groundtruth\.txt",
+        ),
+        (
+            lambda folder: (folder / "rgb/1305031102.000000.png").rename(folder / "rgb/0.png"),
+            r"rgb/0\.png is not named by a timestamp",
+        ),
+        (copy("rgb/*.png", "1305031102.000000.jpg"), "1305031102.000000.* have the same timestamp"),
+        (
+            renumber("depth/*.png", change=lambda seconds: seconds + 100),
+            "no depth file within 0.02 of an image that has a pose",
+        ),
+        (
+            change_lines("groundtruth.txt", lambda rows: [row.replace("13050", "13060") for row in rows]),
+            r"no pose of .*groundtruth.txt is within 0.02 .*1305031102.000000 .*1306031102",
+        ),
+        *((change_json("camera.json", depth_scale=scale), "depth_scale") for scale in (0, -5.0, "5000", True)),
+        *(
+            (change_json("camera.json", depth_scale=scale), "depth reaches from .* scene units")
+            for scale in (1e-7, 1e-320, 1e300)
+        ),
+        (lambda folder: (folder / "confidence").mkdir(), r"confidence has no confidence for 1305031102\.\d+\.png"),
+    ],
+    "rgbd-by-order": [
+        (copy("rgb/*.png", "cover.png"), r"cover\.png: no number in its name"),
+        (
+            lambda folder: (
+                [remove("rgb/7.png")(folder), remove("depth/7.png")(folder)]
+                and change_lines("groundtruth.txt", lambda rows: [*rows[:5], *rows[6:]])(folder)
+            ),
+            r"pose 5 has timestamp 6, but image 5 is 5\.png",
+        ),
+        (
+            lambda folder: [shutil.copytree(folder / "depth", folder / "confidence"), shutil.rmtree(folder / "depth")],
+            "holds confidence/, but no depth",
+        ),
+    ],
+    "endomapper": [
+        (edit("calibration.xml", "_kb4", "_fov"), r"calibration\.xml: the camera model 'calibu_fu_fv_u0_v0_fov'"),
+        (
+            lambda folder: [
+                shutil.copy(folder / "calibration.xml", folder / "other.xml"),
+                edit("other.xml", "> 40 <", "> 41 <")(folder),
+            ],
+            r"calibration\.xml and other\.xml have different cameras",
+        ),
+        (remove("mask/*.png", 3), r"mask has no mask for 0003\.png"),
+    ],
+    "nerfstudio": [
+        (change_frames("transforms.json", fourth_without("depth_file_path")), "10 of 11 frames have a depth_file_path"),
+        (confident(fourth_without("confidence_file_path")), r"10 of 11 frames have a confidence_file_path; images/f"),
+        (confident(lambda index, entry: entry.pop("depth_file_path")), "confidence_file_path, but no depth_file_path"),
+        (confident(dtype="uint16"), r"confidence/frame_00003\.png is an image of 1 channel of uint16.*255 = 1"),
+        (change_json("transforms.json", camera_model="PANORAMA"), "camera_model is PANORAMA"),
+        (change_json("transforms.json", k4=0.1), "OPENCV with k4 = 0.1"),
+    ],
+    "reim-nerf": [
+        (remove("transforms_true_test.json"), r"has no transforms_true_test\.json.*choose another split"),
+        (write("transforms_val.json", "{"), r"transforms_val\.json is not JSON"),
+        (frame(1, "*_train.json", file_path=None), r"_train\.json, frame 1: no file_path"),
+        (
+            change_frame("transforms_test.json", 0, lambda matrix: matrix.__setitem__((0, 3), 0.5)),
+            r"_test\.json: pose or distance map of images/0000_color\.png differs",
+        ),
+        (
+            change_json("transforms_train.json", lambda content: content["frames"].append(content["frames"][0])),
+            r"_train\.json: 'images/0000_color\.png' is repeated",
+        ),
+        (change_json("*_val.json", scene_scale=0.5), r"_val\.json: scene_scale differs from transforms_train\.json"),
+        *(
+            (change_json("transforms_*.json", **{key: value}), message)
+            for key, value, message in (
+                ("scene_scale", None, r"_train\.json: scene_scale is None"),
+                ("scene_scale", 0.0, r"_train\.json: scene_scale is 0"),
+                ("distmap_scale", -1.0, r"_train\.json: distmap_scale is -1"),
+                ("scene_T", TURNED, r"_train\.json: scene_T is not a translation"),
+                ("scene_T", None, r"_train\.json: scene_T is not a translation"),
+                ("camera_model", "OPENCV", "camera_model 'OPENCV'.*FISHEYE_OPENCV"),
+                ("w", None, r"_train\.json: w is None"),
+                ("h", 51.5, r"h = 51\.5"),
+                ("fy", 0, r"_train\.json: .*above 0"),
+                ("p1", 0.01, r"_train\.json: p1 = 0.01"),
+            )
+        ),
+        (
+            change_frames(
+                "transforms_*.json",
+                lambda index, entry: entry.pop("distmap_path") if "0005" in entry["file_path"] else None,
+            ),
+            r"images/0005_color\.png has no distmap_path, but others have",
+        ),
+        (remove("rgb_mask.png"), r"no file .*rgb_mask\.png.*mask=false"),
+        (repaint("rgb_mask.png", 0, half_size), r"rgb_mask\.png is 20 x 16.*40 x 32"),
+        (
+            repaint("rgb_mask.png", 0, lambda mask: np.dstack([mask, mask // 2, mask])),
+            r"rgb_mask\.png is a colour image.*three equal ones",
+        ),
+    ],
+}
+REFUSED = expanded(SAID, DAMAGES) | {
+    (f"its own, {number}", name): row for name, rows in OWN.items() for number, row in enumerate(rows)
+}
+
+#: What may be a fault: the damage, and the pattern of the warning.
+DOUBTS: dict[str, Callable[[Kind], Spoil]] = {
+    "intrinsics of another resolution": lambda k: (
+        change_model(cameras(lambda camera: setattr(camera, "params", 2.0 * camera.params)))
+        if k.format == "colmap"
+        else change_json(k.size.replace("train", "*"), doubled(*TWICE))
+    ),
+    "an image without a pose": lambda k: (
+        lambda folder: copy(k.images, re.sub(r"\d+", "00099", files(folder, k.images)[0].name))(folder)
+    ),
+    "a pose less": lambda k: change_lines(k.poses, lambda rows: rows[:-1]),
+    "a depth file less": lambda k: remove(k.depths, 3),
+}
+WARNED = expanded(
+    r"""
+intrinsics of another resolution
+  c3vd, rgbd, colmap, nerfstudio, reim-nerf: <size>: the principal point is (4|5)\d% of the image \(40 x 32\) from its
+an image without a pose
+  rotatecolon: transforms\.json: 1 images of train_views have no pose and are left out
+  nerfstudio: transforms\.json: 1 images have no pose and are left out: frame_00099\.png
+  colmap: images\.bin: 1 images have no pose and are left out: 00099\.png
+  reim-nerf: 1 images have no pose and are left out: 00099_color\.png
+a pose less | rgbd: of 11 images 1 have no pose and 0 no depth within 0\.02 s
+a depth file less | rgbd: of 11 images 0 have no pose and 1 no depth within 0\.02 s
+""",
+    DOUBTS,
+)

@@ -431,12 +431,6 @@ def test_a_panorama_is_refused_by_name(tmp_path):
 # A real model, before and after COLMAP undistorted it
 
 
-def mean_by_point(errors: list[np.ndarray], numbers: list[np.ndarray]) -> float:
-    """The mean over points of their mean errors, as COLMAP has it."""
-    by_point = np.concatenate(numbers)
-    return (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
-
-
 @pytest.mark.parametrize("place", ["sparse", "distorted_sparse"])
 def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
     folder = shared_data / "colmap_23img" / place
@@ -445,34 +439,14 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
     for image, pose in zip(model.images, model.camera_to_world, strict=True):
         local = (model.positions[image.points] - pose[:3, 3]) @ pose[:3, :3]
         errors.append(np.linalg.norm(model.cameras[image.camera].project(local) - image.observed, axis=1))
-    mean = mean_by_point(errors, [image.points for image in model.images])
+    by_point = np.concatenate([image.points for image in model.images])
+    mean = (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
     reference = pycolmap.Reconstruction(str(folder))
     stored = reference.compute_mean_reprojection_error()
     reference.update_point_3d_errors()
     assert mean == pytest.approx(reference.compute_mean_reprojection_error(), rel=1e-9)
     if place == "distorted_sparse":  # the other model keeps the figure from before it was undistorted
         assert mean == pytest.approx(stored, rel=1e-9)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("place", "model"), [("sparse", "PINHOLE"), ("distorted_sparse", "SIMPLE_RADIAL")])
-def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_images(shared_data, place, model):
-    """As far from there as COLMAP says, in pixels of the stored image: scene cameras and views agree."""
-    folder = shared_data / "colmap_23img"
-    data = read_model(folder / place)
-    assert {lens.model for lens in data.cameras.values()} == {model}
-    errors = []
-    for shot, image in zip(opened(folder, model=place).shots, data.images, strict=True):
-        camera = shot.rectification.camera(shot.camera_to_world).to(dtype=torch.float64)
-        found, depth = camera.project(torch.from_numpy(data.positions[image.points]))
-        assert (depth > 0).all()
-        k, lens = shot.rectification.pinhole, data.cameras[image.camera]
-        seen = lens.unproject(image.observed)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy)
-        errors.append(lens.pinhole.fx / k.fx * np.linalg.norm(found.numpy() - seen, axis=1))
-    reference = pycolmap.Reconstruction(str(folder / place))
-    reference.update_point_3d_errors()
-    mean = mean_by_point(errors, [image.points for image in data.images])
-    assert mean == pytest.approx(reference.compute_mean_reprojection_error(), abs=0.01)
 
 
 @pytest.mark.thorough

@@ -17,9 +17,11 @@ from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recognition import find_format, formats, recognised
-from tests.datamanagers.faults import GROUPS, REFUSED, WARNED
 from tests.datamanagers.kinds import (
+    GROUPS,
     KINDS,
+    REFUSED,
+    WARNED,
     Spoil,
     change_frames,
     change_json,

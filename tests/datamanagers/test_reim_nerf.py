@@ -39,7 +39,7 @@ def cosines() -> np.ndarray:
 
 
 def step(folder: Path) -> float:
-    """mm a step along the ray."""
+    """Mm a step along the ray."""
     content = content_of(folder)
     return content["distmap_scale"] / 65535 / content["scene_scale"]
 

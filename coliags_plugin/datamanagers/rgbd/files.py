@@ -14,12 +14,13 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.core.text_files import read_text, text_lines
+from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
+from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.colmap import read_pinholes
 from coliags_plugin.geometry.poses.formats import shortened
@@ -144,26 +145,10 @@ def find_mesh(folder: Path) -> Path | None:
     return meshes[0] if len(meshes) == 1 else None
 
 
-def read_obj_points(path: Path) -> PointCloud:
-    """Read the vertices of an OBJ file, and their colours (0 to 1 behind the position) if all have one."""
-    rows: list[list[float]] = []
-    for row_number, line in text_lines(path, "an OBJ file"):
-        if not line.startswith("v "):
-            continue
-        try:
-            row = [float(word) for word in line.split()[1:]]
-        except ValueError:
-            row = []
-        if len(row) not in (3, 6) or (rows and len(row) != len(rows[0])):
-            raise InputError(
-                f"{path}, line {row_number}: '{shortened(line)}'", "v x y z, or v x y z r g b in every line"
-            )
-        rows.append(row)
-    values = np.array(rows).reshape(len(rows), -1)
-    colors = None
-    if values.shape[1] == 6:
-        colors = torch.from_numpy(np.rint(np.clip(values[:, 3:], 0.0, 1.0) * 255.0).astype(np.uint8))
-    return PointCloud(torch.from_numpy(values[:, :3].astype(np.float32).reshape(-1, 3)), colors)
+def read_mesh_points(path: Path) -> PointCloud:
+    """The vertices of a mesh, and their colours if all have one."""
+    mesh = read_mesh(path)
+    return PointCloud(torch.from_numpy(mesh.vertices), None if mesh.colors is None else torch.from_numpy(mesh.colors))
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:

@@ -152,7 +152,7 @@ class RGBDDataManager(RecordedDataManager):
             ),
             own_points=None
             if points is None
-            else partial(files.read_obj_points if points.suffix == ".obj" else load_points, points),
+            else partial(files.read_mesh_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
         )
 

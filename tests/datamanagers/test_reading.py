@@ -1,0 +1,205 @@
+"""Reading of images, files that others name, and initial points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.fusion import fuse_depth, read_points
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.files import named_file
+from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
+
+# Images
+
+
+def test_colour_order_and_alpha(tmp_path):
+    bgra = np.zeros((2, 3, 4), np.uint8)
+    bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 99
+    for name, pixels in (("a.png", bgra), ("b.png", bgra[..., :3])):
+        cv2.imwrite(str(tmp_path / name), pixels)
+        np.testing.assert_array_equal(read_rgb(tmp_path / name)[0, 0], [30, 0, 10])
+
+
+@pytest.mark.parametrize(
+    ("reader", "pixels", "message"),
+    [
+        (read_rgb, np.zeros((4, 4), np.uint8), "1 channel of uint8.*8-bit RGB"),
+        (read_rgb, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
+        (read_rgb, None, "cannot read"),
+        (C3VD_DEPTH.read, np.zeros((4, 4), np.uint8), "1 channel of uint8.*16-bit"),
+        (C3VD_DEPTH.read, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
+        (read_mask, np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "a colour image.*three equal ones"),
+        (read_mask, np.zeros((4, 4), np.uint16), "1 channel of uint16.*8-bit mask"),
+    ],
+)
+def test_the_wrong_kind_of_image(tmp_path, reader, pixels, message):
+    if pixels is not None:
+        cv2.imwrite(str(tmp_path / "x.png"), pixels)
+    with pytest.raises(InputError, match=message):
+        reader(tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".jpg"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+def test_half_a_file_is_refused_by_name(tmp_path, suffix, share):
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
+    data = cv2.imencode(suffix, pixels)[1].tobytes()
+    path = tmp_path / f"0003_color{suffix}"
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=r"0003_color.*cannot be decoded.*cut short"):
+        read_mask(path)
+
+
+def test_shrinking_averages_and_growing_interpolates():
+    image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    small = resize_rgb(image, 6, 4)
+    np.testing.assert_allclose(small, image.reshape(4, 2, 6, 2, 3).mean(axis=(1, 3)), atol=0.51)
+    assert resize_rgb(image, 12, 8) is image
+    ramp = np.arange(0, 240, 20, dtype=np.uint8)[None, :, None].repeat(4, 0).repeat(3, 2)
+    grown = resize_rgb(ramp, 24, 4)[0, 1:-1, 0].astype(int)
+    np.testing.assert_allclose(np.diff(grown), 10, atol=1)
+
+
+@pytest.mark.parametrize("size", [(4, 3), (12, 8), (16, 16)])
+def test_nearest_takes_the_pixel_under_the_centre(size):
+    values = np.arange(96, dtype=np.uint16).reshape(8, 12)
+    reference = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    result = resize_nearest(values, *size)
+    assert result.dtype == np.uint16
+    np.testing.assert_array_equal(result, reference)
+
+
+def test_sizes_fit_the_papers_and_nothing_is_enlarged():
+    assert fitted(800, 800, PAPER_SIZE) == (270, 270)
+    assert fitted(3000, 10, PAPER_SIZE) == (338, 1)
+    assert fitted(3000, 10, None) == (3000, 10)
+
+
+# Names of files
+
+
+@pytest.mark.parametrize("name", ["a.png", "images/a.png", "images/../a.png", "./a.png", "", "..png"])
+def test_names_within(tmp_path, name):
+    assert named_file(tmp_path, name, "x.json", outside=False) == tmp_path / name
+
+
+@pytest.mark.parametrize("name", ["../a.png", "images/../../a.png", "/etc/hostname", ".."])
+def test_names_outside(tmp_path, name):
+    with pytest.raises(InputError, match=r"x\.json names .* outside of .*outside_files=true"):
+        named_file(tmp_path, name, "x.json", outside=False)
+    assert named_file(tmp_path, name, "x.json", outside=True) == tmp_path / name
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300, "a/" * 3000])
+def test_names_that_no_file_can_have(tmp_path, name):
+    with pytest.raises(InputError, match=r"x\.json names .*Expected the name of a file"):
+        named_file(tmp_path, name, "x.json", outside=False)
+
+
+def test_an_absolute_path_into_the_folder(tmp_path):
+    assert named_file(tmp_path, str(tmp_path / "a.png"), "x.json", outside=False) == tmp_path / "a.png"
+
+
+# Initial points
+
+
+def frame(depth, index=0, mask=None):
+    height, width = depth.shape
+    c2w = torch.eye(4)
+    c2w[:3, 3] = torch.tensor([5.0, -3.0, float(index)])
+    camera = Camera(9.0, 7.0, 2.25, 4.5, width, height, c2w)
+    image = torch.arange(height * width * 3).remainder(256).to(torch.uint8).reshape(height, width, 3)
+    return Frame(f"{index:04d}", index, image, camera, torch.as_tensor(depth, dtype=torch.float32), mask)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def test_all_pixels_are_taken_where_there_are_few_and_the_true_centre_is_used():
+    depth = torch.rand(6, 5) * 10 + 3
+    view = frame(depth)
+    points = fuse_depth([view], 1000, rng())
+    torch.testing.assert_close(points.positions, view.camera.unproject(view.depth).reshape(-1, 3))
+    torch.testing.assert_close(points.colors, view.image.reshape(-1, 3))
+    pixels, z = view.camera.project(points.positions)
+    torch.testing.assert_close(pixels[7], torch.tensor([2.5, 1.5]))
+    torch.testing.assert_close(z, depth.ravel())
+
+
+def test_unknown_depth_and_masked_pixels_are_left_out():
+    depth = torch.full((6, 5), 4.0)
+    depth[0] = torch.nan
+    mask = torch.ones(6, 5, dtype=torch.bool)
+    mask[:, 0] = False
+    assert len(fuse_depth([frame(depth, mask=mask)], 1000, rng())) == 5 * 4
+
+
+def test_a_draw_is_without_replacement_repeatable_and_fair():
+    near, far = torch.full((40, 50), 5.0), torch.full((40, 50), 9.0)
+    far[:20] = torch.nan
+    frames = [frame(near, 0), frame(far, 1)]
+    points = fuse_depth(frames, 1500, rng())
+    assert len(points) == 1500
+    assert len(torch.unique(points.positions, dim=0)) == 1500
+    again, other = fuse_depth(frames, 1500, rng()), fuse_depth(frames, 1500, rng(1))
+    assert torch.equal(points.positions, again.positions)
+    assert not torch.equal(points.positions, other.positions)
+    # 2000 and 1000 pixels: hypergeometric, standard deviation 13.
+    share = int((points.positions[:, 2] < 7).sum())
+    assert abs(share - 1000) < 60
+
+
+def test_no_valid_depth_at_all():
+    with pytest.raises(InputError, match="none of the 1 training frames has a valid depth"):
+        fuse_depth([frame(torch.full((3, 3), torch.nan))], 10, rng())
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_npz(tmp_path, colored):
+    positions = np.arange(30.0).reshape(10, 3)
+    colors = {"colors": np.arange(30, dtype=np.uint8).reshape(10, 3)} if colored else {}
+    np.savez(tmp_path / "p.npz", positions=positions, **colors)
+    points = read_points(tmp_path / "p.npz", 100, rng())
+    np.testing.assert_array_equal(points.positions, positions)
+    assert (points.colors is not None) == colored
+    assert len(read_points(tmp_path / "p.npz", 4, rng())) == 4
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
+    positions = np.ones((4, 3))
+    positions[2, 1] = np.nan
+    np.savez(tmp_path / "p.npz", positions=positions)
+    assert len(read_points(tmp_path / "p.npz", 100, rng())) == 3
+    assert "1 of 4 points" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.ply", None, "no file"),
+        ("bad.ply", "not a ply", "cannot be read as PLY"),
+        ("bad.npz", "not an npz", "cannot read"),
+        ("other.npz", {"xyz": np.ones((2, 3))}, "positions"),
+        ("flat.npz", {"positions": np.ones((2, 2))}, "shape"),
+        ("words.npz", {"positions": np.full((2, 3), "a")}, "numbers"),
+        ("float.npz", {"positions": np.ones((2, 3)), "colors": np.ones((2, 3))}, "uint8"),
+        ("nan.npz", {"positions": np.full((2, 3), np.nan)}, "holds no points"),
+        ("p.obj", "v 0 0 0", "neither"),
+    ],
+)
+def test_files_that_hold_no_points(tmp_path, name, content, message):
+    if isinstance(content, dict):
+        np.savez(tmp_path / name, **content)
+    elif content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_points(tmp_path / name, 10, rng())
