@@ -193,6 +193,7 @@ def test_unmistakable_lens_files(tmp_path, text):
         (as_text(a1=0.5), "a1 = 0.5"),
         (as_text(c=0.0, d=1.0), "c, d, e = 0, 1, 0"),
         (as_text(width=1350.5), "1350.5 x 1080 pixels"),
+        (as_text(width=0.2), "an image of 0.2 x 1080"),
         (as_text(a3=float("inf")), "no a3"),
     ],
 )

@@ -39,7 +39,7 @@ def cosines() -> np.ndarray:
 
 
 def step(folder: Path) -> float:
-    """Mm a step along the ray."""
+    """Length of a step along the ray, mm."""
     content = content_of(folder)
     return content["distmap_scale"] / 65535 / content["scene_scale"]
 

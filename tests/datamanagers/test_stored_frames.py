@@ -18,7 +18,7 @@ from coliags_plugin.datamanagers import stored_frames
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
-from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names
+from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
 
 
 @pytest.fixture
@@ -54,6 +54,8 @@ def load(folder: Path, **options) -> Scene:
 def test_a_frame_reads_nothing_until_asked_and_then_once(folder, reads):
     frame = frame_of(folder, 3)
     assert (frame.name, frame.camera.width) == ("0003_color", WIDTH) and "0003_color.png" in repr(frame)
+    pose = frame.scaled(2.0).shot.camera_to_world
+    np.testing.assert_allclose(pose[:3, 3], 2.0 * poses(FRAMES)[3][:3, 3], rtol=1e-6)
     assert reads == []
     for _ in range(3):
         assert frame.image.shape == (HEIGHT, WIDTH, 3)
