@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from coliags_plugin.cli import arguments
-from coliags_plugin.cli.summaries import print_summary, view_command
+from coliags_plugin.cli.summaries import coliags, print_summary, view_command
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -159,5 +159,6 @@ class ReconstructCommand:
             "\n".join(lines),
             {"segments": stages, "joins": [each.model_dump(mode="json") for each in made.procedure.joins]},
             written=[self.output / PAGE_FILE],
+            then=[coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")],
             as_json=self.json,
         )

@@ -219,4 +219,10 @@ TARGETS: dict[str, Target] = {
     "prior": Target("depth-maps", ("npy/*", "png/*"), _prior),
     "video": Target("video", ("*",), _video),
     "procedure-page": Target("procedure", _PROCEDURE, write_procedure_page, True),
+    "procedure-export": Target(
+        "procedure",
+        ("*.json", "*/*/*.json", "*/poses/sparse/0/*"),
+        lambda folder: _command("poses", "export", folder, "--output", folder.with_name("exported"), "--overwrite"),
+        True,
+    ),
 }

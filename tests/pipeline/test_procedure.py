@@ -253,6 +253,9 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
         (out / "index.html").unlink()
     assert executor.tasks == []
     assert "shows why" in commands.refused(capsys, *argv, "--set", "least_submap=20"), "nothing is made with others"
+    assert "has no sub-map with poses" in commands.refused(
+        capsys, "poses", "export", out, "--output", tmp_path / "atlas"
+    )
 
 
 @pytest.mark.thorough

@@ -1,0 +1,100 @@
+"""The export of a procedure's sub-maps: what is written can be read back, and is what lies in the segments."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coliags_plugin.cli import main
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.geometry.poses import colmap, tum
+from coliags_plugin.pipeline.procedure.export import export_atlas
+from tests.pipeline.procedures import RATE, SUBMAPS, procedure_content, similarity
+
+
+def test_every_sub_map_is_exported_with_its_trajectory(out, tmp_path):
+    manifest = export_atlas(out, tmp_path / "export")
+    assert json.loads((tmp_path / "export" / "manifest.json").read_text()) == manifest
+    assert {one["name"]: one["frames"] for one in manifest["submaps"]} == {
+        name: [*own] for name, own in SUBMAPS.items()
+    }
+    assert (manifest["source"], manifest["rate"], manifest["timestamps"]) == (["withdrawal.mp4"], RATE, "s")
+    for one in manifest["submaps"]:
+        segment, number = one["name"].split("/")
+        own = tmp_path / "export" / one["folder"]
+        assert one["folder"] == f"{segment}-{number}"
+        path, model = tum.read(own / "trajectory.txt"), colmap.read(out / segment / "poses" / "sparse" / number)
+        np.testing.assert_array_equal(path.timestamps, np.array(one["frames"]) / RATE)
+        np.testing.assert_allclose(path.camera_to_world, model.camera_to_world, atol=1e-9)
+        scene = open_scene(own / "colmap", "colmap", ["initial_points=none"])
+        assert len(scene.video) == len(one["frames"]) == len(list((own / "colmap" / "images").iterdir()))
+        assert one["nerfstudio"] == (number != "2") == (own / "nerfstudio" / "transforms.json").is_file()
+
+
+def test_joined_sub_maps_have_the_transform_to_the_first_one(out, tmp_path):
+    manifest = export_atlas(out, tmp_path / "export")
+    by_name = {one["name"]: one for one in manifest["submaps"]}
+    joined = {name for name, one in by_name.items() if one["joined_to"] != name}
+    assert joined == {"segment-001/0"}
+    assert by_name["segment-001/0"]["joined_to"] == "segment-000/2"
+    np.testing.assert_allclose(by_name["segment-001/0"]["to_joined"], similarity(1))
+    np.testing.assert_array_equal(by_name["segment-000/2"]["to_joined"], np.eye(4))
+    assert [one["reason"] for one in manifest["joins"]] == ["", "12 frames between them"]
+
+
+def test_timestamps_are_frame_numbers_where_the_rate_is_unknown(out, tmp_path):
+    write_json(out / "procedure.json", procedure_content(rate=None))
+    assert export_atlas(out, tmp_path / "export")["timestamps"] == "frame number"
+    assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
+
+
+@pytest.mark.parametrize(("link", "other_disk"), [(False, False), (True, False), (True, True)])
+def test_linked_images_take_no_space_on_the_same_disk(out, tmp_path, monkeypatch, link, other_disk):
+    def refused(*_):
+        raise OSError(18, "Invalid cross-device link")
+
+    if other_disk:
+        monkeypatch.setattr("os.link", refused)
+    export_atlas(out, tmp_path / "export", link=link)
+    for file, is_linked in (("images/003.png", link and not other_disk), ("sparse/0/images.bin", False)):
+        one, other = out / "segment-000/poses" / file, tmp_path / "export/segment-000-0/colmap" / file
+        assert one.read_bytes() == other.read_bytes()
+        assert one.samefile(other) is is_linked
+
+
+def test_what_cannot_be_exported_is_refused(out, tmp_path):
+    export = tmp_path / "export"
+    export_atlas(out, export)
+    with pytest.raises(InputError, match="already exists"):
+        export_atlas(out, export)
+    with pytest.raises(InputError, match="a folder apart from the input"):
+        export_atlas(out, out / "export")
+    file = out / "segment-000" / "poses" / "atlas.json"
+    content = json.loads(file.read_text())
+    content["submaps"][0]["frames"].pop()
+    write_json(file, content)
+    before = (export / "manifest.json").read_bytes()
+    with pytest.raises(InputError, match=r"sparse/0 has 14 frames, .* names 13 of it"):
+        export_atlas(out, export, overwrite=True)
+    assert (export / "manifest.json").read_bytes() == before
+    for segment in ("segment-000", "segment-001"):
+        (out / segment / "poses" / "atlas.json").write_text("{")
+    with pytest.raises(InputError, match=r"has no sub-map with poses: segment-000: poses/atlas\.json"):
+        export_atlas(out, export, overwrite=True)
+
+
+def test_the_command_names_the_sub_maps(out, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["poses", "export", str(out), "--output", str(tmp_path / "export")])
+    assert stopped.value.code == 0
+    told = capsys.readouterr().out
+    assert "segment-001/0: 14 frames, unit unknown, joined to segment-000/2" in told
+    assert "segment-000/2: 5 frames, unit unknown, no dense depth" in told
+    with pytest.raises(SystemExit) as stopped:
+        main(["poses", "export", str(tmp_path), "--output", str(tmp_path / "other")])
+    assert stopped.value.code == 2
+    assert "procedure.json" in capsys.readouterr().err
