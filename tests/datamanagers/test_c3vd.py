@@ -173,8 +173,10 @@ def test_the_option_and_the_file_decide_on_the_lens(tmp_path, caplog, lens, has_
         "# calibration\n" + as_text() + "  # the last one",
         json.dumps({name: CANDIDATE[name] for name in ORDER}),
         "\n".join(line for line in as_text().splitlines() if line[:2] not in ("wi", "he", "a1", "c ", "d ", "e ")),
+        as_text("{1!r}"),
+        "\n".join(as_text("{1!r}").splitlines()[2:]),
     ],
-    ids=["equals", "colons", "tabs", "comments", "json", "only what is needed"],
+    ids=["equals", "colons", "tabs", "comments", "json", "only what is needed", "twelve numbers", "ten numbers"],
 )
 def test_unmistakable_lens_files(tmp_path, text):
     (tmp_path / "camera_intrinsics.txt").write_text(text)
@@ -184,8 +186,8 @@ def test_unmistakable_lens_files(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "seen"),
     [
-        ("see the paper", "no numbers with names"),
-        ("767.7 0 677.7 0 767.7 543.1 0 0 1", "no numbers with names"),
+        ("see the paper", "text without names"),
+        ("767.7 0 677.7 0 767.7 543.1 0 0 1", "9 numbers without names"),
         (as_text().replace("a2 = ", "k2 = "), "no a2; unknown k2"),
         (as_text() + "\ncx = 1", "twice cx"),
         (as_text(cx=337.0), "a centre (337, 543.058) far from the middle of 1350 x 1080"),
@@ -195,6 +197,7 @@ def test_unmistakable_lens_files(tmp_path, text):
         (as_text(width=1350.5), "1350.5 x 1080 pixels"),
         (as_text(width=0.2), "an image of 0.2 x 1080"),
         (as_text(a3=float("inf")), "no a3"),
+        ("\n".join(as_text("{1!r}").splitlines()[::-1]), "an image of"),
     ],
 )
 def test_whatever_else_is_refused_and_the_way_out_named(tmp_path, text, seen):

@@ -30,21 +30,26 @@ CANDIDATE_LENS = OmnidirectionalLens(
 #: Order of the model's parameters on C3VD's page.
 ORDER = ("width", "height", "cx", "cy", "a0", "a1", "a2", "a3", "a4", "c", "d", "e")
 _NEEDED = frozenset({"cx", "cy", "a0", "a2", "a3", "a4"})
-_NAMED = re.compile(r"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NAMED = re.compile(rf"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*({_NUMBER.pattern})")
 
 
 def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     """Read a ``camera_intrinsics.txt``.
 
-    The file's format is not published; numbers must have their names (``cx = 677.7``), the default size is 1350 x 1080.
-    The centre must be near the middle, and the focal length that of a wide-angle lens. Its pixel centres are at
-    integers, as C3VD's.
+    The file's format is not published. Two unambiguous ones are accepted: named numbers (``cx = 677.7``), or twelve
+    bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). The centre must be near
+    the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
     """
     text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
-    named = _NAMED.findall(text)
-    if not named:
-        raise _unclear(path, "no numbers with names")
-    values = _by_name(path, [(name.lower(), float(number)) for name, number in named])
+    named, bare = _NAMED.findall(text), _bare(text)
+    if named:
+        values = _by_name(path, [(name.lower(), float(number)) for name, number in named])
+    elif bare is not None and len(bare) in (len(ORDER), len(ORDER) - 2):
+        values = dict(zip(ORDER[-len(bare) :], bare, strict=True))
+    else:
+        count = "text" if bare is None else f"{len(bare)} numbers"
+        raise _unclear(path, f"{count} without names")
     width, height = values.pop("width", 1350.0), values.pop("height", 1080.0)
     doubt = _doubt(values, width, height)
     if doubt:
@@ -53,6 +58,12 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     return OmnidirectionalLens(
         width=round(width), height=round(height), cx=cx + 0.5, cy=cy + 0.5, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
     )
+
+
+def _bare(text: str) -> list[float] | None:
+    """Numbers of a text; None if it holds anything else."""
+    words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
+    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else None
 
 
 def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
@@ -92,6 +103,6 @@ def _doubt(values: dict[str, float], width: float, height: float) -> str:
 def _unclear(path: Path, seen: str) -> InputError:
     return InputError(
         f"{path} is ambiguous or implausible: {seen}",
-        f"each number with its name: {', '.join(ORDER)}",
+        f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
         "Rewrite it in this format, or --set datamanager.lens=v2 (an unverified candidate), or v1 (C3VD's own)",
     )
