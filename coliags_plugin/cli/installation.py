@@ -27,7 +27,7 @@ class DoctorCommand:
         """Print the results; exit with status 1 where a requirement is missing or a renderer is wrong."""
         from coliags_plugin.checks.installation import check_installation
         from coliags_plugin.reporting.model import Fact, FactList
-        from coliags_plugin.reporting.terminal import terminal_text
+        from coliags_plugin.reporting.text_formats import terminal_text
 
         results = check_installation(self.device)
         marks = {"passed": "ok ", "failed": "BAD", "skipped": "-  "}

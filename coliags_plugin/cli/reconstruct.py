@@ -75,7 +75,7 @@ class ReconstructCommand:
         from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
         from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE
-        from coliags_plugin.reporting.terminal import terminal_text
+        from coliags_plugin.reporting.text_formats import terminal_text
 
         given: dict[str, Any] = {
             "sfm.camera.model": self.camera,

@@ -80,7 +80,7 @@ class ResultsShowCommand:
     def run(self) -> None:
         """Print a table for each."""
         from coliags_plugin.reporting.model import Block, Fact, FactList
-        from coliags_plugin.reporting.terminal import terminal_text
+        from coliags_plugin.reporting.text_formats import terminal_text
         from coliags_plugin.results.reading import find_results
         from coliags_plugin.results.summaries import facts, means_summary
 

@@ -155,7 +155,7 @@ class MeshCommand:
         """Make the mesh, and print the comparison."""
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.reporting.terminal import terminal_text
+        from coliags_plugin.reporting.text_formats import terminal_text
         from coliags_plugin.surface.meshing.writing import comparison_blocks
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance depth=median")

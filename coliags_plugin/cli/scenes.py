@@ -86,7 +86,7 @@ class DataCommand:
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reporting.html_page import write_html
-        from coliags_plugin.reporting.terminal import page_text
+        from coliags_plugin.reporting.text_formats import page_text
 
         with progress_callback() as progress:
             scene = open_scene(self.scene, self.format, self.set, progress)

@@ -22,7 +22,7 @@ from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.choice import ExecutionOptions, make_executor
 from coliags_plugin.reporting.model import Column, Value
-from coliags_plugin.reporting.terminal import DisplayTable
+from coliags_plugin.reporting.text_formats import DisplayTable
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)

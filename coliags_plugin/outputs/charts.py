@@ -2,7 +2,7 @@
 
 The SVG uses CSS classes and no colours, so a chart is readable on a light and on a dark page. The page defines
 ``.chart .frame``, ``.grid``, ``.tick``, ``.axis`` and, for each series style, ``.s0`` to ``.s7`` with a ``color``;
-line, band and marker take the current colour. A ninth series takes the first colour again, dashed.
+line and marker take the current colour. A ninth series takes the first colour again, dashed.
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ class Series:
     x: Sequence[float]  # increasing
     #: same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line
     y: Sequence[float]
-    low: Sequence[float] = ()  # lower edge of a band around the line, or empty
-    high: Sequence[float] = ()  # upper edge of the band
 
 
 def style_classes(style: int) -> str:
@@ -64,15 +62,12 @@ def line_chart(
     ]
     if not points:
         return ""
-    edges = [value for line in series for value in (*line.low, *line.high) if _drawable(value, log_y)]
-    axes = _Axes.around([x for x, _ in points], [y for _, y in points] + edges, log_y, x_names)
+    axes = _Axes.around([x for x, _ in points], [y for _, y in points], log_y, x_names)
     caption = escape(f"{y_label} over {x_label}", quote=True)
     parts = [f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{caption}">']
     parts += axes.drawn(x_label, y_label)
     for line in series:
         parts.append(f'<g class="series {style_classes(line.style)}"><title>{escape(line.name)}</title>')
-        if line.low:
-            parts += [f'<path class="band" d="{path}"/>' for path in axes.bands(line)]
         parts += [f'<path class="line" d="{path}"/>' for path in axes.paths(line)]
         if markers:
             parts += [
@@ -190,21 +185,3 @@ class _Axes:
                 stretches.append([])
         # A segment of one point is visible too: round caps draw a line of no length as a dot.
         return ["M" + "L".join(s if len(s) > 1 else s * 2) for s in stretches if s]
-
-    def bands(self, line: Series) -> list[str]:
-        """One closed path per uninterrupted segment of a band."""
-        stretches: list[list[tuple[float, float, float]]] = [[]]
-        for x, low, high in zip(line.x, line.low, line.high, strict=True):
-            if _drawable(low, self.log_y) and _drawable(high, self.log_y):
-                stretches[-1].append((self.x(x), self.y(low), self.y(high)))
-            else:
-                stretches.append([])
-        return [
-            "M"
-            + "L".join(f"{x:.1f} {high:.1f}" for x, _, high in s)
-            + "L"
-            + "L".join(f"{x:.1f} {low:.1f}" for x, low, _ in reversed(s))
-            + "Z"
-            for s in stretches
-            if len(s) > 1
-        ]

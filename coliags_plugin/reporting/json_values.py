@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from coliags_plugin.reporting.model import Block, Bullets, Fact, FactList, Folded, Page, Section, Table, TableCell
+from coliags_plugin.reporting.model import Block, Bullets, Fact, FactList, Folded, Page, Section, Table
 
 
 def page_values(page: Page) -> dict[str, Any]:
@@ -16,16 +16,6 @@ def page_values(page: Page) -> dict[str, Any]:
         "cautions": list(page.cautions),
         "sections": [_section(section) for section in page.text_sections],
     }
-
-
-def table_values(table: Table) -> dict[str, Any]:
-    """Columns with their units, and rows of plain values by their keys."""
-    columns = [
-        {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
-        for column in table.columns
-    ]
-    rows = [{column.key: _value(row.get(column.key)) for column in table.columns} for row in table.rows]
-    return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}
 
 
 def _facts(facts: Sequence[Fact]) -> dict[str, Any]:
@@ -42,18 +32,25 @@ def _section(section: Section | Folded) -> dict[str, Any]:
 
 
 def _block(block: Block) -> tuple[str, Any]:
-    if isinstance(block, Table):
-        return "tables", table_values(block)
-    if isinstance(block, FactList):
-        return "facts", _facts(block.facts)
-    if isinstance(block, Bullets):
-        return "items", [{"name": item.lead, "text": item.text, "href": item.href} for item in block.items]
-    if isinstance(block, (Section, Folded)):
-        return "sections", _section(block)
-    return "", None
+    match block:
+        case Table():
+            return "tables", _table(block)
+        case FactList():
+            return "facts", _facts(block.facts)
+        case Bullets():
+            return "items", [{"name": item.lead, "text": item.text, "href": item.href} for item in block.items]
+        case Section() | Folded():
+            return "sections", _section(block)
+        case _:
+            return "", None
 
 
-def _value(value: Any) -> Any:
-    if not isinstance(value, TableCell):
-        return value
-    return value.value if value.value is not None else value.text or None
+def _table(table: Table) -> dict[str, Any]:
+    """Columns with their units, and rows of plain values by their keys."""
+    columns = [
+        {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
+        for column in table.columns
+    ]
+    cells = [[cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells]
+    rows = [dict(zip((column.key for column in table.columns), row, strict=True)) for row in cells]
+    return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}

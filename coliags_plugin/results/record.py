@@ -14,7 +14,7 @@ from typing_extensions import Self
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Value, value_text
 from coliags_plugin.reporting.numbers import Direction
-from coliags_plugin.reporting.terminal import DisplayTable
+from coliags_plugin.reporting.text_formats import DisplayTable
 
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1

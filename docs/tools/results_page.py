@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from coliags_plugin.comparison.plan_file import PlannedCell, read_plan
-from coliags_plugin.reporting.markdown import markdown_table
 from coliags_plugin.reporting.model import simple_table
+from coliags_plugin.reporting.text_formats import markdown_table
 from coliags_plugin.results.comparisons import RivalComparison, compare_with_rivals, scene_means
 from coliags_plugin.results.reading import read_result
 from coliags_plugin.results.record import Result

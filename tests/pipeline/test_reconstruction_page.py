@@ -12,7 +12,7 @@ from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table, write_index
 from coliags_plugin.pipeline.stages import StageRecord
-from coliags_plugin.reporting.terminal import terminal_text
+from coliags_plugin.reporting.text_formats import terminal_text
 from tests.pipeline.records import FOLDER, SCENE_FILE, done, record_in
 
 

@@ -183,7 +183,7 @@ def _described(result: Alignment, unit: str) -> str:
 
 def _table(result: Alignment, unit: str) -> str:
     from coliags_plugin.reporting.model import simple_table
-    from coliags_plugin.reporting.terminal import terminal_text
+    from coliags_plugin.reporting.text_formats import terminal_text
 
     step = f"{result.delta} frame{'s' if result.delta > 1 else ''}"
     rows = [

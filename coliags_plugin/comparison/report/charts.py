@@ -20,8 +20,6 @@ _SMALLEST_SHARE = 1e-3
 _LOG_DEPTH_FROM, _LOG_LOSS_FROM = 20.0, 8.0
 #: Curves of more logged steps are averaged over this many intervals.
 _MOST_POINTS = 120
-#: Minimum-maximum bands are drawn for at most this many runs.
-_MOST_BANDS = 3
 #: Columns of the log against which curves are drawn: group of the charts, and label of the axis.
 _TRAINING_AXES = {"step": ("by-step", "step"), "seconds": ("by-seconds", "training time [s]")}
 
@@ -122,28 +120,20 @@ def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
             ("loss", "loss", "Loss"),
         ):
             having = [log for log in logs if x in log.columns and y in log.columns]
-            lines = [_training_line(log, x, y, len(logs) <= _MOST_BANDS) for log in having]
+            lines = [_training_line(log, x, y) for log in having]
             log = y == "loss" and _spans(lines, _LOG_LOSS_FROM)
             charts.append(Chart(lines, x_label, _log_label(y_label, log), title, log_y=log, group=group))
     return charts
 
 
-def _training_line(log: _Log, x: str, y: str, bands: bool) -> Series:
+def _training_line(log: _Log, x: str, y: str) -> Series:
     known = np.isfinite(log.columns[x])
     along, values = log.columns[x][known], log.columns[y][known]
-    if len(along) <= _MOST_POINTS:
-        return Series(log.method, log.style, along.tolist(), values.tolist())
-    intervals = np.array_split(np.arange(len(along)), _MOST_POINTS)
-    kept = [part for part in (part[np.isfinite(values[part])] for part in intervals) if part.size]
-    low, high = ([float(f(values[part])) for part in kept] for f in (np.min, np.max))
-    return Series(
-        log.method,
-        log.style,
-        [float(along[part].mean()) for part in kept],
-        [float(values[part].mean()) for part in kept],
-        low if bands else (),
-        high if bands else (),
-    )
+    if len(along) > _MOST_POINTS:
+        intervals = np.array_split(np.arange(len(along)), _MOST_POINTS)
+        kept = [part for part in (part[np.isfinite(values[part])] for part in intervals) if part.size]
+        along, values = (np.array([every[part].mean() for part in kept]) for every in (along, values))
+    return Series(log.method, log.style, along.tolist(), values.tolist())
 
 
 def _training_hints(study: Study, logs: Sequence[Sequence[_Log]]) -> list[str]:
@@ -151,8 +141,7 @@ def _training_hints(study: Study, logs: Sequence[Sequence[_Log]]) -> list[str]:
     longest = max(len(values) for own in logs for log in own for values in log.columns.values())
     per_point = math.ceil(longest / _MOST_POINTS)
     if per_point > 1:
-        band = "; the band spans their extremes" if max(map(len, logs)) <= _MOST_BANDS else ""
-        hints.append(f"Each point is the mean of up to {per_point} logged steps{band}.")
+        hints.append(f"Each point is the mean of up to {per_point} logged steps.")
     if len(study.methods) > 1:
         hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
     if any(len({log.method for log in own}) < len(own) for own in logs):

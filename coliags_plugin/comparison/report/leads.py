@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import starmap
 
-from coliags_plugin.comparison.report.metric_columns import metric_columns, metric_title
-from coliags_plugin.comparison.report.metric_tables import shared_scenes, spreads
+from coliags_plugin.comparison.report.metric_tables import metric_columns, metric_title, shared_scenes, spreads
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell

@@ -1,19 +1,109 @@
-"""Tables of metrics: means and medians over all scenes, on single scenes, and of the spread over seeds."""
+"""Tables of metrics: their columns, and means over all scenes or a single one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from coliags_plugin.comparison.report.metric_columns import empty_metrics
-from coliags_plugin.comparison.report.published import PublishedBenchmark
+from coliags_plugin.comparison.report.published import published_for
 from coliags_plugin.comparison.report.study import Part, Study
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell, ranked_cells
-from coliags_plugin.reporting.numbers import counted
+from coliags_plugin.reporting.numbers import column_decimals, counted, number_text
 from coliags_plugin.results.comparisons import LEVELS, BySeed, RivalComparison, Spread, common_scenes, spread
+from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
 
 #: Labels the rows.
 METHOD = Column("method", "Method", words=True)
+#: Shown unless the reader chooses others.
+DEFAULT_COLUMNS = (
+    *("psnr", "psnr_gain_fitted", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
+    *("sparse_depth_median", "sparse_depth_p90"),
+)
+#: The same for other sets, whose views leave the path, so that much of what they see was never filmed.
+_BEYOND_THE_PATH = ("psnr", "psnr_seen", "psnr_gain_fitted_seen", *DEFAULT_COLUMNS[2:])
+#: Of the default columns, what is shown where no result has the first.
+_INSTEAD = {"lpips": "lpips_squeeze"}
+#: Chooses all.
+ALL_COLUMNS = "all"
+
+_NAMES = {
+    "psnr": "PSNR",
+    "psnr_gain_fitted": "PSNR, gain fitted",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "lpips_squeeze": "LPIPS, SqueezeNet",
+    "depth_mse": "Depth MSE",
+    "depth_mse_inner": "Depth MSE, inner",
+    "depth_rmse": "Depth RMSE",
+    "depth_mae": "Depth MAE",
+    "depth_median_error": "Depth median error",
+    "depth_abs_rel": "Depth AbsRel",
+    "sparse_depth_median": "Sparse depth, median",
+    "sparse_depth_p90": "Sparse depth, 90th percentile",
+}
+
+
+def metric_title(metric: str) -> str:
+    """Title of a metric, for instance "PSNR, seen pixels"."""
+    base = metric.removesuffix(SEEN_SUFFIX)
+    title = _NAMES.get(base) or base.replace("_", " ").capitalize()
+    return f"{title}, seen pixels" if metric != base else title
+
+
+def check_columns(study: Study, chosen: Sequence[str]) -> None:
+    """Refuse the name of a metric that no result has."""
+    for name in chosen:
+        if name not in study.metrics and name != ALL_COLUMNS:
+            known = [*study.metrics, ALL_COLUMNS]
+            raise InputError(f"--columns {name}: no such metric", f"of {', '.join(known)}", did_you_mean(name, known))
+
+
+def metric_columns(part: Part, chosen: Sequence[str] = ()) -> list[Column]:
+    """Columns of a part: every metric that it has, or that no part has; those not chosen are there, but not shown.
+
+    Chosen ones come first, in their order. Unless chosen, metrics that have no value in the part, nor a published one,
+    are not shown either.
+    """
+    metrics = part.study.metrics
+    own = [name for name in metrics if not _belongs_elsewhere(part, name)]
+    wanted = own if ALL_COLUMNS in chosen else chosen or _default_columns(part)
+    shown = [name for name in wanted if name in own]
+    return [
+        Column(name, metric_title(name), metrics[name].unit, metrics[name].direction, name in shown)
+        for name in dict.fromkeys([*shown, *own])
+    ]
+
+
+def empty_metrics(part: Part) -> list[str]:
+    """Metrics that no result has a value of in this part."""
+    return [name for name in part.study.metrics if not _has_values(part, name)]
+
+
+def _default_columns(part: Part) -> list[str]:
+    default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
+    published = published_for(part)
+    kept = set() if published is None else {name for numbers in published.methods.values() for name in numbers}
+    empty = set(empty_metrics(part)) - kept
+    return [name for name in (_available(part, name) for name in default) if name not in empty]
+
+
+def _has_values(part: Part, metric: str) -> bool:
+    return any(part.values(metric).values())
+
+
+def _available(part: Part, metric: str) -> str:
+    """A default column, or what stands for it where it is empty."""
+    other = _INSTEAD.get(metric, metric)
+    return metric if _has_values(part, metric) or not _has_values(part, other) else other
+
+
+def _belongs_elsewhere(part: Part, metric: str) -> bool:
+    """Whether a metric over the seen pixels is that of other parts only."""
+    if not metric.endswith(SEEN_SUFFIX):
+        return False
+    having = [other for other in part.study.parts if _has_values(other, metric)]
+    return bool(having) and part not in having
 
 
 def method_rows(
@@ -37,80 +127,52 @@ def spreads(values: Mapping[str, BySeed], scenes: Sequence[str]) -> list[Spread]
     return [spread(by_scene, scenes if by_scene else ()) for by_scene in values.values()]
 
 
-def summary_table(
+def means_table(
     part: Part,
     columns: Sequence[Column],
-    comparisons: Mapping[str, Sequence[RivalComparison]],
-    published: PublishedBenchmark | None = None,
+    scene: str | None = None,
+    comparisons: Mapping[str, Sequence[RivalComparison]] | None = None,
 ) -> Table:
-    """Mean of every metric over the scenes that all methods have, with its standard deviation over them.
+    """Mean of every metric over the scenes that all methods have, or over one scene, with its standard deviation.
 
-    Stars are of the comparisons, by metric; published numbers stand below ours.
+    Stars are of the comparisons, by metric; published numbers stand below our means over all scenes.
     """
-    cells = [_summary_cells(part, column, comparisons.get(column.key, ())) for column in columns]
+    published = published_for(part) if scene is None else None
+    scenes, compared = part.scenes if scene is None else [scene], comparisons or {}
+    cells = [_cells(part, column, scenes, compared.get(column.key, ())) for column in columns]
     rows = method_rows(part.study, columns, cells)
     if published is not None:
         rows += [_published_row(method, columns, numbers) for method, numbers in published.methods.items()]
-    frames = counted(sum(len(part.frames(scene)) for scene in part.scenes), "frame")
-    several = len(part.scenes) > 1
-    notes = [*_not_shown_notes(part, columns), *_left_out_notes(part, columns), *_ruled_notes(part, columns)]
+    frames = counted(sum(len(part.frames(each)) for each in scenes), "frame")
+    several = len(scenes) > 1
+    notes = [] if scene is not None else _summary_notes(part, columns)
     if any(cell.spread for own in cells for cell in own):
         notes.append(f"± standard deviation over {'scenes' if several else 'seeds'}")
-    if any(row.stars for compared in comparisons.values() for row in compared):
+    if any(row.stars for own in compared.values() for row in own):
         levels = ", ".join(f"{'*' * (index + 1)} p < {f'{level:g}'[1:]}" for index, level in enumerate(LEVELS))
         notes.append(f"Differs from the reference: {levels} (Wilcoxon signed-rank test over scenes, Holm)")
     return Table(
-        title=part.title,
+        title=part.title if scene is None else f"{scene}, {part.title}",
         columns=[METHOD, *columns],
         rows=rows,
         notes=[*notes, *([] if published is None else [published.note])],
-        count=f"{counted(len(part.scenes), 'scene')}, {frames}" if several else frames,
-        name=f"summary-{part.name}",
+        count=f"{counted(len(scenes), 'scene')}, {frames}" if several else frames,
+        name=f"summary-{part.name}" if scene is None else f"scene-{scene}-{part.name}",
     )
 
 
-def median_table(part: Part, columns: Sequence[Column]) -> Table | None:
-    """Median over the same scenes of the metrics that are errors, which single scenes can rule; None of one scene."""
-    errors = [column for column in columns if column.direction == "lower"]
-    if len(part.scenes) < 2 or not any(column.shown for column in errors):
-        return None
-    cells = []
-    for column in errors:
-        values = part.values(column.key)
-        medians = [own.median for own in spreads(values, shared_scenes(values))]
-        cells.append(ranked_cells(medians, column.unit, column.direction))
-    return Table(
-        title=f"Medians over scenes, {part.title}",
-        columns=[METHOD, *errors],
-        rows=method_rows(part.study, errors, cells),
-        name=f"medians-{part.name}",
-    )
-
-
-def _ruled_notes(part: Part, columns: Sequence[Column]) -> list[str]:
-    """Of which methods the mean of an error is more than twice the median over scenes."""
-    notes = []
-    for column in (column for column in columns if column.shown and column.direction == "lower"):
-        values = part.values(column.key)
-        found = zip(part.study.methods, spreads(values, shared_scenes(values)), strict=True)
-        ruled = [method for method, own in found if own.ruled_by_few]
-        if ruled:
-            notes.append(
-                f"{column.title}: few scenes rule the mean, which is more than twice the median over scenes, of "
-                f"{', '.join(ruled)}"
-            )
-    return notes
-
-
-def _summary_cells(part: Part, column: Column, compared: Sequence[RivalComparison]) -> list[TableCell]:
-    values = part.values(column.key)
+def _cells(part: Part, column: Column, scenes: Sequence[str], compared: Sequence[RivalComparison]) -> list[TableCell]:
+    values = {
+        method: {scene: seeds for scene, seeds in by_scene.items() if scene in scenes}
+        for method, by_scene in part.values(column.key).items()
+    }
     shared = shared_scenes(values)
     found = spreads(values, shared)
     over = [own.over_scenes if own.scenes > 1 else own.over_seeds for own in found]
     cells = ranked_cells([own.mean for own in found], column.unit, column.direction, over)
     stars = {row.rival: row.stars for row in compared}
     return [
-        replace(cell, stars=stars.get(method, ""), note=_summary_note(part, column, method, values[method], shared))
+        replace(cell, stars=stars.get(method, ""), note=_note(part, column, method, values[method], scenes, shared))
         for method, cell in zip(part.study.methods, cells, strict=True)
     ]
 
@@ -121,72 +183,20 @@ def _published_row(method: str, columns: Sequence[Column], numbers: Mapping[str,
     return {METHOD.key: label, **{key: TableCell(printed, float(printed)) for key, printed in cells.items()}}
 
 
-def scene_table(part: Part, columns: Sequence[Column], scene: str) -> Table:
-    """Means over one scene's frames, and over seeds."""
-    seeds = max(len(part.runs(scene, method)) for method in part.study.methods)
-    return Table(
-        title=f"{scene}, {part.title}",
-        columns=[METHOD, *columns],
-        rows=method_rows(part.study, columns, [_scene_cells(part, column, scene) for column in columns]),
-        notes=["± standard deviation over seeds"] if seeds > 1 else [],
-        count=counted(len(part.frames(scene)), "frame"),
-        name=f"scene-{scene}-{part.name}",
-    )
-
-
-def _scene_cells(part: Part, column: Column, scene: str) -> list[TableCell]:
-    found = [spread(values, [scene] if scene in values else []) for values in part.values(column.key).values()]
-    means, over_seeds = [own.mean for own in found], [own.over_seeds for own in found]
-    cells = ranked_cells(means, column.unit, column.direction, over_seeds)
-    return [
-        replace(cell, note=_scene_note(part, column, method, scene, cell.value))
-        for method, cell in zip(part.study.methods, cells, strict=True)
-    ]
-
-
-def seed_table(part: Part, columns: Sequence[Column]) -> Table | None:
-    """Spread over seeds of every metric; None where no scene has two."""
-    cells = []
-    for column in columns:
-        values = part.values(column.key)
-        over_seeds = [own.over_seeds for own in spreads(values, shared_scenes(values))]
-        cells.append(ranked_cells(over_seeds, column.unit, None))
-    if not any(cell.text for own in cells for cell in own):
-        return None
-    counts = {method: max(len(part.runs(scene, method)) for scene in part.scenes) for method in part.study.methods}
-    shown = ", ".join(f"{method} {count}" for method, count in counts.items())
-    return Table(
-        title=f"Spread over seeds, {part.title}",
-        columns=[METHOD, *(replace(column, direction=None) for column in columns)],
-        rows=method_rows(part.study, columns, cells),
-        notes=[f"Root mean square over scenes of the standard deviation over the seeds of a scene. Seeds: {shown}"],
-        name=f"seeds-{part.name}",
-    )
-
-
-def _summary_note(part: Part, column: Column, method: str, values: Mapping[str, object], shared: Sequence[str]) -> str:
+def _note(part: Part, column: Column, method: str, values: BySeed, scenes: Sequence[str], shared: Sequence[str]) -> str:
     """Footnote of a mean over scenes: why it is missing, or what it leaves out."""
-    scenes = [scene for scene in part.scenes if part.runs(scene, method)]
-    if not scenes:
+    own = [scene for scene in scenes if part.runs(scene, method)]
+    if not own:
         return f"{method}: no result"
     if not values:
-        return f"{column.title}: {part.reason(method, column.key)}"
+        return f"{column.title}: {part.reason(method, column.key, scenes[0] if len(scenes) == 1 else None)}"
     if not shared:
         return f"{column.title}: no scene that all methods have"
-    lacking = [scene for scene in scenes if scene not in values]
+    lacking = [scene for scene in own if scene not in values]
     if lacking:
         reason = part.reason(method, column.key, lacking[0])
         return f"{column.title}: not available for {', '.join(lacking)}; {reason}"
     return _partial_note(part, column, method, shared)
-
-
-def _scene_note(part: Part, column: Column, method: str, scene: str, value: float | None) -> str:
-    """Footnote of a value of one scene: why it is missing, or which frames it leaves out."""
-    if not part.runs(scene, method):
-        return f"{method}: no result"
-    if value is None:
-        return f"{column.title}: {part.reason(method, column.key, scene)}"
-    return _partial_note(part, column, method, [scene])
 
 
 def _partial_note(part: Part, column: Column, method: str, scenes: Iterable[str]) -> str:
@@ -197,6 +207,11 @@ def _partial_note(part: Part, column: Column, method: str, scenes: Iterable[str]
     if having == total:
         return ""
     return f"{column.title}: mean over {having} of {total} frames; {part.reason(method, column.key)}"
+
+
+def _summary_notes(part: Part, columns: Sequence[Column]) -> list[str]:
+    """What is not shown, which scenes the means leave out, and which means few scenes rule."""
+    return [*_not_shown_notes(part, columns), *_left_out_notes(part, columns), *_ruled_notes(part, columns)]
 
 
 def _not_shown_notes(part: Part, columns: Sequence[Column]) -> list[str]:
@@ -223,3 +238,19 @@ def _left_out_notes(part: Part, columns: Sequence[Column]) -> list[str]:
         for missing, columns_of in titles.items()
         if missing
     ]
+
+
+def _ruled_notes(part: Part, columns: Sequence[Column]) -> list[str]:
+    """Which methods have a mean error of more than twice the median over scenes, and that median."""
+    notes = []
+    for column in (column for column in columns if column.shown and column.direction == "lower"):
+        values = part.values(column.key)
+        found = dict(zip(values, spreads(values, shared_scenes(values)), strict=True))
+        medians = {method: own.median for method, own in found.items() if own.ruled_by_few and own.median is not None}
+        decimals = column_decimals(column.unit, medians.values())
+        if medians:
+            each = ", ".join(f"{method} ({number_text(median, decimals)})" for method, median in medians.items())
+            notes.append(
+                f"{column.title}: few scenes rule the mean, which is more than twice the median over scenes, of {each}"
+            )
+    return notes

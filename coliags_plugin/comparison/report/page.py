@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from coliags_plugin.comparison.report.charts import profile_section, training_blocks
+from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_blocks
 from coliags_plugin.comparison.report.comparability import cautions
 from coliags_plugin.comparison.report.costs import cost_table
-from coliags_plugin.comparison.report.frame_tables import frame_section
 from coliags_plugin.comparison.report.leads import (
     EXPLANATION,
     PREFERRED,
@@ -19,14 +19,23 @@ from coliags_plugin.comparison.report.leads import (
     lead_table,
     statistics_text,
 )
-from coliags_plugin.comparison.report.metric_columns import check_columns, metric_columns
-from coliags_plugin.comparison.report.metric_tables import median_table, scene_table, seed_table, summary_table
+from coliags_plugin.comparison.report.metric_tables import check_columns, means_table, metric_columns
 from coliags_plugin.comparison.report.provenance import provenance_section
-from coliags_plugin.comparison.report.published import published_for
 from coliags_plugin.comparison.report.study import MissingResult, Part, Study
 from coliags_plugin.comparison.report.views import view_section
-from coliags_plugin.reporting.model import Block, Column, Fact, Folded, Page, Paragraph, Section, Table
+from coliags_plugin.reporting.model import (
+    Block,
+    Column,
+    Fact,
+    Folded,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    Template,
+)
 from coliags_plugin.reporting.numbers import counted
+from coliags_plugin.results.tables import csv_text, frame_rows
 
 _TIMES = "\N{MULTIPLICATION SIGN}"
 #: Scenes listed by name; of more, only their number is given.
@@ -74,7 +83,7 @@ def screen_page(text: Page, study: Study, choices: Choices, scene: Section | Non
         profile_section(study),
         Section("Training", [*costs.blocks, *training_blocks(study)]),
         scenes,
-        frame_section(study, choices.columns, reference),
+        _frames(study),
         provenance_section(study),
     ]
     return replace(text, sections=sections)
@@ -125,9 +134,7 @@ def _metrics(study: Study, choices: Choices, reference: str) -> Section:
 def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     columns = metric_columns(part, choices.columns)
     compared = {column.key: compare(part, column, reference) for column in columns}
-    medians = median_table(part, columns)
-    blocks: list[Block] = [summary_table(part, columns, compared, published_for(part))]
-    blocks += [] if medians is None else [medians]
+    blocks: list[Block] = [means_table(part, columns, comparisons=compared)]
     shown = [column for column in columns if column.shown and compared[column.key]]
     if shown:
         chosen = choices.reference is not None or reference == PREFERRED or is_decided(part.study, reference)
@@ -135,8 +142,7 @@ def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     if shown and len(part.scenes) > 1:
         leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
         blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))
-    seeds = seed_table(part, columns)
-    return blocks if seeds is None else [*blocks, Folded(seeds.title, [seeds])]
+    return blocks
 
 
 def _scenes(study: Study, choices: Choices) -> Section:
@@ -144,8 +150,28 @@ def _scenes(study: Study, choices: Choices) -> Section:
     for part in study.parts if len(tables) > 1 else ():
         columns = metric_columns(part, choices.columns)
         for scene in part.scenes:
-            tables[scene].append(scene_table(part, columns, scene))
+            tables[scene].append(means_table(part, columns, scene))
     return Section("Every scene", [Folded(scene, own) for scene, own in tables.items() if own])
+
+
+def _frames(study: Study) -> Section:
+    """PSNR along every video, and all values as CSV."""
+    download = {
+        "name": "per_frame.csv",
+        "data": b64encode(per_frame_csv(study).encode()).decode("ascii"),
+        "text": "every metric of every frame, method and seed.",
+    }
+    return Section("Every frame", [Template("download.html", download), *frame_charts(study)], screen_only=True)
+
+
+def per_frame_csv(study: Study) -> str:
+    """One line per scene, test set, frame, method and seed, one column per metric; empty where there is no value."""
+    rows = (
+        [run.scene, run.result.scene.split, set_name, frame, run.method, run.result.seed, *values]
+        for run in study.runs
+        for set_name, frame, *values in frame_rows(run.result, study.metrics)
+    )
+    return csv_text(["scene", "split", "set", "frame", "method", "seed", *study.metrics], rows)
 
 
 def _missing(missing: Sequence[MissingResult]) -> Section:

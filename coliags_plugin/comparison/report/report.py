@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
-from coliags_plugin.comparison.report.frame_tables import per_frame_csv
-from coliags_plugin.comparison.report.page import Choices, screen_page, text_page
+from coliags_plugin.comparison.report.page import Choices, per_frame_csv, screen_page, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
 from coliags_plugin.reporting.json_values import page_values
-from coliags_plugin.reporting.latex import latex_text
-from coliags_plugin.reporting.markdown import markdown_text
 from coliags_plugin.reporting.model import Section
+from coliags_plugin.reporting.text_formats import latex_text, markdown_text
 
 Format = Literal["html", "markdown", "latex", "csv", "json"]
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from coliags_plugin.comparison.report.metric_columns import metric_title
+from coliags_plugin.comparison.report.metric_tables import metric_title
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb

@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.frame_tables import per_frame_csv
 from coliags_plugin.comparison.report.leads import p_text
-from coliags_plugin.comparison.report.page import Choices, text_page
+from coliags_plugin.comparison.report.page import Choices, per_frame_csv, text_page
 from coliags_plugin.comparison.report.published import _C3VD_FRAMES
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.comparison.report.study import MissingResult
@@ -113,42 +112,24 @@ def test_the_summary_of_many_scenes_is_the_mean_over_scenes(study_of):
     assert any("standard deviation over scenes" in note for note in table.notes)
 
 
-def test_medians_stand_beside_means_that_one_scene_rules(study_of):
+def test_means_that_one_scene_rules_are_named_with_their_medians(study_of):
     depths = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
     results = [result_of(m, f"s{i}", depth=depth) for m, own in depths.items() for i, depth in enumerate(own)]
-    found = tables(of(study_of, results))
-    means, medians = (entries(found[f"{name}-test"], "depth_mse") for name in ("summary", "medians"))
-    assert [(cell.value, cell.rank) for cell in means.values()] == [
-        (pytest.approx(1.0075), 2),
-        (pytest.approx(0.0525), 1),
-    ]
-    assert [(cell.value, cell.rank) for cell in medians.values()] == [
-        (pytest.approx(0.01), 1),
-        (pytest.approx(0.04), 2),
-    ]
-    ruled = [note for note in found["summary-test"].notes if "rule the mean" in note]
+    table = tables(of(study_of, results))["summary-test"]
+    means = entries(table, "depth_mse").values()
+    assert [(cell.value, cell.rank) for cell in means] == [(pytest.approx(1.0075), 2), (pytest.approx(0.0525), 1)]
+    ruled = [note for note in table.notes if "rule the mean" in note]
     assert ruled[0] == (
-        "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags"
+        "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags (0.0100)"
     )
-    assert "psnr" not in [column.key for column in found["medians-test"].columns]
-    assert "medians-test" not in tables(of(study_of, results[:1]))
-
-
-def test_the_plan_of_a_methods_strategy_is_told_with_its_costs(study_of):
-    planned, plain = result_of("coliags"), result_of("3dgs")
-    training = {**planned.provenance["training"], "plan": "this run densifies 12 times"}
-    planned = planned.model_copy(update={"provenance": {**planned.provenance, "training": training}})
-    assert "coliags: this run densifies 12 times" in tables(of(study_of, [planned, plain]))["costs"].notes
-    assert not any(note.startswith("3dgs:") for note in tables(of(study_of, [planned, plain]))["costs"].notes)
 
 
 def test_seeds_of_one_scene_spread_over_seeds(study_of):
     results = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
-    found = tables(of(study_of, results))
-    assert entries(found["summary-test"], "psnr")["coliags"].spread == "1.00"
-    assert "± standard deviation over seeds" in found["summary-test"].notes
-    assert entries(found["seeds-test"], "psnr")["coliags"].text == "1.00"
-    assert "Seeds: coliags 3" in found["seeds-test"].notes[0]
+    for name, more in (("summary-test", []), ("scene-cecum-test", [result_of("coliags", "sigmoid")])):
+        table = tables(of(study_of, [*results, *more]))[name]
+        assert entries(table, "psnr")["coliags"].spread == "1.00"
+        assert "± standard deviation over seeds" in table.notes
 
 
 def test_a_missing_scene_is_left_out_for_all(study_of):
@@ -299,14 +280,85 @@ def test_p_text(p, text):
 # Cautions
 
 
-def test_transparent_pixels_are_a_caution(study_of):
+def changed(result, **provenance):
+    return result.model_copy(update={"provenance": {**result.provenance, **provenance}})
+
+
+def coded(scene, code, /, **training):
+    return changed(result_of("coliags", scene, software={"code": code, "git": None}), training=training)
+
+
+def transparent(share):
     result = result_of("coliags")
-    sets = {name: part.model_copy(update={"transparent": 0.1234}) for name, part in result.sets.items()}
-    said = of(study_of, [result.model_copy(update={"sets": sets})]).cautions
-    assert said[0].startswith("coliags on cecum, set test: 12.3 % of the pixels have alpha below 0.5")
-    assert len(said) == len(sets)
-    few = {name: part.model_copy(update={"transparent": 0.01}) for name, part in result.sets.items()}
-    assert of(study_of, [result.model_copy(update={"sets": few})]).cautions == []
+    sets = {name: part.model_copy(update={"transparent": share}) for name, part in result.sets.items()}
+    return result.model_copy(update={"sets": sets})
+
+
+OURS = result_of("coliags", software={"code": "c1"})
+HELD_OUT = {"depth": ["0004", "0012"], "points": None}
+
+
+@pytest.mark.parametrize(
+    ("results", "said"),
+    [
+        (
+            [OURS, result_of("3dgs", steps=80, software={"code": "c2", "git": "def5678"}, data={"calibration": "x"})],
+            [
+                "The results come from different code: c1 (commit abc1234): coliags; c2 (commit def5678): 3dgs.",
+                "The runs were trained for different numbers of steps: coliags 40, 3dgs 80.",
+                "Runs of one scene record different data, see Provenance: calibration.",
+            ],
+        ),
+        ([OURS, result_of("3dgs", software={"code": "c1", "git": "def5678"})], []),
+        (  # trained and evaluated by other code, or resumed
+            [
+                coded("p", "c1", code="c1"),
+                coded("q", "c2", code="c1"),
+                coded("r", "c2", code="c1", code_changes=[{"at_step": 3, "code": "c2"}]),
+            ],
+            [
+                "The results come from different code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
+                "c1, then c2, evaluated by c2: coliags (1 of 3)."
+            ],
+        ),
+        (
+            [changed(result_of(method), held_out_used=HELD_OUT) for method in ("coliags", "3dgs")],
+            [
+                "cecum, split every-8th: its depth comes from images of 2 held-out frames too, whose scores are too "
+                "good for that.",
+                "cecum, split every-8th: its points may come from images of held-out frames, as it is not recorded "
+                "which it was made from.",
+            ],
+        ),
+        (
+            [*(result_of("coliags", seed=seed) for seed in range(2)), result_of("3dgs")],
+            [
+                "The methods were trained with different seeds on cecum (coliags: 0, 1; 3dgs: 0); a mean over more "
+                "seeds varies less."
+            ],
+        ),
+        (
+            [result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))],
+            ["The scenes have images of different sizes: 16 x 12, 32 x 24 px."],
+        ),
+        (
+            [changed(OURS, untrained_views={"poses": "poses are moved"}), result_of("3dgs", software={"code": "c1"})],
+            ["coliags, poses: poses are moved."],
+        ),
+        ([changed(OURS, untrained_views={"poses": "poses are moved"})], []),
+        (
+            [transparent(0.1234)],
+            [
+                f"coliags on cecum, set {name}: 12.3 % of the pixels have alpha below 0.5: their depth, hatched, means "
+                "little."
+                for name in FRAMES
+            ],
+        ),
+        ([transparent(0.01)], []),
+    ],
+)
+def test_cautions(study_of, results, said):
+    assert of(study_of, results).cautions == said
 
 
 def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
@@ -324,82 +376,13 @@ def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
     assert note.startswith("Not shown, without values: Depth MSE; ")
 
 
-def test_cautions(study_of):
-    ours = result_of("coliags", software={"code": "c1"})
-    other = result_of(
-        "3dgs",
-        steps=80,
-        software={"code": "c2", "git": "def5678"},
-        data={"calibration": "fisheye"},
-        train=ours.scene.train,
-    )
-    said = of(study_of, [ours, other]).cautions
-    assert "The runs were trained for different numbers of steps: coliags 40, 3dgs 80." in said
-    assert "The results come from different code: c1 (commit abc1234): coliags; c2 (commit def5678): 3dgs." in said
-    assert "Runs of one scene record different data, see Provenance: calibration." in said
-    assert of(study_of, [ours, result_of("3dgs", software={"code": "c1", "git": "def5678"})]).cautions == []
-
-
-def test_results_of_different_code_are_told_apart(study_of):
-    """Trained and evaluated by other code, or resumed."""
-
-    def result(scene, code, /, **training):
-        made = result_of("coliags", scene, software={"code": code, "git": None})
-        return made.model_copy(update={"provenance": {**made.provenance, "training": training}})
-
-    changes = [{"at_step": 3, "code": "c2"}]
-    results = [
-        result("p", "c1", code="c1"), result("q", "c2", code="c1"), result("r", "c2", code="c1", code_changes=changes),
-    ]  # fmt: skip
-    assert of(study_of, results).cautions == [
-        "The results come from different code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
-        "c1, then c2, evaluated by c2: coliags (1 of 3)."
-    ]
-
-
-def test_what_was_made_from_held_out_images_is_said(study_of):
-    results = [result_of(method) for method in ("coliags", "3dgs")]
-    used = {"held_out_used": {"depth": ["0004", "0012"], "points": None}}
-    results = [result.model_copy(update={"provenance": {**result.provenance, **used}}) for result in results]
-    assert of(study_of, results).cautions == [
-        "cecum, split every-8th: its depth comes from images of 2 held-out frames too, whose scores are too good for "
-        "that.",
-        "cecum, split every-8th: its points may come from images of held-out frames, as it is not recorded which it "
-        "was made from.",
-    ]
-
-
-def test_unpaired_seeds_are_said(study_of):
-    said = of(study_of, [result_of("coliags", seed=seed) for seed in range(2)] + [result_of("3dgs")]).cautions
-    assert said == [
-        "The methods were trained with different seeds on cecum (coliags: 0, 1; 3dgs: 0); a mean over more seeds "
-        "varies less."
-    ]
-
-
-def test_scenes_of_different_sizes_are_said(study_of):
-    results = [result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))]
-    assert of(study_of, results).cautions == ["The scenes have images of different sizes: 16 x 12, 32 x 24 px."]
-
-
-def test_what_modules_make_of_held_out_views_is_said_where_methods_differ(study_of):
-    ours = result_of("coliags")
-    ours = ours.model_copy(update={"provenance": {**ours.provenance, "untrained_views": {"poses": "poses are moved"}}})
-    assert of(study_of, [ours, result_of("3dgs")]).cautions == ["coliags, poses: poses are moved."]
-    assert of(study_of, [ours]).cautions == []
-
-
-def test_failed_cells_are_listed(tmp_path):
+def test_cells_without_a_result(tmp_path, study_of):
     failed = [("cecum", "3dgs", 0, "ran out of memory"), ("sigmoid", "3dgs", 1, "")]
     page = text_page(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())
-    rows = tables(page)["failed"].rows
-    assert [list(row.values()) for row in rows] == [
+    assert [list(row.values()) for row in tables(page)["failed"].rows] == [
         ["3dgs", "cecum", 0, "ran out of memory"],
         ["3dgs", "sigmoid", 1, "no reason was recorded"],
     ]
-
-
-def test_unfinished_cells_are_counted(study_of):
     missing = tuple(MissingResult(scene, "3dgs", 0, None) for scene in "pq")
     page = text_page(replace(study_of([result_of("coliags")]), missing=missing), Choices())
     assert "failed" not in tables(page)
@@ -409,25 +392,14 @@ def test_unfinished_cells_are_counted(study_of):
 # Published numbers
 
 
-def c3vd_sequences(method="coliags", **changes):
+def c3vd_sequences(**changes):
     """All 22 sequences, under other names."""
     sequences = []
     for index, frames in enumerate(_C3VD_FRAMES.values()):
-        test = tuple(f"{frame:04d}" for frame in range(0, frames, 8))
-        train = tuple(f"{frame:04d}" for frame in range(frames) if frame % 8)
-        sequences.append(
-            result_of(
-                method,
-                f"sequence-{index}",
-                **{
-                    "frames": {"test": test},
-                    "train": train,
-                    "size": (338, 270),
-                    "data": {"dataset": "c3vd"},
-                    **changes,
-                },
-            )
-        )
+        names = [f"{frame:04d}" for frame in range(frames)]
+        facts = {"frames": {"test": tuple(names[::8])}, "train": [name for i, name in enumerate(names) if i % 8]}
+        facts |= {"size": (338, 270), "data": {"dataset": "c3vd"}}
+        sequences.append(result_of("coliags", f"sequence-{index}", **{**facts, **changes}))
     return sequences
 
 
@@ -504,10 +476,15 @@ def test_costs_on_different_devices_are_not_ranked(study_of, change):
     assert len({entry.text for entry in entries(table, "device").values()}) == 2
 
 
-def test_a_cost_that_was_not_measured(study_of):
-    page = of(study_of, [result_of("a", cost={"train_seconds": None, "gaussians": None})])
-    assert entries(tables(page)["costs"], "train_seconds")["a"].note == "Training: not measured"
-    assert "a radiance field" in entries(tables(page)["costs"], "gaussians")["a"].note
+def test_what_was_not_measured_and_what_was_planned(study_of):
+    bare = result_of("a", cost={"train_seconds": None, "gaussians": None})
+    planned = result_of("b")
+    planned = changed(planned, training={**planned.provenance["training"], "plan": "this run densifies 12 times"})
+    table = tables(of(study_of, [bare, planned]))["costs"]
+    assert entries(table, "train_seconds")["a"].note == "Training: not measured"
+    assert "a radiance field" in entries(table, "gaussians")["a"].note
+    assert "b: this run densifies 12 times" in table.notes
+    assert not any(note.startswith("a:") for note in table.notes)
 
 
 # Frames

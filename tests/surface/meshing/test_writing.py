@@ -14,7 +14,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.reporting.terminal import terminal_text
+from coliags_plugin.reporting.text_formats import terminal_text
 from coliags_plugin.surface.meshing.settings import MeshSettings
 from coliags_plugin.surface.meshing.writing import comparison_blocks, first_hits, mesh_run
 from tests.scenes import wall_scene, write_wall

@@ -1,0 +1,310 @@
+"""Pages as plain text for the terminal, as Markdown and as LaTeX: formats without figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rich.cells import cell_len
+
+from coliags_plugin.reporting.model import (
+    Block,
+    Bullet,
+    Bullets,
+    Column,
+    Fact,
+    FactList,
+    Folded,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+)
+from coliags_plugin.reporting.numbers import DASH, sentence, unit_text
+
+_MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~])")
+_HEAD = "% Needs \\usepackage{booktabs}, and \\usepackage[T1]{fontenc} for names with underscores."
+_ESCAPES = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "%": r"\%",
+    "_": r"\_",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": "$<$",
+    ">": "$>$",
+    "|": "$|$",
+    "±": r"$\pm$",
+    "²": "$^2$",
+    "³": "$^3$",
+    "·": r"$\cdot$",
+    "\N{MULTIPLICATION SIGN}": r"$\times$",
+    "°": r"$^\circ$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "…": r"\ldots{}",
+    "`": r"\textasciigrave{}",
+    "\N{EN DASH}": "--",
+}
+_MINUS = re.compile(r"(?<![\w-])-(?=[\d.])")
+_CODE = re.compile("`([^`]+)`")
+_SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
+
+
+class _PlainText:
+    """Plain text, and what the formats without figures that derive from it share."""
+
+    between: ClassVar[str] = "\n\n"  # stands between blocks
+    dash: ClassVar[str] = "-"  # stands for a missing value
+    plus_minus: ClassVar[str] = "±"
+
+    def text(self, blocks: Sequence[Block], level: int = 2) -> str:
+        """Blocks one after the other, without those that have no text; titles are headings of a level and deeper."""
+        return self.between.join(filter(None, (self._block(block, level) for block in blocks)))
+
+    def _block(self, block: Block, level: int) -> str:
+        match block:
+            case Paragraph():
+                return self._sentences(block.text)
+            case Bullets():
+                return "\n".join(map(self._item, block.items))
+            case FactList():
+                return self._facts([fact for fact in block.facts if fact.text])
+            case Table():
+                return self._table(block.only_shown())
+            case Section() | Folded():
+                return self._titled(block.title, self.text(block.blocks, level + 1), level)
+            case _:
+                return ""
+
+    def _escaped(self, text: str) -> str:
+        """Words of a text, none of whose characters has a meaning of its own."""
+        return text
+
+    def _sentences(self, text: str) -> str:
+        return self._escaped(text)
+
+    def _item(self, item: Bullet) -> str:
+        return ": ".join(filter(None, (item.href or item.lead, item.text)))
+
+    def _facts(self, facts: Sequence[Fact]) -> str:
+        """Facts that have a text: names, and values in a column."""
+        return _aligned([[fact.name, fact.text] for fact in facts], "ll")
+
+    def _titled(self, title: str, body: str, level: int) -> str:
+        return f"{title}\n{body}" if body else ""
+
+    def _table(self, table: Table) -> str:
+        """A table of columns that are all shown, with its title, footnotes and notes."""
+        alignment = "".join("l" if column.words or not index else "r" for index, column in enumerate(table.columns))
+        title = [" ".join(filter(None, (table.title, f"({table.count})" if table.count else "")))] * bool(table.title)
+        notes = [f"{mark.strip()} {text}" for text, mark in self._marks(table).items()]
+        return "\n".join([*title, _aligned(self._rows(table), alignment), *notes, *table.notes])
+
+    def _rows(self, table: Table) -> list[list[str]]:
+        """Texts of the headings, then of the cells of each row."""
+        marks = self._marks(table)
+        cells = [[self._cell(cell, marks.get(cell.note, "")) for cell in row] for row in table.cells]
+        return [[*map(self._heading, table.columns)], *cells]
+
+    def _heading(self, column: Column) -> str:
+        unit = unit_text(column.unit)
+        return f"{column.name} ({unit})" if unit else column.name
+
+    def _marks(self, table: Table) -> dict[str, str]:
+        return {text: self._raised(note.mark) for text, note in table.footnotes.items()}
+
+    def _raised(self, mark: str) -> str:
+        return f" [{mark}]"
+
+    def _number(self, cell: TableCell) -> str:
+        """Text of a cell that has one, marked by its rank."""
+        return self._escaped(cell.text)
+
+    def _stars(self, stars: str) -> str:
+        return stars
+
+    def _cell(self, cell: TableCell, mark: str) -> str:
+        if not cell.text:
+            return f"{self.dash}{mark}"
+        spread = f" {self.plus_minus} {cell.spread}" if cell.spread else ""
+        return f"{self._number(cell)}{spread}{self._stars(cell.stars) if cell.stars else ''}{mark}"
+
+
+class _Markdown(_PlainText):
+    dash = DASH
+
+    def _escaped(self, text: str) -> str:
+        return _MARKDOWN_SPECIAL.sub(r"\\\1", " ".join(text.split()))
+
+    def _item(self, item: Bullet) -> str:
+        lead = f"[{self._escaped(item.lead)}]({item.href})" if item.href else self._escaped(item.lead)
+        return f"- {': '.join(filter(None, (lead, self._escaped(item.text))))}"
+
+    def _facts(self, facts: Sequence[Fact]) -> str:
+        return "\n".join(f"- {self._escaped(fact.name)}: {self._escaped(fact.text)}" for fact in facts)
+
+    def _titled(self, title: str, body: str, level: int) -> str:
+        return "\n\n".join(filter(None, (f"{'#' * level} {self._escaped(title)}", body)))
+
+    def _table(self, table: Table) -> str:
+        count = f" ({self._escaped(table.count)})" if table.count else ""
+        title = f"**{self._escaped(table.title)}**{count}" if table.title else ""
+        head, *rows = self._rows(table)
+        rule = ["---" if column.words or not index else "---:" for index, column in enumerate(table.columns)]
+        lines = [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]
+        below = [f"{mark} {self._escaped(text)}  " for text, mark in self._marks(table).items()]
+        below += [f"{sentence(self._escaped(note))}  " for note in table.notes]
+        return "\n\n".join(filter(None, [title, "\n".join(lines), "\n".join(below).rstrip()]))
+
+    def _heading(self, column: Column) -> str:
+        unit = unit_text(column.unit)
+        return self._escaped(" ".join(filter(None, (column.name, column.arrow, f"[{unit}]" if unit else ""))))
+
+    def _raised(self, mark: str) -> str:
+        return f"<sup>{mark}</sup>"
+
+    def _number(self, cell: TableCell) -> str:
+        text = self._escaped(cell.text)
+        return {1: f"**{text}**", 2: f"<ins>{text}</ins>"}.get(cell.rank or 0, text)
+
+    def _stars(self, stars: str) -> str:
+        return self._escaped(stars)
+
+
+class _Latex(_Markdown):
+    """Tables, and all else as comments."""
+
+    between, dash, plus_minus = "\n", "--", r"$\pm$"
+
+    def _escaped(self, text: str) -> str:
+        """Plain text as LaTeX; what stands between backticks in typewriter type."""
+        parts = _CODE.split(" ".join(text.split()))
+        plain = [_SPECIAL.sub(lambda match: _ESCAPES[match.group()], part) for part in parts]
+        return "".join(rf"\texttt{{{part}}}" if number % 2 else part for number, part in enumerate(plain))
+
+    def _sentences(self, text: str) -> str:
+        return f"% {' '.join(text.split())}"
+
+    def _item(self, item: Bullet) -> str:
+        return self._sentences(": ".join(filter(None, (item.lead, item.text))))
+
+    def _facts(self, facts: Sequence[Fact]) -> str:
+        return "\n".join(self._sentences(f"{fact.name}: {fact.text}") for fact in facts)
+
+    def _titled(self, title: str, body: str, level: int) -> str:
+        head = f"\n{self._sentences(f'==== {title}')}" if level == 2 else self._sentences(f"-- {title}")
+        return "\n".join(filter(None, (head, body)))
+
+    def _table(self, table: Table) -> str:
+        count = f" ({table.count})" if table.count else ""
+        below = [f"{mark} {self._escaped(text)}." for text, mark in self._marks(table).items()]
+        below += [sentence(self._escaped(note)) for note in table.notes]
+        head, *rows = (rf"{' & '.join(cells)} \\" for cells in self._rows(table))
+        printed = [row[0].published for row in table.cells]
+        if True in printed[1:] and not printed[0]:
+            rows.insert(printed.index(True), r"\midrule")
+        lines = [
+            r"\begin{table}[t]",
+            r"\centering",
+            rf"\caption{{{self._escaped(table.title + count)}}}",
+            rf"\label{{tab:{re.sub('[^A-Za-z0-9:-]', '-', table.name)}}}",
+            rf"\begin{{tabular}}{{l{''.join('l' if column.words else 'r' for column in table.columns[1:])}}}",
+            r"\toprule",
+            head,
+            r"\midrule",
+            *rows,
+            r"\bottomrule",
+            r"\end{tabular}",
+            *([r"\par\smallskip", rf"{{\footnotesize {' '.join(below)}}}"] if below else []),
+            r"\end{table}",
+        ]
+        return "\n".join(lines)
+
+    def _raised(self, mark: str) -> str:
+        return f"$^{{{mark}}}$"
+
+    _stars = _raised
+
+    def _number(self, cell: TableCell) -> str:
+        text = _MINUS.sub("$-$", self._escaped(cell.text))
+        return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(cell.rank or 0, text)
+
+
+_PLAIN, _MARKDOWN, _LATEX = _PlainText(), _Markdown(), _Latex()
+
+
+@dataclass(frozen=True, repr=False)
+class DisplayTable(Table):
+    """A table that ``print`` shows as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame."""
+
+    def __str__(self) -> str:
+        """The table as text."""
+        return terminal_text([self])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The table as HTML; notebooks ask for it."""
+        from coliags_plugin.reporting.html_page import html_blocks
+
+        return html_blocks([self])
+
+
+def page_text(page: Page) -> str:
+    """Facts, tables and sentences of a page as text; no figures."""
+    head = "\n".join(filter(None, [terminal_text([FactList(page.facts)]), page.note, *page.cautions]))
+    return "\n\n".join(filter(None, [head, terminal_text(page.text_sections)]))
+
+
+def terminal_text(blocks: Sequence[Block]) -> str:
+    """Blocks as text, with empty lines between them."""
+    return _PLAIN.text(blocks)
+
+
+def markdown_text(page: Page) -> str:
+    """A page without its figures."""
+    escaped = _MARKDOWN._escaped
+    parts = [f"# {escaped(page.title)}", f"> {escaped(page.note)}" if page.note else ""]
+    parts.append(_MARKDOWN.text([FactList([fact for fact in page.facts if not fact.wide])]))
+    parts += [f"{fact.name}: {escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
+    parts.append("\n".join(f"- **{escaped(caution)}**" for caution in page.cautions))
+    return "\n\n".join(filter(None, [*parts, _MARKDOWN.text(page.text_sections)])) + "\n"
+
+
+def markdown_table(table: Table) -> str:
+    """A table with its title, footnotes and notes: the columns that are shown."""
+    return _MARKDOWN.text([table])
+
+
+def latex_text(page: Page) -> str:
+    """All tables in the order of the page, with the text between them as comments."""
+    parts = [_HEAD, _LATEX._sentences(page.title), _LATEX._sentences(page.note) if page.note else ""]
+    parts.append(_LATEX.text([FactList([fact for fact in page.facts if not fact.wide])]))
+    parts += [_LATEX._sentences(caution) for caution in page.cautions]
+    return "\n".join(filter(None, [*parts, _LATEX.text(page.text_sections)])) + "\n"
+
+
+def latex_table(table: Table) -> str:
+    """A ``table`` environment with caption, label, footnotes and notes: the columns that are shown."""
+    return _LATEX.text([table])
+
+
+def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
+    """Rows of cells as lines; ``l`` or ``r`` for each column."""
+    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        pads = [" " * (width - cell_len(text)) for text, width in zip(row, widths, strict=True)]
+        cells = [
+            pad + text if side == "r" else text + pad for text, pad, side in zip(row, pads, alignment, strict=True)
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
