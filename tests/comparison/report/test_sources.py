@@ -154,45 +154,44 @@ def test_what_was_not_evaluated_is_refused(tmp_path):
     refuses([run, run / ".." / "run"], "twice")
 
 
-def test_a_comparison_under_another_protocol_says_which(tmp_path):
-    folder = write_comparison(tmp_path, [result_of("coliags")])
-    refuses([folder], "results of protocol paper only.*Pass --protocol paper", protocol="authors-code")
-
-
-@pytest.mark.parametrize(("content", "match"), [("{", "cut off"), ("{}", "not a results file")])
-def test_a_damaged_file_is_refused_by_name(tmp_path, content, match):
-    folder = write_comparison(tmp_path, [result_of("coliags")])
-    (file,) = folder.glob("results/*/*/*.json")
+@pytest.mark.parametrize(
+    ("kind", "content", "match"),
+    [
+        ("results", "{", "cut off"),
+        ("results", "{}", "not a results file"),
+        ("failures", "{", "is not JSON"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_name(tmp_path, kind, content, match):
+    folder = write_comparison(tmp_path, [result_of("coliags")], [("cecum", "3dgs", 0, "")])
+    (file,) = folder.glob(f"{kind}/*/*/*.json")
     file.write_text(content)
     refuses([folder], f"{file.name}.*{match}")
 
 
-def test_a_damaged_failure_is_refused_by_name(tmp_path):
-    folder = write_comparison(tmp_path, [result_of("coliags")], [("cecum", "3dgs", 0, "")])
-    (file,) = folder.glob("failures/*/*/*.json")
-    file.write_text("{")
-    refuses([folder], f"{file.name} is not JSON")
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"version": 2}, "version 1, .*version 2"),
+        ({"size": (32, 24)}, "16 x 12 and 32 x 24 px"),
+        ({"scene": "sigmoid"}, "no scene in common: coliags has cecum, the other methods have sigmoid"),
+        ({"split": "block"}, "coliags was trained on split 'every-8th', the other methods on split 'block'"),
+        ({"train": ("0001", "0003")}, "trained on different frames"),
+        ({"frames": FRAMES | {"test": (*FRAMES["test"][:-1], "0037")}}, "'0036' in one where the other has '0037'"),
+        ({"frames": {"test": ("0004",)}}, "5 and 1 frames"),
+        ({"frames": {"test": FRAMES["test"]}}, "'rotation' is in one of them"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(study_of, options, match):
+    with pytest.raises(InputError, match=match):
+        study_of([result_of("coliags"), result_of("3dgs", **options)])
 
 
-def test_what_cannot_be_compared_is_refused(study_of):
-    ours = result_of("coliags")
-
-    def refused(match, **options):
-        with pytest.raises(InputError, match=match):
-            study_of([ours, result_of("3dgs", **options)])
-
-    refused("version 1, .*version 2", version=2)
-    refused("16 x 12 and 32 x 24 px", size=(32, 24))
-    refused("no scene in common: coliags has cecum, the other methods have sigmoid", scene="sigmoid")
-    refused("coliags was trained on split 'every-8th', the other methods on split 'block'", split="block")
-    refused("trained on different frames", train=("0001", "0003"))
-    refused("'0036' in one where the other has '0037'", frames=FRAMES | {"test": (*FRAMES["test"][:-1], "0037")})
-    refused("5 and 1 frames", frames={"test": ("0004",)})
-    refused("'rotation' is in one of them", frames={"test": FRAMES["test"]})
+def test_other_true_images_are_refused(study_of):
     other = result_of("3dgs")
     moved = {name: part.model_copy(update={"truth_sha256": "f" * 64}) for name, part in other.sets.items()}
     with pytest.raises(InputError, match="true images or depths of set 'test' differ"):
-        study_of([ours, other.model_copy(update={"sets": moved})])
+        study_of([result_of("coliags"), other.model_copy(update={"sets": moved})])
 
 
 def test_another_scene_may_have_another_size_and_other_sets(study_of):
@@ -207,14 +206,9 @@ OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
 
 
 def test_splits_are_parts_of_their_own(study_of):
-    results = [result_of(method, split=split) for split in ("every-8th", "block") for method in ("a", "b")]
-    study = study_of(results)
-    assert [(part.split, part.set_name) for part in study.parts] == [
-        ("every-8th", "test"),
-        ("every-8th", "rotation"),
-        ("block", "test"),
-        ("block", "rotation"),
-    ]
+    study = study_of([result_of(method, split=split) for split in ("every-8th", "block") for method in ("a", "b")])
+    expected = [(split, name) for split in ("every-8th", "block") for name in ("test", "rotation")]
+    assert [(part.split, part.set_name) for part in study.parts] == expected
     assert study.methods == ["a", "b"]
 
 
