@@ -29,19 +29,21 @@ def test_auto_falls_back_to_torch_and_says_why(monkeypatch):
 
 
 def test_auto_passes_its_options_on():
-    chosen = choose_renderer(
-        make_component("renderers", {"name": "auto", "background": (0.5, 0.0, 0.0)}), "gaussians3d", CPU
-    )
-    assert chosen.renderer.settings.background == (0.5, 0.0, 0.0)
+    renderer = make_component("renderers", {"name": "auto", "background": (0.5, 0.0, 0.0)})
+    assert choose_renderer(renderer, "gaussians3d", CPU).renderer.settings.background == (0.5, 0.0, 0.0)
 
 
-def test_an_impossible_pair_names_both_sides():
-    with pytest.raises(InputError, match=r"draws gaussians3d, surfels, the field is made of radiance"):
-        choose_renderer(make_component("renderers", "torch"), "radiance", CPU)
-    with pytest.raises(InputError, match=r"no renderer can serve.*--set renderer=NAME, NAME being volume"):
-        choose_renderer(make_component("renderers", "auto"), "radiance", CPU)
-    with pytest.raises(InputError, match=r"renderer auto, prefer: .*Did you mean 'volume'"):
-        choose_renderer(make_component("renderers", {"name": "auto", "prefer": ("volum",)}), "radiance", CPU)
+@pytest.mark.parametrize(
+    ("renderer", "message"),
+    [
+        ("torch", r"draws gaussians3d, surfels, the field is made of radiance"),
+        ("auto", r"no renderer can serve.*--set renderer=NAME, NAME being volume"),
+        ({"name": "auto", "prefer": ("volum",)}, r"renderer auto, prefer: .*Did you mean 'volume'"),
+    ],
+)
+def test_an_impossible_pair_names_both_sides(renderer, message):
+    with pytest.raises(InputError, match=message):
+        choose_renderer(make_component("renderers", renderer), "radiance", CPU)
 
 
 def test_an_unavailable_renderer_says_why(monkeypatch):

@@ -24,6 +24,7 @@ from tests.renderers.naive import splat_surfels
 from tests.renderers.test_torch_renderer import (
     INPUTS,
     SUMS,
+    FieldOf,
     cast,
     make,
     moved,
@@ -37,6 +38,7 @@ from tests.renderers.test_torch_renderer import (
 from tests.renderers.test_torch_renderer import OUTPUTS as SOLID_OUTPUTS
 from tests.renderers.test_torch_renderer import SCENES as SCENES_OF_GAUSSIANS
 from tests.renderers.test_torch_renderer import scene as scene_of_gaussians
+from tests.renderers.test_torch_renderer import smooth_scene as solid_smooth_scene
 
 BACKGROUND = (0.3, 0.1, 0.9)
 #: Depth of an intersection that tells a ray and a disc are all but parallel, in scenes 9 deep at most: relative errors
@@ -349,16 +351,13 @@ def test_a_disc_that_faces_the_camera(opacity):
     assert output.splats.radii.tolist() == [math.ceil(math.sqrt(tau * (camera.fy * scales[1] / z) ** 2 + 1e-4))]
 
 
-def test_a_disc_smaller_than_a_pixel_is_drawn_by_the_filter():
-    camera = pinhole()
-    output = render_gaussians(make_surfels([0, 0, 5.0], 1e-5, 0.7), camera)
+@pytest.mark.parametrize("deviation", [math.sqrt(0.5), 2.0])
+def test_a_disc_smaller_than_a_pixel_is_drawn_by_the_filter(deviation):
+    options = TorchRendererSettings(surfel_filter=deviation)
+    output = render_gaussians(make_surfels([0, 0, 5.0], 1e-5, 0.7), pinhole(), settings=options)
     rows, columns = torch.meshgrid(torch.arange(7.0) - 3, torch.arange(9.0) - 4, indexing="ij")
-    expected = 0.7 * torch.exp(-(rows**2 + columns**2).double())
+    expected = 0.7 * torch.exp(-0.5 * (rows**2 + columns**2).double() / deviation**2)
     torch.testing.assert_close(output.alpha, torch.where(expected < 1 / 255, 0.0, expected), rtol=1e-7, atol=1e-12)
-    wider = render_gaussians(
-        make_surfels([0, 0, 5.0], 1e-5, 0.7), camera, settings=TorchRendererSettings(surfel_filter=2)
-    )
-    torch.testing.assert_close(wider.alpha[3, 6].item(), 0.7 * math.exp(-0.5))
 
 
 def slanted_plane(normal, distance, spacing, flat=None):
@@ -386,7 +385,7 @@ def test_depths_and_normals_of_a_slanted_plane_are_exact_where_those_of_flat_gau
     for name in ("depth_expected", "depth_median"):
         of_surfels = float((output[name] - depth)[inside].abs().max())
         of_gaussians = float((render_gaussians(gaussians, camera, (name,))[name] - depth)[inside].abs().max())
-        print(f"{name} of a plane 5 away: surfels {of_surfels:.1e}, flat Gaussians {of_gaussians:.1e}")
+
         assert of_surfels < 1e-12 and of_gaussians > 0.1
     torch.testing.assert_close(output["normals"], -output.alpha[..., None] * normal)
     assert output["distortion"].abs().max() < 1e-28
@@ -395,22 +394,13 @@ def test_depths_and_normals_of_a_slanted_plane_are_exact_where_those_of_flat_gau
 # --- distortion -------------------------------------------------------------------------------------------------------
 
 
-def test_distortion_of_two_discs_and_of_one():
-    near, far = 0.2, 100.0
+@pytest.mark.parametrize("far", [100.0, 6.0])
+def test_distortion_of_two_discs(far):
+    near, settings = 0.2, TorchRendererSettings(distortion_far=far)
     discs = make_surfels([[0, 0, 3.0], [0, 0, 4.0]], 1e4, torch.tensor([0.4, 0.5], dtype=torch.float64))
-    output = render_gaussians(discs, pinhole(), ("distortion",))
+    found = render_gaussians(discs, pinhole(), ("distortion",), settings)["distortion"][3, 4]
     first, second = (far / (far - near) * (1 - near / z) for z in (3.0, 4.0))
-    torch.testing.assert_close(
-        output["distortion"][3, 4].item(), 0.4 * 0.6 * 0.5 * (first - second) ** 2, rtol=1e-9, atol=0
-    )
-    nearer = render_gaussians(discs, pinhole(), ("distortion",), TorchRendererSettings(distortion_far=6.0))
-    first, second = (6.0 / 5.8 * (1 - near / z) for z in (3.0, 4.0))
-    torch.testing.assert_close(
-        nearer["distortion"][3, 4].item(), 0.4 * 0.6 * 0.5 * (first - second) ** 2, rtol=1e-9, atol=0
-    )
-    one, camera = scene("random")
-    one = dataclasses.replace(one, **{k: getattr(one, k)[:1] for k in INPUTS})
-    assert render_gaussians(one, camera, ("distortion",))["distortion"].max() < 1e-30
+    assert found.item() == pytest.approx(0.4 * 0.6 * 0.5 * (first - second) ** 2, rel=1e-9)
 
 
 def test_distortion_of_close_discs_survives_float32():
@@ -426,23 +416,24 @@ def test_distortion_of_close_discs_survives_float32():
 
 
 @pytest.mark.parametrize(
-    ("mean", "scales", "quat"),
+    ("made", "mean", "scales", "opacity", "quat"),
     [
-        ([0, 0, 0.2], 0.3, [1.0, 0, 0, 0]),
-        ([0, 0, -3.0], 0.3, [1.0, 0, 0, 0]),
-        ([0, 0, 3.0], 0.3, [0.5, 0.5, 0.5, 0.5]),  # exactly edge-on: its normal is the x axis
-        ([0, 0, 3.0], (0.3, 0.0), [1.0, 0, 0, 0]),
-        ([90.0, 0, 3.0], 0.3, [1.0, 0, 0, 0]),
+        *((make, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.0, 0.1, 0.2)),
+        (make, [0, 0, 4.0], 0.3, 1 / 256, [1.0, 0, 0, 0]),
+        *((make_surfels, [0, 0, depth], 0.3, 0.7, [1.0, 0, 0, 0]) for depth in (-3.0, 0.2)),
+        (make_surfels, [0, 0, 3.0], 0.3, 0.7, [0.5, 0.5, 0.5, 0.5]),  # exactly edge-on: its normal is the x axis
+        (make_surfels, [0, 0, 3.0], (0.3, 0.0), 0.7, [1.0, 0, 0, 0]),
+        (make_surfels, [90.0, 0, 3.0], 0.3, 0.7, [1.0, 0, 0, 0]),
     ],
 )
-def test_what_is_not_drawn_gets_no_gradient(mean, scales, quat):
-    gaussians = cast(make_surfels(mean, scales, 0.7, quats=torch.tensor([quat])), grad=True)
-    pose = torch.eye(4, dtype=torch.float64).requires_grad_()
+def test_what_is_not_drawn_gets_no_gradient(made, mean, scales, opacity, quat):
+    gaussians = cast(made(mean, scales, opacity, quats=torch.tensor([quat])), grad=True)
+    wants, pose = outputs_of(gaussians), torch.eye(4, dtype=torch.float64).requires_grad_()
     camera = dataclasses.replace(pinhole(), camera_to_world=pose)
-    output = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(background=BACKGROUND))
+    output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(background=BACKGROUND))
     assert torch.equal(output.rgb, torch.tensor(BACKGROUND, dtype=torch.float64).expand(7, 9, 3))
-    assert output.splats.radii.tolist() == [0] and not any(output[name].any() for name in OUTPUTS if name != "rgb")
-    sum(output[name].sum() for name in OUTPUTS).backward()
+    assert output.splats.radii.tolist() == [0] and not any(output[name].any() for name in wants if name != "rgb")
+    sum(output[name].sum() for name in wants).backward()
     for gradient in (*(getattr(gaussians, name).grad for name in INPUTS), pose.grad, output.splats.means2d.grad):
         assert not gradient.any()
 
@@ -501,21 +492,30 @@ class Surfels(GaussianField):
 Surfels.__abstractmethods__ = frozenset()
 
 
-def test_the_registered_component_renders_surfels_with_their_own_outputs():
+def test_the_registered_component_renders_both_primitives_with_their_own_outputs():
     renderer_class = registry.renderers.get("torch")
-    assert "surfels" in renderer_class.primitives
+    assert renderer_class is TorchRenderer and renderer_class.availability().ok
+    assert renderer_class.primitives == {"gaussians3d", "surfels"}
     assert renderer_class.outputs_of("surfels") == set(OUTPUTS)
-    assert renderer_class.outputs_of("gaussians3d") == renderer_class.outputs == set(OUTPUTS) - {"distortion"}
-    gaussians, camera = smooth_scene()
-    model = Model(Surfels(gaussians), TorchRenderer(TorchRendererSettings()), {})
-    assert "distortion" in model.outputs
+    assert renderer_class.outputs_of("gaussians3d") == renderer_class.outputs == set(SOLID_OUTPUTS)
+    for field, wants in (
+        (FieldOf(solid_smooth_scene()[0]), ("depth_expected",)),
+        (Surfels(smooth_scene()[0]), ("distortion",)),
+    ):
+        gaussians, camera = field.gaussians(None), smooth_scene()[1]
+        output = renderer_class(renderer_class.Settings()).render(field, camera, wants)
+        assert output.splats.gaussians is gaussians
+        torch.testing.assert_close(
+            output[wants[0]], render_gaussians(gaussians, camera, outputs_of(gaussians))[wants[0]]
+        )
+        with pytest.raises(KeyError):
+            output["depth_median"]
+    model = Model(field, TorchRenderer(TorchRendererSettings()), {})
     model.check_outputs(["distortion"], "a loss")
-    output = model.render(camera, ("distortion",))
-    torch.testing.assert_close(output["distortion"], render_gaussians(gaussians, camera, OUTPUTS)["distortion"])
+    torch.testing.assert_close(model.render(camera, wants)["distortion"], output["distortion"])
+    field.primitive = "radiance"
     with pytest.raises(InputError, match="no renderer output 'distortion'"):
-        field = Surfels(gaussians)
-        field.primitive = "radiance"
-        VolumeRenderer(VolumeRendererSettings()).render(field, camera, ("distortion",))
+        VolumeRenderer(VolumeRendererSettings()).render(field, camera, wants)
 
 
 @pytest.mark.parametrize(("far", "near"), [(0.2, 0.2), (100.0, 200.0)])

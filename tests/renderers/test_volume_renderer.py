@@ -87,13 +87,6 @@ def test_some_pixels_are_those_of_the_whole_image():
     torch.testing.assert_close(some["depth_expected"][:, 0], whole["depth_expected"][row, column])
 
 
-def test_refusals():
-    with pytest.raises(InputError, match="no renderer output 'normals'"):
-        make().render(Fog(1.0), camera_at(0, 0, 0), ("normals",))
-    with pytest.raises(InputError, match="start at 2 and end at 1"):
-        make(far_plane=1.0).check_field(Fog(1.0), 2.0)
-
-
 # --- from coarse to fine ----------------------------------------------------------------------------------------------
 
 
@@ -246,28 +239,36 @@ def test_chance_places_samples_in_training_alone():
     assert not torch.equal(drawn(0, jitter=True), drawn(1, jitter=True))
 
 
-def test_bounds_of_the_field_and_their_refusals():
-    field, camera = Fog(50.0, start=12.0), camera_at(0, 0, 0)
+BOUNDED = type("Bounded", (Fog,), {"ray_bounds": torch.tensor([10.0, 25.0], dtype=torch.float64)})(50.0, 12.0)
+
+
+def test_bounds_of_the_field():
     open_ended = make(far_plane=None, spacing="distance", samples=300)
-    with pytest.raises(InputError, match="does not know where its surface is"):
-        open_ended.check_field(field, 0.0)
-    make().check_field(field, 0.2)
-    bounded = type("Bounded", (Fog,), {"ray_bounds": torch.tensor([10.0, 25.0], dtype=torch.float64)})(50.0, 12.0)
-    open_ended.check_field(bounded, 0.0)
     given = make(far_plane=25.0, spacing="distance", samples=300)
+    make().check_field(Fog(50.0), 0.2)
+    open_ended.check_field(BOUNDED, 0.0)
     ours, theirs = (
-        one.render(bounded, replace(camera, near_plane=near), ("depth_expected",))
-        for one, near in ((open_ended, 0.0), (given, 10.0))
+        one.render(BOUNDED, camera_from(near), ("depth_expected",)) for one, near in ((open_ended, 0.0), (given, 10.0))
     )
     assert torch.equal(ours["depth_expected"], theirs["depth_expected"])
-    with pytest.raises(InputError, match=r"start at 30 and end at 25"):
-        open_ended.check_field(bounded, 30.0)
-    with pytest.raises(ValueError, match="spacing 'depth': a field's own is a distance"):
-        make(far_plane=None)
-    with pytest.raises(InputError, match="near_plane 0 with spacing 'depth'"):
-        make().check_field(bounded, 0.0)
-    with pytest.raises(ValueError, match="importance_samples with samples 2"):
-        make(samples=2, importance_samples=4)
+
+
+@pytest.mark.parametrize(
+    ("options", "field", "near_plane", "message"),
+    [
+        ({"far_plane": 1.0}, Fog(1.0), 2.0, "start at 2 and end at 1"),
+        ({"far_plane": None, "spacing": "distance"}, Fog(1.0), 0.0, "does not know where its surface is"),
+        ({"far_plane": None, "spacing": "distance"}, BOUNDED, 30.0, "start at 30 and end at 25"),
+        ({}, BOUNDED, 0.0, "near_plane 0 with spacing 'depth'"),
+        ({"far_plane": None}, None, 0.0, "spacing 'depth': a field's own is a distance"),
+        ({"samples": 2, "importance_samples": 4}, None, 0.0, "importance_samples with samples 2"),
+    ],
+)
+def test_refusals(options, field, near_plane, message):
+    with pytest.raises(ValueError if field is None else InputError, match=message):
+        make(**options).check_field(field, near_plane)
+    with pytest.raises(InputError, match="no renderer output 'normals'"):
+        make().render(Fog(1.0), camera_at(0, 0, 0), ("normals",))
 
 
 # --- a radiance field as a third party would add one ------------------------------------------------------------------
