@@ -14,9 +14,7 @@ from hypothesis import strategies as st
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
-from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead, IMIAAppearanceSettings
 from coliags_plugin.fields.frustum import spheres_in_frustum
-from coliags_plugin.fields.mlp import embedded_inputs
 from tests.fields.made import make_field
 from tests.scenes import camera_at, wall_scene
 
@@ -34,12 +32,21 @@ def make(node, seed=0, **options):
     return field
 
 
-def test_perceptron_sizes_are_the_papers():
-    field = make(COLIAGS)
-    sizes = {name: [tuple(p.shape) for p in group if p.ndim == 2] for name, group in field.parameter_groups().items()}
-    assert sizes["opacity_mlp"] == [(32, 95), (10, 32)]
-    assert sizes["covariance_mlp"] == [(32, 95), (70, 32)]
-    assert sizes["color_mlp"] == [(32, 47), (30, 32)]
+@pytest.mark.parametrize(
+    ("options", "sizes"),
+    [
+        (COLIAGS, [(32, 95), (10, 32), (32, 95), (70, 32), (32, 47), (30, 32)]),
+        (SCAFFOLD, [(32, 35), (10, 32), (32, 35), (70, 32), (32, 35), (30, 32)]),
+        (
+            {**SCAFFOLD, "appearance_head": {"name": "plain", "distance": True}},
+            [(32, 35), (10, 32), (32, 35), (70, 32), (32, 36), (30, 32)],
+        ),
+    ],
+)
+def test_perceptron_sizes_are_the_papers(options, sizes):
+    groups = make(options).parameter_groups()
+    parameters = [p for name in ("opacity_mlp", "covariance_mlp", "color_mlp") for p in groups[name]]
+    assert [tuple(p.shape) for p in parameters if p.ndim == 2] == sizes
 
 
 def test_spacing_is_the_anchors_own_and_travels_with_the_state():
@@ -47,23 +54,6 @@ def test_spacing_is_the_anchors_own_and_travels_with_the_state():
     field = make(COLIAGS, voxel_size=2.0)
     assert field.spacing == pytest.approx(2.0, rel=1e-5)
     assert type(field).from_state(field.state_dict(), field.settings).spacing == field.spacing
-
-
-def test_scaffold_perceptron_sizes():
-    field = make(SCAFFOLD)
-    assert field.geometry_head.opacity_mlp[0].in_features == 35
-    assert field.appearance_head.color_mlp[0].in_features == 35
-    with_distance = make(SCAFFOLD, appearance_head={"name": "plain", "distance": True})
-    assert with_distance.appearance_head.color_mlp[0].in_features == 36
-
-
-def test_coliags_with_plain_heads_is_scaffold_to_the_bit():
-    plain = {"geometry_head": {"name": "plain"}, "appearance_head": {"name": "plain"}}
-    ours, theirs = make({**COLIAGS, **plain}), make(SCAFFOLD)
-    camera = camera_at(1.0, 0.5, 2.0)
-    first, second = ours.gaussians(camera), theirs.gaussians(camera)
-    for name in ("means", "quats_wxyz", "scales", "opacities", "colors", "source_index", "visible_sources"):
-        assert torch.equal(getattr(first, name), getattr(second, name))
 
 
 def test_imve_without_frequencies_decodes_as_the_plain_head():
@@ -121,24 +111,18 @@ def test_sources_name_anchor_and_child():
     assert set((drawn.source_index // 10).tolist()) <= set(drawn.visible_sources.tolist())
 
 
-def test_initial_anchors_lie_on_the_grid_once():
-    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 10 - 5
-    anchors = voxelize(points, 0.8)
-    cells = anchors / 0.8
-    torch.testing.assert_close(cells, cells.round(), rtol=0, atol=1e-5)
-    assert len(torch.unique(cells.round(), dim=0)) == len(anchors)
-    nearest = torch.cdist(points, anchors).amin(dim=1)
-    assert nearest.max() <= 0.8 * math.sqrt(3) / 2 + 1e-5
-
-
 @settings(max_examples=20, deadline=None)
 @given(size=st.floats(0.3, 5.0), seed=st.integers(0, 1000))
-def test_voxels_really_merge_and_do_not_depend_on_order(size, seed):
+def test_initial_anchors_lie_on_the_grid_once_and_do_not_depend_on_order(size, seed):
     generator = torch.Generator().manual_seed(seed)
-    points = torch.rand(200, 3, generator=generator) * 4
+    points = torch.rand(200, 3, generator=generator) * 4 - 2
     anchors = voxelize(points, size)
     assert 1 <= len(anchors) <= (4 / size + 2) ** 3
     assert torch.equal(anchors, voxelize(points[torch.randperm(200, generator=generator)], size))
+    cells = anchors / size
+    torch.testing.assert_close(cells, cells.round(), rtol=0, atol=1e-5)
+    assert len(torch.unique(cells.round(), dim=0)) == len(anchors)
+    assert torch.cdist(points, anchors).amin(dim=1).max() <= size * math.sqrt(3) / 2 + 1e-5
 
 
 def test_initial_scales_are_root_mean_square_neighbour_distances():
@@ -164,29 +148,13 @@ def test_default_voxel_is_two_pixels_on_the_surface():
     assert len(field.anchors) < len(scene.points) / 2
 
 
-def test_useless_voxels_are_warned_of(caplog):
+def test_useless_voxels_are_warned_of_and_no_points_are_an_input_error(caplog):
     with caplog.at_level("WARNING"):
         make_field(**COLIAGS, voxel_size=0.001)
     assert "merge almost nothing" in caplog.text
-
-
-def test_no_points_are_an_input_error():
     scene = replace(wall_scene(), points=PointCloud(torch.zeros(0, 3)))
     with pytest.raises(InputError, match="no initial points"):
         make_field(**COLIAGS, scene=scene, voxel_size=1.0)
-
-
-def test_frustum_filter_changes_no_drawn_gaussian():
-    """Every child whose ellipse can touch the image belongs to a visible anchor; a turned camera decodes fewer."""
-    field = make(COLIAGS, voxel_size=1.0)
-    camera = camera_at(0.0, 0.0, 10.0, yaw=0.9)
-    visible = set(field.visible_anchors(camera).tolist())
-    assert 0 < len(visible) < len(field.anchors)
-    positions = field.child_positions().detach().double()
-    for anchor in range(len(field.anchors)):
-        pixels, depth = camera.project(positions[anchor])
-        inside = (depth > 0.2) & ((pixels >= 0) & (pixels < torch.tensor([32.0, 24.0]))).all(dim=1)
-        assert anchor in visible or not inside.any()
 
 
 @settings(max_examples=30, deadline=None)
@@ -263,22 +231,6 @@ def test_hidden_units_start_over_the_distances_that_occur(head, column):
     assert torch.equal(before.weight, after.weight)
     on_kink = after.bias + after.weight[:, column] * torch.from_numpy(kinks).float()
     torch.testing.assert_close(on_kink, before.bias, atol=1e-5, rtol=0.0)
-
-
-def test_few_units_start_dead():
-    """Over a colon's distances in mm, features 0; by default more than a third of the units are never active."""
-    distances = torch.linspace(5.0, 100.0, 500)
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=1)
-    dead = {}
-    for start in ("scene_distances", "pytorch"):
-        head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
-        head.init_from_distances(distances)
-        networks = head.networks(torch.zeros(500, 32), directions, distances[:, None], directions[:, 2:].abs(), None)
-        inputs = torch.cat([torch.zeros(500, 32), embedded_inputs(networks)], dim=1)
-        dead[start] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
-    assert dead["scene_distances"] <= 2
-    assert dead["pytorch"] >= 11
 
 
 def test_a_head_that_does_not_see_the_distance_expects_nothing():

@@ -17,26 +17,9 @@ def test_imia_embedding_of_one_half():
     assert embedded[0].tolist() == pytest.approx(HALF, abs=5e-7)
 
 
-def test_imia_embedding_of_zero():
-    assert cosine_embedding(torch.zeros(1, 1), 5)[0].tolist() == [0.0] + [0.0, 1.0] * 5
-
-
-def test_imve_embedding_order():
-    v = torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64)
-    embedded = cosine_embedding(v, 10)[0]
-    assert len(embedded) == 63
-    torch.testing.assert_close(embedded[:3], v[0])
-    for k in range(10):
-        block = embedded[3 + 6 * k : 9 + 6 * k]
-        torch.testing.assert_close(block, torch.cat([(2**k * v[0]).sin(), (2**k * v[0]).cos()]))
-
-
-def test_no_frequencies_leave_the_input():
-    x = torch.rand(4, 3)
-    torch.testing.assert_close(cosine_embedding(x, 0), x, rtol=0, atol=0)
-
-
-def test_dtype_and_leading_dimensions_are_kept():
-    embedded = cosine_embedding(torch.rand(2, 5, 3, dtype=torch.float64), 4)
-    assert embedded.shape == (2, 5, 27)
-    assert embedded.dtype == torch.float64
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("shape", "frequencies"), [((1, 3), 10), ((2, 5, 3), 4), ((4, 1), 5), ((4, 3), 0)])
+def test_octaves_follow_one_another(shape, frequencies, dtype):
+    v = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    octaves = [part for k in range(frequencies) for part in ((2**k * v).sin(), (2**k * v).cos())]
+    torch.testing.assert_close(cosine_embedding(v, frequencies), torch.cat([v, *octaves], dim=-1))

@@ -22,9 +22,10 @@ def make(scene=None, **options):
     return make_field("gaussians", scene or colored_wall(), **options)
 
 
-def test_one_faint_round_gaussian_at_every_point():
+@pytest.mark.parametrize("name", ["gaussians", "surfels"])
+def test_one_faint_round_gaussian_at_every_point(name):
     scene = colored_wall()
-    field = make(scene)
+    field = make_field(name, scene)
     seen = field.gaussians(camera_at(0, 0, -50))
     points = scene.points.positions[seen.source_index]
     torch.testing.assert_close(seen.means, points)
@@ -32,7 +33,9 @@ def test_one_faint_round_gaussian_at_every_point():
     torch.testing.assert_close(seen.colors, scene.points.colors[seen.source_index] / 255.0)
     # Points on a grid of 0.5 mm: inner ones have three neighbours at that distance.
     assert seen.scales.median().item() == pytest.approx(0.5, rel=1e-5)
-    assert torch.equal(seen.quats_wxyz, torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4))
+    assert seen.scales.shape[1] == (2 if name == "surfels" else 3) and torch.equal(seen.scales[:, 0], seen.scales[:, 1])
+    if name == "gaussians":
+        assert torch.equal(seen.quats_wxyz, torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4))
 
 
 def test_points_without_colours_are_grey_and_no_points_are_refused():
@@ -140,21 +143,18 @@ def test_parameter_groups_are_named_as_in_gsplat():
 # Surfels
 
 
-def test_one_faint_round_disc_at_every_point_turned_at_random():
-    scene, field = wall_scene(), make_field("surfels")
+def test_surfels_are_turned_at_random_and_restored_in_any_number():
+    field = make_field("surfels", normal_neighbours=8)
     assert field.primitive == "surfels" and field.elements == "gaussians"
-    seen = field.gaussians(camera_at(0, 0, -50))
-    assert seen.scales.shape == (len(seen), 2) and torch.equal(seen.scales[:, 0], seen.scales[:, 1])
-    torch.testing.assert_close(seen.means, scene.points.positions[seen.source_index])
-    torch.testing.assert_close(seen.opacities, torch.full((len(seen),), 0.1))
-    # Points on a grid of 0.5 mm: inner ones have three neighbours at that distance.
-    assert seen.scales.median().item() == pytest.approx(0.5, rel=1e-5)
+    assert field.references.of_rows.shape == (field.element_count, 3)
     quats = field.quats.detach()
     assert 0 <= quats.min() < 0.01 and 0.99 < quats.max() < 1
     torch.testing.assert_close(quats.mean(0), torch.full((4,), 0.5), rtol=0, atol=0.03)
-    assert torch.equal(make_field("surfels").quats, field.quats) and not torch.equal(
-        make_field("surfels", seed=1).quats, field.quats
-    )
+    same, other = (make_field("surfels", seed=seed) for seed in (0, 1))
+    assert torch.equal(same.quats, field.quats) and not torch.equal(other.quats, field.quats)
+    state = {name: value[:7] if value.ndim else value for name, value in same.state_dict().items()}
+    restored = type(same).from_state(state, same.settings)
+    assert restored.element_count == 7 and restored.scales.shape == (7, 2)
 
 
 def test_their_normals_are_those_that_are_drawn():
@@ -170,15 +170,3 @@ def test_their_normals_are_those_that_are_drawn():
     row, column = divmod(int(output.alpha.argmax()), output.alpha.shape[1])
     drawn = output["normals"][row, column] / output.alpha[row, column]
     torch.testing.assert_close(drawn, normal if normal[2] < 0 else -normal, rtol=1e-4, atol=1e-5)
-
-
-def test_from_state_restores_any_number():
-    field = make_field("surfels")
-    state = {name: value[:7] if value.ndim else value for name, value in field.state_dict().items()}
-    other = type(field).from_state(state, field.settings)
-    assert other.element_count == 7 and other.scales.shape == (7, 2)
-
-
-def test_references_work_for_surfels_too():
-    field = make_field("surfels", normal_neighbours=8)
-    assert field.references.of_rows.shape == (field.element_count, 3)

@@ -92,12 +92,21 @@ def test_a_glint_beside_the_normal_is_learned():
     assert errors["imia-glints"] < 0.75 * errors["imia"]
 
 
-def test_a_field_keeps_normals_for_it_alone_or_below_a_law():
-    for appearance in ("imia-glints", {"name": "attenuated", "head": "imia-glints"}):
-        field = make_field("anchors", geometry_head="plain", appearance_head=appearance)
-        torch.testing.assert_close(field.normals[:, 2].abs(), torch.ones(len(field.anchors)))
-        gaussians = field.gaussians(camera_at(0.5, 0.0, 1.0))
-        assert gaussians.colors.isfinite().all()
-        gaussians.colors.sum().backward()
-        gradients = [value.grad for value in field.appearance_head.parameters() if value.grad is not None]
-        assert all(gradient.isfinite().all() for gradient in gradients)
+@pytest.mark.parametrize(
+    "appearance",
+    [
+        *("imia-glints", {"name": "attenuated", "head": "imia-glints"}),
+        {"name": "attenuated", "head": "plain", "incidence_exponent": 0.3},
+    ],
+)
+def test_a_field_keeps_the_normals_of_the_wall_for_heads_that_see_them(appearance):
+    field = make_field("anchors", geometry_head="plain", appearance_head=appearance)
+    torch.testing.assert_close(field.normals[:, 2].abs(), torch.ones(len(field.anchors)))
+    assert torch.equal(type(field).from_state(field.state_dict(), field.settings).normals, field.normals)
+    gaussians = field.gaussians(camera_at(0.5, 0.0, 1.0))
+    assert gaussians.colors.isfinite().all()
+    gaussians.colors.sum().backward()
+    gradients = [value.grad for value in field.appearance_head.parameters() if value.grad is not None]
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    without = make_field("anchors", geometry_head="plain", appearance_head="plain")
+    assert without.normals is None and "normals" not in without.state_dict()

@@ -79,9 +79,6 @@ def test_fields_carry_them_through_checkpoints():
     other = type(field).from_state(field.state_dict(), field.settings)
     assert torch.equal(other.references.of_rows, field.references.of_rows)
     assert torch.equal(other.references.points, field.references.points)
-
-
-def test_without_neighbours_there_are_none():
-    field = make_field("gaussians")
-    assert field.references is None
-    assert not any(name.startswith("references") for name in field.state_dict())
+    without = make_field("gaussians")
+    assert without.references is None
+    assert not any(name.startswith("references") for name in without.state_dict())
