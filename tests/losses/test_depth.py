@@ -57,33 +57,26 @@ def test_pixels_are_weighted_by_their_confidence(name, case):
     output, frame, rendered = case
     known = frame.mask & frame.depth.isfinite()
     weights = frame.depth_confidence.double() * known
+
+    def compared(frame, expected):
+        term = make(name)(output, frame)
+        gradients = [torch.autograd.grad(each, rendered, retain_graph=True)[0] for each in (term, expected)]
+        assert not gradients[0][~known].any()
+        return term.item(), expected.item(), *gradients
+
     expected = (weights * penalties(name, output, frame)).sum() / weights.sum()
-    term = make(name)(output, frame)
-    assert term.item() == pytest.approx(expected.item(), rel=1e-12)
-    (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
-    (found,) = torch.autograd.grad(term, rendered)
+    term, value, found, wanted = compared(frame, expected)
+    assert term == pytest.approx(value, rel=1e-12)
     torch.testing.assert_close(found, wanted)
-    assert not found[~known].any()
-
-
-@pytest.mark.parametrize("name", WEIGHTED)
-def test_without_confidence_nothing_changes_to_the_bit(name, case):
-    output, frame, rendered = case
-    plain = replace(frame, depth_confidence=None)
-    known = frame.mask & frame.depth.isfinite()
-    term, expected = make(name)(output, plain), masked_mean(penalties(name, output, frame), known)
-    assert term.item() == expected.item()
-    assert torch.equal(*(torch.autograd.grad(each, rendered, retain_graph=True)[0] for each in (term, expected)))
+    # Without confidence nothing changes, to the bit.
+    expected = masked_mean(penalties(name, output, frame), known)
+    plain, value, found, wanted = compared(replace(frame, depth_confidence=None), expected)
+    assert plain == value and torch.equal(found, wanted)
     certain = replace(frame, depth_confidence=torch.ones(HEIGHT, WIDTH))
-    assert make(name)(output, certain).item() == pytest.approx(term.item(), rel=1e-12)
-
-
-@pytest.mark.parametrize("name", WEIGHTED)
-def test_no_confidence_at_all_costs_nothing(name, case):
-    output, frame, rendered = case
-    term = make(name)(output, replace(frame, depth_confidence=torch.zeros(HEIGHT, WIDTH)))
-    term.backward()
-    assert term.item() == 0.0 and not rendered.grad.any()
+    assert make(name)(output, certain).item() == pytest.approx(plain, rel=1e-12)
+    nothing = replace(frame, depth_confidence=torch.zeros(HEIGHT, WIDTH))
+    term, _, found, _ = compared(nothing, 0.0 * rendered.sum())
+    assert term == 0.0 and not found.any()
 
 
 #: Zero, or far from the numbers that float64 keeps no digits of.
@@ -118,6 +111,9 @@ def test_it_is_hubers_loss_of_the_relative_error(case):
     assert term.item() == pytest.approx(expected.item(), rel=1e-12)
     (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
     torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], wanted)
+    plain, sure = (replace(frame, depth_confidence=each) for each in (None, torch.ones(HEIGHT, WIDTH)))
+    certain = make("estimated-depth")(output, sure).item()
+    assert make("estimated-depth")(output, plain).item() == pytest.approx(certain, rel=1e-12)
 
 
 @settings(max_examples=30, deadline=None)
@@ -135,18 +131,6 @@ def test_it_does_not_depend_on_the_unit(scale, shift, floor):
     near, x = 0.05, abs(shift)
     assert term(1.0) == pytest.approx(weight * (x * x / (2 * near) if x < near else x - near / 2), rel=1e-5, abs=1e-9)
     assert term(scale) == pytest.approx(term(1.0), rel=1e-9, abs=1e-12)
-
-
-def test_a_prior_guides_with_a_tenth_of_the_weight(case):
-    output, frame, _ = case
-    nothing, certain = torch.zeros(HEIGHT, WIDTH), torch.ones(HEIGHT, WIDTH)
-    prior, sure, plain = (
-        make("estimated-depth")(output, replace(frame, depth_confidence=each)).item()
-        for each in (nothing, certain, None)
-    )
-    assert prior == pytest.approx(0.1 * sure, rel=1e-6)
-    assert plain == pytest.approx(sure, rel=1e-12)
-    assert make("estimated-depth", floor=0.0)(output, replace(frame, depth_confidence=nothing)).item() == 0.0
 
 
 def test_ignored_and_unknown_pixels_may_be_nan():

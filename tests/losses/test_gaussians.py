@@ -30,23 +30,22 @@ FACTORS = torch.tensor([[1.0, 2.0, 1.0], [1.0, 1.0, -1.0]])
 
 
 @pytest.mark.parametrize(
-    ("step", "schedule", "share"),
+    ("step", "schedule", "share", "options"),
     [
-        (1001, Schedule(40_000, 40_000), 18_999 / 19_000),
-        (10_500, Schedule(40_000, 40_000), 0.5),
-        (20_000, Schedule(40_000, 40_000), 0.0),
-        (25_000, Schedule(40_000, 40_000), 0.0),
-        (105, Schedule(400, 40_000), 0.5),
-        (5, Schedule(400, 40_000), 1.0),
+        *(
+            (step, Schedule(steps, 40_000), share, {"from_step": 1000, "until_step": 20_000})
+            for step, steps, share in (
+                (1001, 40_000, 18_999 / 19_000),
+                *((10_500, 40_000, 0.5), (20_000, 40_000, 0.0), (25_000, 40_000, 0.0)),
+                *((105, 400, 0.5), (5, 400, 1.0)),
+            )
+        ),
+        (50, Schedule(100, 100), 0.5, {}),  # without an end, it ends with the run
     ],
 )
-def test_factors_are_held_near_one_less_and_less(step, schedule, share):
-    term = of_channel("diffuse-factor", FACTORS, step, schedule, from_step=1000, until_step=20_000)
+def test_factors_are_held_near_one_less_and_less(step, schedule, share, options):
+    term = of_channel("diffuse-factor", FACTORS, step, schedule, **options)
     assert term.item() == pytest.approx(share * (1 + 4) / 6)
-
-
-def test_without_an_end_the_hold_ends_with_the_run():
-    assert of_channel("diffuse-factor", FACTORS, 50, Schedule(100, 100)).item() == pytest.approx(0.5 * 5 / 6)
 
 
 def test_the_variance_is_around_the_mean_of_each_component():
@@ -110,13 +109,11 @@ def value(field, step=2, **options):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0, 150.0])
-def test_one_minus_the_cosine_to_the_surface(degrees):
+def test_one_minus_the_cosine_of_the_shortest_axis_to_the_surface(degrees):
     expected = 1.0 - abs(math.cos(math.radians(degrees)))
     assert value(turned_field(degrees)).item() == pytest.approx(expected, abs=1e-6)
-
-
-def test_the_axis_is_that_of_the_smallest_scale():
-    assert value(turned_field(0.0, scales=(1.0, 0.1, 1.0))).item() == pytest.approx(1.0, abs=1e-6)
+    other = 1.0 - abs(math.sin(math.radians(degrees)))
+    assert value(turned_field(degrees, scales=(1.0, 0.1, 1.0))).item() == pytest.approx(other, abs=1e-6)
 
 
 @pytest.mark.thorough

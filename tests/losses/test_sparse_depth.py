@@ -91,10 +91,13 @@ def test_a_point_on_a_pixel_centre_is_that_pixel(case, rendered):
     assert rendered.grad.nonzero().tolist() == [[2, 3]]
 
 
-@pytest.mark.parametrize("place", [(0.0, 0.0), (WIDTH, HEIGHT), (0.2, 6.9), (8.99, 0.0)])
-def test_edges_of_the_image_take_the_outermost_pixels(case, rendered, place):
-    at = rendered[min(int(place[1]), HEIGHT - 1), min(int(place[0]), WIDTH - 1)]
-    assert case(rendered, [place], [0.0]).item() == pytest.approx(at.item())
+@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1), (1, 6), (5, 1)])
+@pytest.mark.parametrize("place", [(0.0, 0.0), (1.0, 1.0), (0.02, 0.98), (0.999, 0.0)])
+def test_edges_of_the_image_take_the_outermost_pixels(case, size, place):
+    rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
+    pixel = (place[0] * size[1], place[1] * size[0])
+    row, column = (0 if share < 0.5 else -1 for share in place[::-1])
+    assert case(rendered, [pixel], [0.0]).item() == pytest.approx(rendered[row, column].item())
 
 
 @pytest.mark.parametrize("outside", [(-0.1, 3.0), (4.0, 7.1), (torch.nan, 2.0)])
@@ -159,13 +162,6 @@ def test_inverse_depth_is_inverted_and_emptiness_left_out(case):
     assert inverse.grad.tolist() == [[pytest.approx(-400.0), 0.0], [0.0, 0.0]]
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 1)])
-def test_images_of_one_row_or_column(case, size):
-    rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
-    assert case(rendered, [[0.5, 0.5]], [0.0]).item() == 1.0
-    assert case(rendered, [[size[1] - 0.5, size[0] - 0.5]], [0.0]).item() == rendered[-1, -1].item()
-
-
 # Training with it
 
 SPARSE = ("losses.depth=null", "losses.sparse_depth={name: sparse-depth, weight: 1.0}")
@@ -199,9 +195,9 @@ def test_any_method_can_be_given_the_term(tmp_path):
 
 
 def test_a_scene_without_such_depth_is_refused_before_training(tmp_path):
-    with pytest.raises(InputError, match=r"'sparse_depth' needs depth at single points.*losses\.sparse_depth=null"):
-        trainer(tmp_path / "run", wall_scene())
-    with pytest.raises(
-        InputError, match=r"'depth' needs depth, .*losses\.depth=null, train .*coliags-sparse-depth on its points"
+    for scene, overrides, message in (
+        (wall_scene(), SPARSE, r"'sparse_depth' needs depth at single points.*losses\.sparse_depth=null"),
+        (sparse_scene(), SPARSE[1:], r"'depth' needs depth, .*losses\.depth=null, train .*coliags-sparse-depth on its"),
     ):
-        trainer(tmp_path / "run", sparse_scene(), SPARSE[1:])
+        with pytest.raises(InputError, match=message):
+            trainer(tmp_path / "run", scene, overrides)
