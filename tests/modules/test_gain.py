@@ -72,14 +72,12 @@ def test_options():
         make(reference=held_out.name)
 
 
-def test_shading_multiplies_the_colours_alone():
-    module = make()
-    with torch.no_grad():
-        module.log_gain[0] = 0.7
+@pytest.mark.parametrize("channels", [1, 3])
+def test_shading_multiplies_the_colours_alone(channels):
+    module = make(torch.linspace(-0.4, 0.4, 7 * channels), channels=channels)
     output = RenderOutput(torch.rand(2, 3, 3), torch.rand(2, 3), None, {"normals": torch.rand(2, 3, 3)})
-    view = View("0001", 1.0, True)
-    shaded = module.shade(output, view)
-    torch.testing.assert_close(shaded.rgb, output.rgb * module.gain(view))
+    shaded = module.shade(output, View("0003", 3.0, True))
+    torch.testing.assert_close(shaded.rgb, output.rgb * (module.log_gain[2] - module.log_gain.mean(0)).exp())
     assert shaded.alpha is output.alpha and shaded.maps is output.maps
 
 
@@ -88,14 +86,6 @@ def test_views_beside_the_video_have_the_gain_of_the_nearest_training_camera():
     aside = replace(scene.train[4], name="turned-0", index=0)  # taken where the fifth training frame was
     module = make(LOGS, replace(scene, test_sets={**scene.test_sets, "rotation": [aside]}))
     assert module.gain(aside.view(trained=False)).item() == pytest.approx(module.gains()[4].item())
-
-
-def test_each_colour_has_its_own_gain():
-    module = make(torch.linspace(-0.4, 0.4, 21), channels=3)
-    output = RenderOutput(torch.rand(2, 3, 3), torch.rand(2, 3), None, {})
-    view = View("0003", 3.0, True)
-    expected = output.rgb * (module.log_gain[2] - module.log_gain.mean(0)).exp()
-    torch.testing.assert_close(module.shade(output, view).rgb, expected)
 
 
 def test_gains_stay_within_their_bounds_and_frames_at_a_bound_are_named():
@@ -201,6 +191,7 @@ def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer
         assert found == pytest.approx(answer, abs=0.03 if noise else 1e-5), noise
 
 
+@pytest.mark.thorough
 def test_least_squares_takes_errors_for_a_response():
     """So that the test above means something."""
     opposite = [fitted_response(0.0, 0.03, "opposite", 2, seed)[1] for seed in range(12)]
@@ -211,15 +202,12 @@ def test_least_squares_takes_errors_for_a_response():
 
 def test_depth_that_tells_nothing_of_the_brightness_gives_no_response():
     module, scene, _ = exposed()
-    rng = np.random.default_rng(0)
-    for depths in (np.full(len(scene.train), 20.0), rng.uniform(10.0, 30.0, len(scene.train))):
-        other = make(scene=with_depths(scene, depths), untrained="metered")
-        other.metering.brightness.copy_(module.metering.brightness)
-        assert other.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
+    depths = np.full(len(scene.train), 20.0), np.random.default_rng(0).uniform(10.0, 30.0, len(scene.train))
     bare = replace(scene, train=[replace(frame, depth=None) for frame in scene.train])
-    other = make(scene=bare, untrained="metered")
-    other.metering.brightness.copy_(module.metering.brightness)
-    assert other.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
+    for other in (*(with_depths(scene, each) for each in depths), bare):
+        metered = make(scene=other, untrained="metered")
+        metered.metering.brightness.copy_(module.metering.brightness)
+        assert metered.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
 
 
 def test_metering_leaves_other_views_alone():
@@ -231,14 +219,6 @@ def test_metering_leaves_other_views_alone():
     fixed, scene, _ = exposed(answer=0.0)
     held_out = scene.test_sets["test"][1].view(trained=False)
     torch.testing.assert_close(fixed.shade(output, held_out).rgb, output.rgb)
-
-
-@pytest.mark.parametrize("frames", [3, 5])
-def test_videos_too_short_for_metering_are_interpolated(frames):
-    module, scene, _ = exposed(frames=frames)
-    output = rendering(0.3)
-    view = scene.test_sets["test"][0].view(trained=False)
-    torch.testing.assert_close(module.shade(output, view).rgb, output.rgb * module.gain(view).detach())
 
 
 def test_brightness_is_kept_from_training_alone():
@@ -253,8 +233,10 @@ def test_brightness_is_kept_from_training_alone():
     torch.testing.assert_close(module.metering.brightness, before)
 
 
-def test_views_are_interpolated_until_all_training_frames_were_rendered():
-    module, scene, _ = exposed()
-    module.metering.brightness[7] = 0.0
+@pytest.mark.parametrize("frames", [3, 5, 33])
+def test_views_are_interpolated_in_short_videos_and_until_all_training_frames_were_rendered(frames):
+    module, scene, _ = exposed(frames=frames)
+    if frames == 33:
+        module.metering.brightness[7] = 0.0
     output, view = rendering(0.3), scene.test_sets["test"][0].view(trained=False)
     torch.testing.assert_close(module.shade(output, view).rgb, output.rgb * module.gain(view).detach())
