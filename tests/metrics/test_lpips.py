@@ -198,14 +198,11 @@ def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
     assert str(culprit) in str(caught.value)
 
 
-def test_a_missing_weights_folder_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="is not a folder"):
-        make("lpips", weights=str(tmp_path / "nothing"))
-
-
-def test_lpips_of_too_small_images_is_unavailable(nowhere):
+def test_too_small_images_and_a_missing_folder(nowhere):
     with pytest.raises(UnavailableError, match="40x31"):
         make("lpips")(images(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
+    with pytest.raises(InputError, match="is not a folder"):
+        make("lpips", weights=str(nowhere / "nothing"))
 
 
 def test_the_network_is_read_once(nowhere, pair):

@@ -75,19 +75,22 @@ def direct(net, pair):
 # Downloading
 
 
-def test_what_is_downloaded_is_found_and_gives_the_same_values(server, cache, pair):
-    written = install(NETS, None, None)
+@pytest.mark.parametrize("copied", [False, True])
+def test_what_is_downloaded_or_copied_is_found_and_gives_the_same_values(server, cache, made, pair, copied):
+    written = install(NETS, None, made if copied else None)
     assert sorted(path.relative_to(cache).as_posix() for path in written) == files(cache) == EVERYTHING
+    assert bool(server.requests) != copied
     for net in NETS:
         assert find_weights(net) == (cache / BACKBONE_FILES[net][0], cache / "v0.1" / f"{net}.pth")
         assert make("lpips", net=net)(pair) == pytest.approx(direct(net, pair), rel=1e-6)
+    assert install(NETS, None, made if copied else None) == []
 
 
 def test_small_files_come_first_and_nothing_is_asked_for_where_nothing_is_missing(server):
     install(NETS, None, None)
     assert server.requests[:2] == ["/v0.1/alex.pth", "/v0.1/squeeze.pth"]
     server.requests.clear()
-    assert install(NETS, None, None) == []
+    install(NETS, None, None)
     assert server.requests == []
 
 
@@ -134,15 +137,6 @@ def test_what_does_not_arrive_whole_is_not_installed(server, cache, spoil, messa
 
 
 # Copying
-
-
-def test_files_of_a_folder_are_copied(server, cache, made, pair):
-    assert len(install(NETS, None, made)) == 4
-    assert files(cache) == EVERYTHING
-    assert server.requests == []
-    for net in NETS:
-        assert make("lpips", net=net)(pair) == pytest.approx(direct(net, pair), rel=1e-6)
-    assert install(NETS, None, made) == []
 
 
 def test_heads_beside_the_backbone_are_taken_too(server, cache, made, tmp_path):
@@ -193,9 +187,6 @@ def test_a_folder_that_lacks_files_says_which(server, cache, made, tmp_path):
         assert f"{server.url}/{name}" in str(caught.value)
     assert "v0.1/alex.pth" not in str(caught.value)
     assert not cache.exists()
-
-
-def test_no_folder_to_copy_from(server, tmp_path):
     with pytest.raises(InputError, match="is not a folder"):
         install(NETS, None, tmp_path / "nothing")
 

@@ -164,22 +164,15 @@ def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(scene):
     assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
 
 
-def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(scene):
+def test_authors_code_wraps_surfaces_beyond_150_mm_and_true_depth_beyond_100_mm(scene):
     _, frame = scene
+    frame = replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
     far = torch.full((HEIGHT, WIDTH), 1 / 160.0)
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=far)
     comparison = protocol("authors-code").compare(output, frame)
-    # 160 / 150 * 65535 = 69904, less 65536
+    # 160 / 150 * 65535 = 69904, less 65536; 101 / 100 * 65535 = 66190.35, less 65536
     assert comparison.depth[0, 0].item() == pytest.approx(4368 / 65535 * 150, abs=0.0024)
-
-
-def test_authors_code_wraps_true_depth_beyond_100_mm_too(scene):
-    output, frame = scene
-    beyond = replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
-    # 101 / 100 * 65535 = 66190.35, less 65536
-    assert protocol("authors-code").compare(output, beyond).true_depth[0, 0].item() == pytest.approx(
-        654 / 65535 * 100, abs=1e-5
-    )
+    assert comparison.true_depth[0, 0].item() == pytest.approx(654 / 65535 * 100, abs=1e-5)
 
 
 # -------------------------------------------------------------------------------------------------------- quantisation
@@ -195,34 +188,23 @@ def one(value):
 )
 def test_eight_bits_round_to_the_nearest_level_and_clamp(value, level):
     assert through_8_bit(one(value)).item() == pytest.approx(level / 255, abs=1e-7)
-
-
-def test_every_eight_bit_level_comes_back_exactly():
     levels = torch.arange(256) / 255
     assert torch.equal(through_8_bit(levels), levels)
-
-
-def test_nan_is_left_for_the_metrics_to_refuse():
-    assert through_8_bit(one(torch.nan)).isnan().all()
+    assert through_8_bit(one(torch.nan)).isnan().all()  # left for the metrics to refuse
 
 
 @pytest.mark.parametrize("scale", [100.0, 150.0])
-def test_sixteen_bits_truncate(scale):
+@pytest.mark.parametrize(
+    ("level", "stored"),
+    [
+        *((1000.9, 1000), (65535, 65535), (0, 0)),
+        *((65971.9, 65971 - 65536), (144177.5, 144177 - 2 * 65536)),  # beyond full scale it wraps around
+        *((value, 0) for value in (torch.inf, -torch.inf, torch.nan, 1e15)),  # what no integer holds
+    ],
+)
+def test_sixteen_bits_truncate(level, stored, scale):
     step = scale / 65535
-    assert through_16_bit(one(1000.9 * step), scale).item() == pytest.approx(1000 * step, rel=1e-6)
-    assert through_16_bit(one(scale), scale).item() == scale
-    assert through_16_bit(one(0.0), scale).item() == 0.0
-
-
-def test_beyond_full_scale_it_wraps_around():
-    """151 mm over 150 is level floor(151 / 150 * 65535) = 65971, of which 16 bits keep 435: 0.9957 mm."""
-    assert through_16_bit(one(151.0), 150.0).item() == pytest.approx(435 / 65535 * 150, abs=1e-6)
-    assert through_16_bit(one(330.0), 150.0).item() == pytest.approx((144177 - 2 * 65536) / 65535 * 150, abs=1e-6)
-
-
-@pytest.mark.parametrize("value", [torch.inf, -torch.inf, torch.nan, 1e12])
-def test_what_no_integer_holds_becomes_zero(value):
-    assert through_16_bit(one(value), 150.0).item() == 0.0
+    assert through_16_bit(one(level * step), scale).item() == pytest.approx(stored * step, rel=1e-6)
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the cast is undefined in C; x86-64 is meant")
