@@ -125,38 +125,31 @@ def test_statistics_are_means_over_the_views_that_draw():
     assert after_backward(other, 600, field, rows, make_output([8], [0.0]))["grown"] == 0
 
 
-def test_never_prunes_everything():
+def test_parts_spread_along_the_normal_by_a_share_and_those_of_surfels_stay_in_their_planes():
+    quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=torch.Generator().manual_seed(2)), dim=1)
+    axes = rotation_matrices(quats).mT
+
+    def along(scales, **options):
+        shifts = make_strategy(**options)._shifts(torch.tensor([scales] * 200).log(), quats)
+        return (axes @ shifts[..., None]).squeeze(-1)
+
+    expected = along([0.5, 0.2, 0.1]) * torch.tensor([1.0, 1.0, 0.1])
+    torch.testing.assert_close(along([0.5, 0.2, 0.1], split_normal_share=0.1), expected, rtol=1e-4, atol=1e-6)
+    surfels = along([0.5, 0.01], split_normal_share=0.1)
+    torch.testing.assert_close(surfels[:, 2], torch.zeros(200), rtol=0, atol=1e-6)
+    torch.testing.assert_close(surfels[:, :2].std(0), torch.tensor([0.5, 0.01]), rtol=0.15, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("faint", "prune_above", "pruned"), [(slice(2, 3), 10_000, 0), (slice(2, 3), 0, 1), (slice(None), 0, 0)]
+)
+def test_prunes_only_where_enough_would_stay_and_never_everything(faint, prune_above, pruned):
     field, rows = make()
     with torch.no_grad():
-        field.opacities.fill_(-9.0)
-    count = len(field.means)
-    assert after_backward(make_strategy(), 600, field, rows, make_output([0], [0.0]))["pruned"] == 0
-    assert len(field.means) == count
-
-
-def test_parts_spread_along_the_normal_by_a_share_of_the_deviation():
-    strategy, usual = make_strategy(split_normal_share=0.1), make_strategy()
-    scales, quats = torch.tensor([[0.5, 0.2, 0.1]] * 9).log(), torch.tensor([[1.0, 0, 0, 0]] * 9)
-    expected = usual._shifts(scales, quats) * torch.tensor([1.0, 1.0, 0.1])
-    torch.testing.assert_close(strategy._shifts(scales, quats), expected)
-
-
-def test_parts_of_surfels_stay_in_their_planes():
-    quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=torch.Generator().manual_seed(2)), dim=1)
-    shifts = make_strategy(split_normal_share=0.1)._shifts(torch.tensor([[0.5, 0.01]] * 200).log(), quats)
-    axes = rotation_matrices(quats)
-    along = (axes.mT @ shifts[..., None]).squeeze(-1)
-    torch.testing.assert_close(along[:, 2], torch.zeros(200), rtol=0, atol=1e-6)
-    torch.testing.assert_close(along[:, :2].std(0), torch.tensor([0.5, 0.01]), rtol=0.15, atol=0)
-
-
-def test_prunes_only_where_enough_would_stay():
-    for prune_above, pruned in ((10_000, 0), (0, 1)):
-        field, rows = make()
-        with torch.no_grad():
-            field.opacities[2] = -6.0
-        strategy = make_strategy(prune_above=prune_above)
-        assert after_backward(strategy, 600, field, rows, make_output([3], [0.0]))["pruned"] == pruned
+        field.opacities[faint] = -9.0
+    count, strategy = len(field.means), make_strategy(prune_above=prune_above)
+    assert after_backward(strategy, 600, field, rows, make_output([3], [0.0]))["pruned"] == pruned
+    assert len(field.means) == count - pruned
 
 
 def test_reference_normals_follow_their_gaussians():
