@@ -43,31 +43,22 @@ def test_an_archive_that_expands_enormously_is_refused_before_it_does(tmp_path):
         read_arrays(path, EXPECTED, ["positions"])
 
 
-def test_objects_are_refused(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(npz_bytes(positions=np.array([{}], object)))
-    with pytest.raises(InputError, match="cannot read"):
-        read_arrays(path, EXPECTED, ["positions"])
-    (tmp_path / "a.npy").write_bytes(b"")
-    np.save(tmp_path / "a.npy", np.array([{}], object))
-    with pytest.raises(InputError, match="cannot read"):
-        read_array(tmp_path / "a.npy", EXPECTED)
-
-
-def test_entries_that_are_no_arrays_are_refused(tmp_path):
-    path = tmp_path / "a.npz"
-    with zipfile.ZipFile(path, "w") as archive:
+def test_what_is_no_array_is_refused(tmp_path):
+    np.savez(tmp_path / "objects.npz", positions=np.array([{}], object))
+    np.save(tmp_path / "objects.npy", np.array([{}], object))
+    with zipfile.ZipFile(tmp_path / "text.npz", "w") as archive:
         archive.writestr("positions", b"text")
-    with pytest.raises(InputError, match="'positions', which is no array"):
-        read_arrays(path, EXPECTED, ["positions"])
-
-
-def test_a_header_that_promises_more_than_follows_reserves_nothing(tmp_path):
-    path = tmp_path / "a.npy"
+    # A header that promises more than follows reserves nothing.
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 1000000), }"
-    path.write_bytes(b"\x93NUMPY\x01\x00" + (len(header)).to_bytes(2, "little") + header + bytes(100))
-    with pytest.raises(InputError, match="cannot read"):
-        read_array(path, EXPECTED)
+    (tmp_path / "short.npy").write_bytes(
+        b"\x93NUMPY\x01\x00" + (len(header)).to_bytes(2, "little") + header + bytes(100)
+    )
+    for name in ("objects.npz", "objects.npy", "text.npz", "short.npy"):
+        message = "'positions', which is no array" if name == "text.npz" else "cannot read"
+        with pytest.raises(InputError, match=message):
+            read_array(tmp_path / name, EXPECTED) if name.endswith("npy") else read_arrays(
+                tmp_path / name, EXPECTED, ["positions"]
+            )
 
 
 @settings(max_examples=300, deadline=None)
@@ -84,11 +75,6 @@ def test_any_damage_is_an_input_error(data, tmp_path_factory):
     except InputError:
         return
     assert arrays["positions"].nbytes <= 64 << 20
-
-
-def test_arrays_survive_a_round_trip(tmp_path):
-    np.save(tmp_path / "a.npy", np.arange(5))
-    assert read_array(tmp_path / "a.npy", EXPECTED).tolist() == [0, 1, 2, 3, 4]
 
 
 class _Collected:

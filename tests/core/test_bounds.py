@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
-
 import numpy as np
 import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import subsampled
@@ -74,21 +70,3 @@ def test_points_far_away_are_left_out(caplog):
 def test_settings_that_are_not_finite_are_refused(change):
     with pytest.raises(InputError, match="finite"):
         load_method("coliags", [change])
-
-
-def png_header(width, height):
-    """A PNG of one grey byte that says it has so many pixels."""
-
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
-
-
-@pytest.mark.parametrize("size", [(60000, 60000), (30000, 30000), (40000, 10), (2**31 - 1, 1)])
-def test_an_image_that_would_fill_the_memory_is_refused_by_its_header(tmp_path, size):
-    path = tmp_path / "0.png"
-    path.write_bytes(png_header(*size))
-    with pytest.raises(InputError, match=r"pixels|decoded"):
-        read_rgb(path)

@@ -23,54 +23,34 @@ READ = """if True:
     from coliags_plugin.datamanagers.rotatecolon.exr_depth import read_exr_channel
     separate_stderr()
     logging.basicConfig(format="log: %(message)s")
-    path = Path(sys.argv[1])
-    try:
-        read_exr_channel(path, "Y") if path.suffix == ".exr" else decode_image(path)
-    except InputError as error:
-        print("refused:", error, file=sys.stderr)
+    for path in map(Path, sys.argv[1:]):
+        try:
+            read_exr_channel(path, "Y") if path.suffix == ".exr" else decode_image(path)
+        except InputError as error:
+            print("refused:", error, file=sys.stderr)
 """
 
 
-def said(path) -> list[str]:
-    """All lines that a process writes which reads an image."""
-    done = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True)
-    assert done.stdout == ""
-    return done.stderr.splitlines()
-
-
-@pytest.fixture
-def pixels():
-    return np.random.default_rng(0).integers(0, 255, (40, 50, 3)).astype(np.uint8)
-
-
-def test_a_damaged_png_is_told_once(tmp_path, pixels):
-    data = bytearray(encode_image(pixels))
-    data[len(data) // 2] ^= 0xFF
-    (tmp_path / "a.png").write_bytes(data)  # libpng: CRC error
-    (line,) = said(tmp_path / "a.png")
-    assert line.startswith(f"refused: {tmp_path / 'a.png'}")
-
-
-def test_a_short_tiff_is_told_once(tmp_path, pixels):
-    data = encode_image(pixels, ".tiff")
-    (tmp_path / "a.tiff").write_bytes(data[: len(data) // 2])  # libtiff: seek error
-    (line,) = said(tmp_path / "a.tiff")
-    assert line.startswith("refused: ")
-
-
-def test_a_short_exr_is_told_once(tmp_path, pixels):
+def test_damage_is_told_once_and_a_warning_where_it_is_decoded(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 50, 3)).astype(np.uint8)
     write_exr(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 50)).astype(np.float32)})
-    data = (tmp_path / "a.exr").read_bytes()
-    (tmp_path / "a.exr").write_bytes(data[: len(data) // 2])  # OpenEXR: corrupt leader, and a warning on stdout
-    (line,) = said(tmp_path / "a.exr")
-    assert line.startswith("refused: ")
-
-
-def test_damage_that_is_decoded_is_a_warning(tmp_path, pixels):
-    data = encode_image(pixels, ".jpg")
-    (tmp_path / "a.jpg").write_bytes(data[:-2] + b"0123456789" + data[-2:])  # libjpeg: extraneous bytes
-    (line,) = said(tmp_path / "a.jpg")
-    assert line.startswith("log: an image is read that may be damaged; its decoder says: Corrupt JPEG data: ")
+    png, tiff, jpg = (encode_image(pixels, suffix) for suffix in (".png", ".tiff", ".jpg"))
+    exr, middle = (tmp_path / "a.exr").read_bytes(), len(png) // 2
+    damaged = {
+        "a.png": png[:middle] + bytes([png[middle] ^ 0xFF]) + png[middle + 1 :],  # libpng: CRC error
+        "a.tiff": tiff[: len(tiff) // 2],  # libtiff: seek error
+        "a.exr": exr[: len(exr) // 2],  # OpenEXR: corrupt leader, and a warning on stdout
+        "a.jpg": jpg[:-2] + b"0123456789" + jpg[-2:],  # libjpeg: extraneous bytes
+    }
+    for name, data in damaged.items():
+        (tmp_path / name).write_bytes(data)
+    command = [sys.executable, "-c", READ, *(str(tmp_path / name) for name in damaged)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    *refused, warning = done.stderr.splitlines()
+    assert done.stdout == "" and len(refused) == 3
+    for line, name in zip(refused, damaged, strict=False):
+        assert line.startswith("refused: ") and str(tmp_path / name) in line
+    assert warning.startswith("log: an image is read that may be damaged; its decoder says: Corrupt JPEG data: ")
 
 
 def test_threads_share_it_and_the_terminal_comes_back(capfd, caplog):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import struct
 import zlib
 
 import cv2
@@ -60,13 +61,19 @@ def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
     start, rest = whole[:33], whole[33:]
     # OpenCV would allocate what the length of a chunk says.
     long = start + chunk(b"IDAT", b"x" * 20, 1 << 30) + rest
-    large = start[:8] + chunk(b"IHDR", (60_000).to_bytes(4, "big") * 2 + start[24:29]) + rest
+    sizes = ((60_000, 60_000), (30_000, 30_000), (40_000, 10), (2**31 - 1, 1))
     damaged = {
         "cut": (whole[:-13], "cannot be decoded"),
         "cut in the last chunk": (whole[:-1], "cannot be decoded"),
         "empty": (b"", "cannot be decoded"),
         "long": (long, "cannot be decoded"),
-        "large": (large, "60000 x 60000 pixels|decompression bomb"),
+        **{
+            f"{width} x {height}": (
+                start[:8] + chunk(b"IHDR", struct.pack(">II", width, height) + start[24:29]) + rest,
+                f"{width} x {height} pixels|decompression bomb|cannot be decoded",
+            )
+            for width, height in sizes
+        },
         "text": (b"no image at all", "cannot be decoded"),
     }
     for name, (data, message) in damaged.items():
