@@ -63,13 +63,8 @@ def test_numbers_of_numpy_and_torch_and_paths_are_plain():
     settings = {"a": np.float32(0.5), "b": np.int64(3), "c": np.bool_(True), "d": Path("x/y"), "e": torch.tensor(2)}
     assert parse_assignments(assignments(settings)) == {"a": 0.5, "b": 3, "c": True, "d": "x/y", "e": 2}
     assert parse_assignments(assignments({"a": -math.inf})) == {"a": -math.inf}
-
-
-def test_of_a_key_that_is_there_twice_the_last_counts_in_its_place():
+    # Of a key that is there twice the last counts, in its place.
     assert list(parse_assignments(["a=1", "b=2", "a=3"]).items()) == [("b", 2), ("a", 3)]
-
-
-def test_settings_reach_the_method():
     settings = {"field.geometry_head.frequencies": 7, 'optimizers."offsets".lr': 0.5, "losses.depth": None}
     config = load_method("coliags", assignments(settings)).config
     assert config.field.settings.geometry_head.settings.frequencies == 7

@@ -46,15 +46,6 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     assert ours == rival
 
 
-def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only():
-    rival = load_method("scaffold-gs-distance").config.model_dump()
-    closest = load_method("scaffold-gs-depth").config.model_dump()
-    assert rival.pop("description") != closest.pop("description")
-    assert rival["field"]["appearance_head"].pop("distance") is True
-    assert closest["field"]["appearance_head"].pop("distance") is False
-    assert rival == closest
-
-
 @pytest.mark.parametrize(
     ("method", "base", "loss", "elsewhere"),
     [
@@ -103,77 +94,89 @@ def test_methods_for_scenes_without_true_depth_differ_in_what_they_need_for_that
     assert mine == same
 
 
-def test_the_start_of_biases_is_written_out_and_its_ablation_changes_nothing_else():
-    for name in ("coliags", "scaffold-gs-distance"):
-        assert f"bias_init: scene_distances  # {name}.yaml:" in load_method(name).with_origins()
-    ours = load_method("coliags").config.model_dump()
-    theirs = load_method("ablations/bias-init-pytorch").config.model_dump()
-    assert ours.pop("description") != theirs.pop("description")
-    assert ours["field"]["appearance_head"].pop("bias_init") == "scene_distances"
-    assert theirs["field"]["appearance_head"].pop("bias_init") == "pytorch"
-    assert ours == theirs
+@pytest.mark.parametrize(
+    ("method", "other", "option", "values"),
+    [
+        ("scaffold-gs-distance", "scaffold-gs-depth", "distance", (True, False)),
+        ("coliags", "ablations/bias-init-pytorch", "bias_init", ("scene_distances", "pytorch")),
+    ],
+)
+def test_methods_that_differ_in_one_option_of_the_appearance_head_alone(method, other, option, values):
+    first, second = (load_method(name).config.model_dump() for name in (method, other))
+    assert first.pop("description") != second.pop("description")
+    assert tuple(config["field"]["appearance_head"].pop(option) for config in (first, second)) == values
+    assert first == second
+    assert f"bias_init: scene_distances  # {method}.yaml:" in load_method(method).with_origins()
 
 
 @pytest.mark.parametrize(
-    ("row", "depth", "geometry", "appearance"),
+    ("row", "depth", "heads", "frequencies"),
     [
-        ("none", False, "plain", "plain"),
-        ("depth", True, "plain", "plain"),
-        ("depth-imia", True, "plain", "imia"),
-        ("depth-imve", True, "imve", "plain"),
-        ("depth-imve-imia", True, "imve", "imia"),
+        ("none", False, ("plain", "plain"), ()),
+        ("depth", True, ("plain", "plain"), ()),
+        ("depth-imia", True, ("plain", "imia"), ()),
+        ("depth-imve", True, ("imve", "plain"), ()),
+        ("depth-imve-imia", True, ("imve", "imia"), (10, 5)),
+        *(
+            (f"embedding-{geometry}-{appearance}", True, ("imve", "imia"), (geometry, appearance))
+            for geometry, appearance in ((10, 0), (10, 5), (10, 10), (5, 5), (15, 5))
+        ),
     ],
 )
-def test_the_papers_five_ablation_rows(row, depth, geometry, appearance):
+def test_the_papers_ablation_rows_and_embedding_sizes(row, depth, heads, frequencies):
     config = load_method(f"ablations/{row}").config
     assert ("depth" in config.losses) == depth
-    assert config.field.settings.geometry_head.name == geometry
-    assert config.field.settings.appearance_head.name == appearance
+    found = config.field.settings.geometry_head, config.field.settings.appearance_head
+    assert tuple(head.name for head in found) == heads
+    if frequencies:
+        assert tuple(head.settings.frequencies for head in found) == frequencies
 
 
-@pytest.mark.parametrize("sizes", [(10, 0), (10, 5), (10, 10), (5, 5), (15, 5)])
-def test_the_papers_embedding_sizes(sizes):
-    field = load_method(f"ablations/embedding-{sizes[0]}-{sizes[1]}").config.field.settings
-    found = (field.geometry_head.settings.frequencies, field.appearance_head.settings.frequencies)
-    assert found == sizes
+def looked_up(config, path):
+    """What a config has at a path of attributes and keys."""
+    for key in path.split("."):
+        config = config[key] if isinstance(config, dict) else getattr(config, key)
+    return config
 
 
-def test_changed_name_drops_inherited_options(method_file):
-    path = method_file("base: coliags\nfield:\n  geometry_head: {name: plain}\n")
-    head = load_method(path).config.field.settings.geometry_head
-    assert head.name == "plain"
-    assert not hasattr(head.settings, "frequencies")
+HEAD = "field.settings.geometry_head"
+RATE = "optimizers.features.lr"
 
 
-def test_same_name_keeps_inherited_options(method_file):
-    path = method_file("base: coliags\nfield:\n  geometry_head: {frequencies: 4}\n")
-    head = load_method(path).config.field.settings.geometry_head
-    assert (head.name, head.settings.frequencies, head.settings.hidden) == ("imve", 4, 32)
+@pytest.mark.parametrize(
+    ("text", "overrides", "expected"),
+    [
+        ("field:\n  geometry_head: {name: plain}\n", (), {f"{HEAD}.name": "plain"}),
+        (
+            "field:\n  geometry_head: {frequencies: 4}\n",
+            (),
+            {f"{HEAD}.name": "imve", f"{HEAD}.settings.frequencies": 4},
+        ),
+        ("field: {geometry_head: {frequencies: 4}}\n", (), {f"{HEAD}.settings.hidden": 32}),
+        ("schedule: {steps: 7}\n", (), {"schedule.steps": 7}),
+        ("", ["field.geometry_head.frequencies=8", f"{RATE}=1e-3"], {f"{HEAD}.settings.frequencies": 8, RATE: 1e-3}),
+        ("", ["losses.depth.final_weight=null", "losses.depth.weight=0"], {"losses.depth.settings.weight": 0.0}),
+        ("", [f"{RATE}=0"], {RATE: 0.0}),
+        ("", ["sampler=pixels", "sampler.pixels=7"], {"sampler.name": "pixels", "sampler.settings.pixels": 7}),
+        ("", ["losses={l1: {name: l1, weight: 1}}", "losses.l1.weight=0.5"], {"losses.l1.settings.weight": 0.5}),
+    ],
+)
+def test_files_and_overrides_change_what_they_inherit(method_file, text, overrides, expected):
+    method_file(f"base: coliags\n{text}", "parent.yaml")
+    config = load_method(method_file("base: parent.yaml\n"), overrides).config
+    assert {path: looked_up(config, path) for path in expected} == expected
+    assert hasattr(looked_up(config, f"{HEAD}.settings"), "frequencies") == ("plain" not in text)
 
 
 def test_null_removes_a_loss():
     assert "depth" not in load_method("coliags", ["losses.depth=null"]).config.losses
 
 
-def test_set_overrides_and_says_so():
-    loaded = load_method("coliags", ["field.geometry_head.frequencies=8", "optimizers.features.lr=1e-3"])
-    assert loaded.config.field.settings.geometry_head.settings.frequencies == 8
-    assert loaded.config.optimizers["features"].lr == 1e-3
-    assert "frequencies: 8  # --set field.geometry_head.frequencies=8" in loaded.with_origins()
-
-
-def test_origins_name_file_and_line():
-    text = load_method("coliags").with_origins()
-    assert "# scaffold-gs.yaml:" in text
-    assert "# coliags.yaml:" in text
-    assert "# default" in text
-    assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 10
-
-
-def test_bases_may_be_paths_beside_the_file(method_file):
-    method_file("base: coliags\nschedule: {steps: 7}\n", "parent.yaml")
-    path = method_file("base: parent.yaml\n")
-    assert load_method(path).config.schedule.steps == 7
+def test_origins_name_file_and_line_or_the_option():
+    text = load_method("coliags", ["field.geometry_head.frequencies=8"]).with_origins()
+    for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# --set field.geometry_head.frequencies=8"):
+        assert part in text
+    assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 8
 
 
 @pytest.mark.parametrize(
@@ -223,56 +226,42 @@ def test_mistakes_are_named(method_file, text, parts):
         assert part in str(caught.value)
 
 
-@pytest.mark.parametrize("assignment", ["steps", "=3", "schedule..steps=3", "schedule.stepz=3"])
-def test_bad_assignments_are_named(assignment):
-    with pytest.raises(InputError, match="--set"):
-        load_method("coliags", [assignment])
-
-
 @pytest.mark.parametrize(
-    ("assignment", "seen"),
+    ("assignment", "seen", "end", "start"),
     [
-        ("losses.depth.final_weight=0", "final_weight 0.0 with weight 0.2"),
-        ("losses.depth.weight=0", "final_weight 0.01 with weight 0.0"),
-        ("optimizers.offsets.final_lr=0", "final_lr 0.0 with lr 0.01"),
-        ("optimizers.offsets.lr=0", "final_lr 0.0001 with lr 0.0"),
+        ("losses.depth.final_weight=0", "final_weight 0.0 with weight 0.2", "final_weight", "weight"),
+        ("losses.depth.weight=0", "final_weight 0.01 with weight 0.0", "final_weight", "weight"),
+        ("optimizers.offsets.final_lr=0", "final_lr 0.0 with lr 0.01", "final_lr", "lr"),
+        ("optimizers.offsets.lr=0", "final_lr 0.0001 with lr 0.0", "final_lr", "lr"),
     ],
 )
-def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen):
+def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen, end, start):
     """It would be 0 for the whole run."""
     with pytest.raises(InputError) as caught:
         load_method("coliags", [assignment])
-    key = assignment.split("=")[0]
-    end, _, _, start, _ = seen.split()
     assert str(caught.value) == (
-        f"--set {assignment}: {key}: {seen}: a logarithmic schedule cannot reach or leave 0; give both above 0, or "
-        f"leave {end} out (null) for a constant {start}."
+        f"--set {assignment}: {assignment.split('=')[0]}: {seen}: a logarithmic schedule cannot reach or leave 0; give "
+        f"both above 0, or leave {end} out (null) for a constant {start}."
     )
 
 
-def test_a_constant_zero_switches_off():
-    off = ["losses.depth.final_weight=null", "losses.depth.weight=0", "optimizers.features.lr=0"]
-    config = load_method("coliags", off).config
-    assert config.losses["depth"].settings.weight == 0.0
-    assert config.optimizers["features"].lr == 0.0
-
-
-def test_unknown_method_is_named():
-    with pytest.raises(InputError, match="Did you mean 'coliags'"):
-        load_method("colliags")
+@pytest.mark.parametrize(
+    ("name", "assignments", "message"),
+    [
+        *(("coliags", [text], "--set") for text in ("steps", "=3", "schedule..steps=3", "schedule.stepz=3")),
+        ("colliags", [], "Did you mean 'coliags'"),
+    ],
+)
+def test_bad_assignments_and_unknown_methods_are_named(name, assignments, message):
+    with pytest.raises(InputError, match=message):
+        load_method(name, assignments)
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("1e-5", 1e-5),
-        ("-3", -3),
-        ("0.5", 0.5),
-        ("true", True),
-        ("null", None),
-        ("[1, 2]", (1, 2)),
-        ("on", "on"),
-        ("a", "a"),
+        *(("1e-5", 1e-5), ("-3", -3), ("0.5", 0.5), ("true", True), ("null", None)),
+        *(("[1, 2]", (1, 2)), ("on", "on"), ("a", "a")),
     ],
 )
 def test_scalars_are_read_as_yaml_1_2(text, value):
@@ -282,16 +271,6 @@ def test_scalars_are_read_as_yaml_1_2(text, value):
 
 def test_an_empty_file_is_an_empty_mapping():
     assert parse_tree("", "x").plain() == {}
-
-
-def test_a_bare_name_may_be_given_options_later():
-    method = load_method("coliags", ["sampler=pixels", "sampler.pixels=7", "renderer={name: torch}"])
-    assert method.config.sampler.name == "pixels" and method.config.sampler.settings.pixels == 7
-
-
-def test_a_mapping_may_be_changed_further():
-    overrides = ["losses={l1: {name: l1, weight: 1.0}}", "losses.l1.weight=0.5"]
-    assert load_method("coliags", overrides).config.losses["l1"].settings.weight == 0.5
 
 
 def test_a_component_without_settings_is_named(monkeypatch):

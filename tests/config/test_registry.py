@@ -21,14 +21,16 @@ def test_every_builtin_can_be_imported_and_has_settings_where_its_kind_has_some(
             assert kind in WITHOUT_SETTINGS or component.Settings is not None
 
 
-def test_unknown_name_says_what_was_meant():
-    with pytest.raises(InputError, match="Did you mean 'torch'"):
-        REGISTRIES["renderers"].get("troch")
-
-
-def test_a_registry_says_what_its_components_are_called():
-    with pytest.raises(InputError, match=r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"):
-        REGISTRIES["pose_formats"].get("tumm")
+@pytest.mark.parametrize(
+    ("kind", "name", "message"),
+    [
+        ("renderers", "troch", "Did you mean 'torch'"),
+        ("pose_formats", "tumm", r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"),
+    ],
+)
+def test_unknown_name_says_what_was_meant(kind, name, message):
+    with pytest.raises(InputError, match=message):
+        REGISTRIES[kind].get(name)
 
 
 def test_duplicate_name_is_refused():
@@ -62,12 +64,19 @@ def test_plugin_path_files_are_found(monkeypatch, tmp_path):
     assert registry.source("mine") == str(plugin)
 
 
-@pytest.mark.parametrize("text", ["x = 1\n", "COMPONENTS = {'nonsense': {}}\n", "COMPONENTS = {'fields': ['mine']}\n"])
-def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *(("x = 1\n", "COMPONENTS"), ("COMPONENTS = {'nonsense': {}}\n", "COMPONENTS")),
+        *(("COMPONENTS = {'fields': ['mine']}\n", "COMPONENTS"), (None, "not a file")),
+    ],
+)
+def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text, message):
     plugin = tmp_path / "bad.py"
-    plugin.write_text(text)
+    if text is not None:
+        plugin.write_text(text)
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
-    with pytest.raises(InputError, match="COMPONENTS"):
+    with pytest.raises(InputError, match=message):
         Registry("fields", {}, "thing").names()
 
 
@@ -77,9 +86,3 @@ def test_a_plugin_that_cannot_be_imported_is_named(target):
     registry.register("ghost", target, "entry point of another package")
     with pytest.raises(InputError, match="'ghost' from entry point of another package cannot be imported"):
         registry.get("ghost")
-
-
-def test_missing_plugin_file_is_an_input_error(monkeypatch, tmp_path):
-    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(tmp_path / "gone.py"))
-    with pytest.raises(InputError, match="not a file"):
-        Registry("fields", {}, "thing").names()
