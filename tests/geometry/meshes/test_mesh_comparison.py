@@ -127,14 +127,9 @@ def test_samples_of_a_part():
         sample_surface(mesh, 10, np.zeros(len(mesh), bool))
 
 
-@pytest.mark.parametrize("factor", [0.001, 1000.0])
-def test_another_unit_is_refused(factor):
+@pytest.mark.parametrize(("factor", "shift"), [(0.001, 0), (1000, 0), (1, 60)])
+def test_another_unit_or_world_is_refused(factor, shift):
     mesh = replace(plane(), vertices=plane().vertices + np.float32([30, 0, 20]))
+    other = replace(mesh, vertices=np.float32(factor) * mesh.vertices + np.float32(shift))
     with pytest.raises(InputError, match="one world and unit"):
-        compare_meshes(replace(mesh, vertices=mesh.vertices * np.float32(factor)), true(mesh), COUNT)
-
-
-def test_another_world_is_refused():
-    mesh = sphere(20.0)
-    with pytest.raises(InputError, match="one world and unit"):
-        compare_meshes(replace(mesh, vertices=mesh.vertices + np.float32(30)), true(mesh), COUNT)
+        compare_meshes(other, true(mesh), COUNT)

@@ -258,19 +258,26 @@ def pairs(matches):
     return list(zip(matches.first.tolist(), matches.second.tolist(), strict=True))
 
 
-def test_by_name_first_or_its_last_part_where_folders_and_suffixes_differ():
-    matches = associate(named(["c", "a", "x", "b"]), named(["a", "b", "c", "d", "e"]))
-    assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 0), (3, 1)])
-    matches = associate(named(["images/a.png", "images/b.png", "images/c.png"]), named(["c.jpg", "b.jpg", "a.jpg"]))
-    assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 1), (2, 0)])
+TWINS = ["left/a.png", "right/a.png", "left/b.png"]
 
 
-def test_a_last_part_that_several_frames_share_serves_nobody():
-    first = named(["left/a.png", "right/a.png", "left/b.png"])
-    matches = associate(first, named(["a.jpg", "b.jpg", "c.jpg"]))
-    assert matches.by == "index"
-    assert matches.skipped == ("by name: 'a' names several frames",)
-    assert associate(first, first).by == "name"
+@pytest.mark.parametrize(
+    ("first", "second", "by", "expected", "skipped"),
+    [
+        (named(["c", "a", "x", "b"]), named(["a", "b", "c", "d", "e"]), "name", [(0, 2), (1, 0), (3, 1)], None),
+        # Names' last parts, where folders and suffixes differ; one that several frames share serves nobody.
+        (named(["i/a.png", "i/b.png", "i/c"]), named(["c.jpg", "b.jpg", "a"]), "name", [(0, 2), (1, 1), (2, 0)], None),
+        (named(TWINS), named(["a.jpg", "b.jpg", "c.jpg"]), "index", None, ("by name: 'a' names several frames",)),
+        (named(TWINS), named(TWINS), "name", None, None),
+        (winding(5), winding(5, timestamps=np.arange(5.0)), "index", [(k, k) for k in range(5)], ()),
+        (*[winding(5, timestamps=np.zeros(5))] * 2, "index", None, ("by time: timestamps are repeated",)),
+    ],
+)  # fmt: skip
+def test_by_name_then_time_then_index(first, second, by, expected, skipped):
+    matches = associate(first, second)
+    assert matches.by == by
+    assert expected is None or pairs(matches) == expected
+    assert skipped is None or matches.skipped == skipped
 
 
 def test_by_time_each_frame_once_and_the_nearest_first():
@@ -299,34 +306,24 @@ def test_by_time_is_greedy_over_all_pairs(seed):
     assert pairs(associate(first, second, "time", 0.05)) == sorted(expected)
 
 
-def test_by_index_where_counts_agree():
-    matches = associate(winding(5), winding(5, timestamps=np.arange(5.0)))
-    assert (matches.by, pairs(matches)) == ("index", [(k, k) for k in range(5)])
-    assert matches.skipped == ()
-
-
-def test_repeated_times_are_passed_over():
-    trajectory = winding(5, timestamps=np.zeros(5))
-    assert associate(trajectory, trajectory).skipped == ("by time: timestamps are repeated",)
-
-
 def test_endogslams_training_frames():
-    reference, estimate = winding(20), winding(18)
-    with pytest.raises(InputError, match=r"18 and 20 poses.*pass --match endogslam-train"):
-        associate(estimate, reference)
-    matches = associate(estimate, reference, "endogslam-train")
+    matches = associate(winding(18), winding(20), "endogslam-train")
     assert matches.second.tolist() == [k for k in range(20) if k not in (7, 15)]
-    with pytest.raises(InputError, match="17 poses are not the training frames of 20"):
-        associate(winding(17), reference, "endogslam-train")
 
 
-def test_what_cannot_be_matched_says_what_was_tried():
-    with pytest.raises(InputError, match=r"by name: no name in common; by index: 3 and 4 poses"):
-        associate(named("abc"), named("wxyz"))
-    with pytest.raises(InputError, match="by name: not both have names"):
-        associate(named("abc"), winding(3), "name")
-    with pytest.raises(InputError, match="by index: 2 frames match"):
-        associate(winding(2), winding(2))
+@pytest.mark.parametrize(
+    ("first", "second", "how", "message"),
+    [
+        (winding(18), winding(20), (), r"18 and 20 poses.*pass --match endogslam-train"),
+        (winding(17), winding(20), ("endogslam-train",), "17 poses are not the training frames of 20"),
+        (named("abc"), named("wxyz"), (), r"by name: no name in common; by index: 3 and 4 poses"),
+        (named("abc"), winding(3), ("name",), "by name: not both have names"),
+        (winding(2), winding(2), (), "by index: 2 frames match"),
+    ],
+)
+def test_what_cannot_be_matched_says_what_was_tried(first, second, how, message):
+    with pytest.raises(InputError, match=message):
+        associate(first, second, *how)
 
 
 def test_matched_frames_alone_are_aligned():

@@ -70,20 +70,10 @@ def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_pa
     assert (read.intrinsics.fx, read.intrinsics.fy) == (70.0, 70.0)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("1 1 0 0 0 5 6 1 b.png", "line 2: '1 1 0 0 0 5 6 1 b.png'. Expected IMAGE_ID QW"),
-        ("1 2 0 0 0 5 6 7 1 b.png", "line 2: a quaternion of length 2"),
-        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is not a rotation"),
-        ("1 1 0 0 0 nan 6 7 1 b.png", "line 2: .*nan"),
-    ],
-)
-def test_lines_that_are_none(tmp_path, line, message):
-    (tmp_path / "images.txt").write_text(f"# comment\n{line}\n\n")
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 70 71 32 24\n")
-    with pytest.raises(InputError, match=message):
-        colmap.read(tmp_path)
+def write_text(folder, images, cameras):
+    (folder / "images.txt").write_text(images)
+    (folder / "cameras.txt").write_text(cameras)
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -92,40 +82,42 @@ def test_lines_that_are_none(tmp_path, line, message):
         ("1 OPENCV 64 48 70 71 32 24 0 0 0 0\n", "the camera is OPENCV"),
         ("1 PINHOLE 64 48 70 71 32 24\n2 PINHOLE 64 48 70 72 32 24\n", "2 different cameras"),
         ("1 PINHOLE 64 48 70 71 32 24\n", "lacks a camera"),
+        ("1 PINHOLE 64 48 70 71 32 24\n2 PINHOLE 64 48 70 71 32 24\n", None),  # equal cameras are one
     ],
 )
-def test_no_common_pinhole(tmp_path, cameras, remark):
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 2 b.png\n\n")
-    (tmp_path / "cameras.txt").write_text(cameras)
-    read = colmap.read(tmp_path)
-    assert read.intrinsics is None
-    assert remark in read.remarks[0]
+def test_common_pinholes(tmp_path, cameras, remark):
+    read = colmap.read(write_text(tmp_path, "1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 2 b.png\n\n", cameras))
+    if remark is None:
+        assert read.intrinsics.fy == 71.0
+    else:
+        assert read.intrinsics is None
+        assert remark in read.remarks[0]
 
 
-def test_equal_cameras_are_one(tmp_path):
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 2 b.png\n\n")
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 70 71 32 24\n2 PINHOLE 64 48 70 71 32 24\n")
-    assert colmap.read(tmp_path).intrinsics.fy == 71.0
+ONE = "1 1 0 0 0 5 6 7 1 a.png\n\n"
+CAMERA = "1 PINHOLE 64 48 70 71 32 24\n"
 
 
-@pytest.mark.parametrize("cameras", ["1 PINHOLE 64 48 70\n", "1 PINHOLE 64\n", "x\n", "1 PINHOLE 64 48 0 71 32 24\n"])
-def test_cameras_that_are_none(tmp_path, cameras):
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n")
-    (tmp_path / "cameras.txt").write_text(cameras)
-    with pytest.raises(InputError, match=r"cameras\.txt, (line|camera) 1"):
-        colmap.read(tmp_path)
-
-
-def test_models_that_are_none(tmp_path):
+@pytest.mark.parametrize(
+    ("images", "cameras", "message"),
+    [
+        ("1 1 0 0 0 5 6 1 b.png\n", CAMERA, "line 1: '1 1 0 0 0 5 6 1 b.png'. Expected IMAGE_ID QW"),
+        ("# comment\n1 2 0 0 0 5 6 7 1 b.png\n\n", CAMERA, "line 2: a quaternion of length 2"),
+        ("# comment\n1 0 0 0 0 5 6 7 1 b.png\n\n", CAMERA, "line 2: the quaternion .* is not a rotation"),
+        ("# comment\n1 1 0 0 0 nan 6 7 1 b.png\n\n", CAMERA, "line 2: .*nan"),
+        *(
+            (ONE, cameras, r"cameras\.txt, (line|camera) 1")
+            for cameras in ("1 PINHOLE 64 48 70\n", "1 PINHOLE 64\n", "x\n", "1 PINHOLE 64 48 0 71 32 24\n")
+        ),
+        ("# nothing\n", "", "holds no poses"),
+        (ONE + ONE.replace("1", "2", 1), CAMERA, r"'a.png' is repeated"),
+    ],
+)
+def test_models_that_are_none(tmp_path, images, cameras, message):
     with pytest.raises(InputError, match="holds no COLMAP model"):
         colmap.read(tmp_path)
-    (tmp_path / "images.txt").write_text("# nothing\n")
-    (tmp_path / "cameras.txt").write_text("")
-    with pytest.raises(InputError, match="holds no poses"):
-        colmap.read(tmp_path)
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 1 a.png\n\n")
-    with pytest.raises(InputError, match=r"'a.png' is repeated"):
-        colmap.read(tmp_path)
+    with pytest.raises(InputError, match=message):
+        colmap.read(write_text(tmp_path, images, cameras))
 
 
 def test_names_with_blanks_are_for_binary_models(tmp_path):

@@ -71,19 +71,14 @@ def test_names_and_times_are_kept_where_the_format_says_so(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", WRITABLE)
-def test_content_tells_the_format(tmp_path, name):
-    write_trajectory(tmp_path / "out.whatever", winding(intrinsics=PINHOLE), name)
-    assert format_of(tmp_path / "out.whatever").name == name.removesuffix("-text")
-
-
-@pytest.mark.parametrize("name", WRITABLE)
-def test_writing_is_the_same_every_time(tmp_path, name):
+def test_content_tells_the_format_and_is_the_same_every_time(tmp_path, name):
     trajectory = winding(intrinsics=PINHOLE)
     contents = []
-    for attempt in ("first", "second"):
-        write_trajectory(tmp_path / attempt, trajectory, name)
-        files = sorted((tmp_path / attempt).rglob("*")) if format_named(name).folder else [tmp_path / attempt]
-        contents.append([path.read_bytes() for path in files])
+    for attempt in ("first.whatever", "second"):
+        path = tmp_path / attempt
+        write_trajectory(path, trajectory, name)
+        assert format_of(path).name == name.removesuffix("-text")
+        contents.append([part.read_bytes() for part in (sorted(path.rglob("*")) if path.is_dir() else [path])])
     assert contents[0] == contents[1]
 
 
@@ -112,44 +107,40 @@ def test_a_folder_of_other_things_is_never_replaced(tmp_path):
     assert (tmp_path / "project" / "thesis.tex").read_text() == "everything"
 
 
-@pytest.mark.parametrize("name", ["colmap", "colmap-text", "endogslam"])
-def test_formats_that_need_intrinsics_say_so(tmp_path, name):
-    with pytest.raises(InputError, match=r"no intrinsics.*--intrinsics fx,fy,cx,cy --size"):
-        write_trajectory(tmp_path / "out", winding(), name)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["colmap", "colmap-text", "nerfstudio"])
-def test_a_repeated_name_is_not_written(tmp_path, name):
-    trajectory = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
-    with pytest.raises(InputError, match=r"'a\.png' is repeated \(poses 0 and 2\)"):
-        write_trajectory(tmp_path / "out", trajectory, name)
-
-
 def test_what_is_no_pose_file_is_told(tmp_path):
-    with pytest.raises(InputError, match="no file or folder"):
-        format_of(tmp_path / "none")
-    kitti = as_text(np.ones((2, 12)))
-    for name, text, held in (
-        ("kitti.txt", kitti, "12 numbers"),
-        ("letter.txt", "Dear", "no row of"),
-        ("empty", "", "no row of"),
-    ):
+    for name, text in (("kitti.txt", as_text(np.ones((2, 12)))), ("letter.txt", "Dear"), ("empty", "")):
         (tmp_path / name).write_text(text)
-        with pytest.raises(InputError, match=f"its first line holds {held}"):
-            format_of(tmp_path / name)
-    with pytest.raises(InputError, match=r"holds empty, kitti\.txt, letter\.txt\. Expected the folder of a COLMAP"):
-        format_of(tmp_path)
+    for name, chosen, message in (
+        ("none", None, "no file or folder"),
+        ("kitti.txt", None, "its first line holds 12 numbers"),
+        ("letter.txt", None, "its first line holds no row of"),
+        ("empty", None, "its first line holds no row of"),
+        ("", None, r"holds empty, kitti\.txt, letter\.txt\. Expected the folder of a COLMAP"),
+        ("empty", "colmab", r"no pose format 'colmab'.*Did you mean 'colmap'"),
+        ("", "tum", "is a folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            format_of(tmp_path / name, chosen)
 
 
-def test_names_of_formats(tmp_path):
-    (tmp_path / "a").write_text("")
-    with pytest.raises(InputError, match=r"no pose format 'colmab'.*Did you mean 'colmap'"):
-        format_of(tmp_path / "a", "colmab")
-    with pytest.raises(InputError, match="is a folder"):
-        format_of(tmp_path, "tum")
-    with pytest.raises(InputError, match="format 'endogslam-truth' is read-only"):
-        write_trajectory(tmp_path / "out", winding(), "endogslam-truth")
+TWICE = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "trajectory", "message"),
+    [
+        ("endogslam-truth", winding(), "format 'endogslam-truth' is read-only"),
+        *(
+            (name, winding(), r"no intrinsics.*--intrinsics fx,fy,cx,cy --size")
+            for name in ("colmap", "colmap-text", "endogslam")
+        ),
+        *((name, TWICE, r"'a\.png' is repeated \(poses 0 and 2\)") for name in ("colmap", "colmap-text", "nerfstudio")),
+    ],
+)
+def test_what_a_format_cannot_hold_is_not_written(tmp_path, name, trajectory, message):
+    with pytest.raises(InputError, match=message):
+        write_trajectory(tmp_path / "out", trajectory, name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_byte_order_mark_line_ends_and_blank_lines_do_no_harm(tmp_path):
@@ -167,29 +158,23 @@ def test_byte_order_mark_line_ends_and_blank_lines_do_no_harm(tmp_path):
     same_poses(format_named("colmap").read(tmp_path / "colmap"), trajectory, "colmap")
 
 
-def test_trajectories_are_checked(tmp_path):
+def test_trajectories_are_checked_and_summed_up():
     poses = winding(3).camera_to_world
-    with pytest.raises(InputError, match=r"poses of the shape \[0, 4, 4\]"):
-        Trajectory(poses[:0])
-    with pytest.raises(InputError, match=r"\[3, 3, 4\]"):
-        Trajectory(poses[:, :3])
-    broken = poses.copy()
-    broken[1, :3] *= -1.0
-    with pytest.raises(InputError, match="pose 1: a left-handed transform"):
-        Trajectory(broken)
-    broken = poses.copy()
-    broken[2, 0, 3] = np.nan
-    with pytest.raises(InputError, match="pose 2: a transform that is not finite"):
-        Trajectory(broken)
-    with pytest.raises(InputError, match="2 names for 3 poses"):
-        Trajectory(poses, names=("a", "b"))
-    with pytest.raises(InputError, match="timestamps"):
-        Trajectory(poses, timestamps=np.array([0.0, 1.0, np.inf]))
+    turned, endless = poses.copy(), poses.copy()
+    turned[1, :3] *= -1.0
+    endless[2, 0, 3] = np.nan
+    for made, options, message in (
+        (poses[:0], {}, r"poses of the shape \[0, 4, 4\]"),
+        (poses[:, :3], {}, r"\[3, 3, 4\]"),
+        (turned, {}, "pose 1: a left-handed transform"),
+        (endless, {}, "pose 2: a transform that is not finite"),
+        (poses, {"names": ("a", "b")}, "2 names for 3 poses"),
+        (poses, {"timestamps": np.array([0.0, 1.0, np.inf])}, "timestamps"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Trajectory(made, **options)
     with pytest.raises(InputError, match="focal lengths and size positive"):
         Intrinsics(0.0, 1.0, 1.0, 1.0, 4, 4)
-
-
-def test_summary_counts_and_measures():
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = [0.0, 1.0, 3.0, 4.0, 6.0]
     text = Trajectory(poses).summary("mm")
