@@ -63,13 +63,21 @@ def test_sides_of_another_scale_do_not_hold_together():
     assert not links[GAP].holds
 
 
-def test_too_few_common_points_tell_no_scale():
-    assert [Link(0, points, None, None, spanning=4).holds for points in (19, 20)] == [False, True]
-    assert not Link(0, 99, None, None, spanning=3).holds
-    assert [Link(0, points, 0.1, 0.1).holds for points in (7, 8)] == [False, True]
-    assert "too few to compare" in Link(0, 3, None, None).reason
-    assert "not mapped together" in Link(0, 99, None, None).reason
-    assert not Link(0, 9, 0.0, 0.2).holds
+@pytest.mark.parametrize(
+    ("link", "holds", "reason"),
+    [
+        (Link(0, 19, None, None, spanning=4), False, ""),
+        (Link(0, 20, None, None, spanning=4), True, ""),
+        (Link(0, 99, None, None, spanning=3), False, ""),
+        (Link(0, 7, 0.1, 0.1), False, ""),
+        (Link(0, 8, 0.1, 0.1), True, ""),
+        (Link(0, 9, 0.0, 0.2), False, ""),
+        (Link(0, 3, None, None), False, "too few to compare"),
+        (Link(0, 99, None, None), False, "not mapped together"),
+    ],
+)
+def test_too_few_common_points_tell_no_scale(link, holds, reason):
+    assert link.holds == holds and reason in link.reason
 
 
 def test_a_part_has_its_frames_and_the_points_they_see():
@@ -98,7 +106,12 @@ def test_held_out_tracks_measure_the_poses(noise):
     assert held_out_error(model, [replace(frame, ids=frame.ids + 1) for frame in tracks]) is None
 
 
-def test_images_of_another_scale_are_not_held():
+def test_images_of_another_scale_or_of_few_points_are_not_held():
+    model, _ = seen_points()
+    assert held_part(model) is model
+    for observation in range(37):
+        model.delete_observation(8, observation)
+    assert sorted(held_part(model).reg_image_ids()) == list(range(1, COUNT))
     model = part_of(seen_points()[0], range(1, COUNT))
     for point in model.points3D.values():
         if {element.image_id for element in point.track.elements} <= {2, 3, 4}:
@@ -147,14 +160,6 @@ def test_adjustment_brings_poses_back_and_leaves_outliers_out():
         np.testing.assert_allclose(model.images[number].cam_from_world().matrix(), true[number - 1], atol=0.02)
     np.testing.assert_array_equal(model.images[5].points2D[3].xy, moved)
     assert not model.images[5].points2D[3].has_point3D()
-
-
-def test_images_that_see_few_points_are_not_held():
-    model, _ = seen_points()
-    assert held_part(model) is model
-    for observation in range(37):
-        model.delete_observation(8, observation)
-    assert sorted(held_part(model).reg_image_ids()) == list(range(1, COUNT))
 
 
 @pytest.fixture(scope="module")
@@ -229,19 +234,19 @@ def test_the_atlas_is_written(tracked, tmp_path):
         assert image.samefile(tracked.images[0]) == is_same and image.read_bytes() == tracked.images[0].read_bytes()
 
 
+def ribbon_colors(images, models, lost):
+    """Of every frame."""
+    row = draw_ribbon(Atlas(images, models, lost))[75, 20:1180]
+    return [tuple(row[int((frame + 0.2) * 1160 / len(images))].tolist()) for frame in range(len(images))]
+
+
 def test_the_ribbon_has_a_colour_for_every_model(tracked):
     halves = (replace(tracked.largest, registered=(0, 1, 2, 3)), replace(tracked.largest, registered=(4, 5, 6)))
-    ribbon = draw_ribbon(Atlas(tracked.images, halves, {7: "blurred"}))
-    row = ribbon[75, 20:1180]
-    colors = [tuple(int(value) for value in row[int((frame + 0.2) * 1160 / 8)]) for frame in range(8)]
+    colors = ribbon_colors(tracked.images, halves, {7: "blurred"})
     assert len(set(colors[:4])) == len(set(colors[4:7])) == 1
     assert len({colors[0], colors[4], colors[7]}) == 3
-
-
-def test_more_models_than_colours_are_told_apart(tracked):
-    models = tuple(replace(tracked.largest, registered=(number,)) for number in range(14))
-    row = draw_ribbon(Atlas(tracked.images * 2, models, {}))[75, 20:1180]
-    assert len({tuple(row[int((number + 0.2) * 1160 / 16)].tolist()) for number in range(14)}) == 14
+    many = tuple(replace(tracked.largest, registered=(number,)) for number in range(14))
+    assert len(set(ribbon_colors(tracked.images * 2, many, {})[:14])) == 14
 
 
 @pytest.mark.thorough

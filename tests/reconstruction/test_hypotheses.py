@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -164,17 +164,22 @@ def test_a_fisheye_is_as_wide_as_its_own_law_says():
     assert not Hypothesis(Model(focal=100.0, lens=lens), -0.7).is_plausible((40.0, 180.0))
 
 
-def test_other_focal_lengths_that_fit_as_well_are_told():
-    chosen = Hypothesis(Model(), -0.7)
+@pytest.mark.parametrize(
+    ("focal", "error", "correlation", "lens", "told"),
+    [
+        (260.0, 0.51, -0.5, "SIMPLE_RADIAL", True),
+        (210.0, 0.51, -0.5, "SIMPLE_RADIAL", False),
+        (260.0, 0.7, -0.5, "SIMPLE_RADIAL", False),
+        (260.0, 0.51, 0.5, "SIMPLE_RADIAL", False),
+        # Another camera model tells nothing else unless its focal length is another one.
+        (210.0, 0.51, -0.7, "SIMPLE_RADIAL_FISHEYE", False),
+        (260.0, 0.51, -0.7, "SIMPLE_RADIAL_FISHEYE", True),
+    ],
+)
+def test_other_focal_lengths_that_fit_as_well_are_told(focal, error, correlation, lens, told):
+    chosen, other = Hypothesis(Model(), -0.7), Hypothesis(Model(focal=focal, error=error, lens=lens), correlation)
     assert not is_ambiguous([chosen], chosen, RANGE)
-    assert is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.51), -0.5)], chosen, RANGE)
-    assert not is_ambiguous([chosen, Hypothesis(Model(focal=210.0, error=0.51), -0.5)], chosen, RANGE)
-    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.7), -0.5)], chosen, RANGE)
-    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.51), 0.5)], chosen, RANGE)
-    # Another camera model tells nothing else unless its focal length is another one.
-    fisheye = Model(focal=210.0, error=0.51, lens="SIMPLE_RADIAL_FISHEYE")
-    assert not is_ambiguous([chosen, Hypothesis(fisheye, -0.7)], chosen, RANGE)
-    assert is_ambiguous([chosen, Hypothesis(replace(fisheye, focal=260.0), -0.7)], chosen, RANGE)
+    assert is_ambiguous([chosen, other], chosen, RANGE) == told
 
 
 def test_correlation_of_exact_falloff_and_of_too_few_points():

@@ -96,24 +96,21 @@ def test_poses_tell_look_alikes_apart():
     assert not len(mutual_matches(first, second, 0.7, 0.7))
 
 
-@pytest.mark.parametrize(("off", "count"), [(0.0, 1), (1.3, 1), (1.5, 0)])
-def test_the_epipolar_error_is_sampsons(off, count):
-    """Along x, off the common row by d: the Sampson distance is d / sqrt(2)."""
-    assert matched_when_moved(-10.0, off) == count
-
-
-@pytest.mark.parametrize(("shift", "scale", "count"), [(-8.0, 1.0, 1), (8.0, 1.0, 0), (-8.0, 2.0, 0), (-8.0, 1.5, 1)])
-def test_rays_must_meet_in_front_and_scales_agree(shift, scale, count):
-    """From further right, things in front lie further left."""
-    assert matched_when_moved(shift, 0.0, scale) == count
-
-
-def matched_when_moved(x, y, scale=1.0):
-    """Matches of a spot that lies x, y pixels elsewhere in the image of a camera 2 mm to the right."""
+@pytest.mark.parametrize(
+    ("x", "y", "scale", "count"),
+    [
+        # Along x, off the common row by d: the Sampson distance is d / sqrt(2).
+        *((-10.0, off, 1.0, count) for off, count in ((0.0, 1), (1.3, 1), (1.5, 0))),
+        # From further right, things in front lie further left.
+        *((-8.0, 0.0, 1.0, 1), (8.0, 0.0, 1.0, 0), (-8.0, 0.0, 2.0, 0), (-8.0, 0.0, 1.5, 1)),
+    ],
+)
+def test_the_epipolar_error_is_sampsons_rays_meet_in_front_and_scales_agree(x, y, scale, count):
+    """A spot that lies x, y pixels elsewhere in the image of a camera 2 mm to the right."""
     cameras, alike = (camera(), camera(x=2.0)), np.ones((1, 128))
     at = seen(cameras[0], [[0.0, 0, 20]])
     other = features(at + np.array([x, y]), alike, 2.0 * scale)
-    return len(epipolar_matches(features(at, alike), other, cameras, *LOOSE))
+    assert len(epipolar_matches(features(at, alike), other, cameras, *LOOSE)) == count
 
 
 def test_cameras_in_one_place_match_nothing():

@@ -52,15 +52,29 @@ def test_colmaps_camera_projects_as_the_lens(name, size):
     np.testing.assert_allclose(camera.img_from_cam(points), expected, atol=1e-6)
 
 
-def test_crops_are_refused_and_known_cameras_are_kept():
+@pytest.mark.parametrize(
+    ("options", "refined", "count"),
+    [
+        ({"model": "c3vd"}, False, 1),
+        ({"model": "c3vd", "refine": True}, True, 1),
+        ({}, True, 3),
+        ({"refine": False}, False, 3),
+        ({"model": "PINHOLE"}, True, 2),
+        ({"model": "PINHOLE", "params": (1.0,)}, False, 1),
+        ({"model": "PINHOLE", "params": (1.0,), "refine": True}, True, 1),
+    ],
+)
+def test_known_cameras_have_one_start_and_are_kept(options, refined, count):
+    settings = CameraSettings(focal_factors=(0.6, 0.4), **options)
+    assert is_refined(settings) == refined and len(starts(settings)) == count
+    if not options:
+        fisheye = "SIMPLE_RADIAL_FISHEYE"
+        assert starts(settings) == [Start(fisheye, 0.6), Start(fisheye, 0.4), Start("SIMPLE_RADIAL", 0.6)]
+
+
+def test_crops_are_refused():
     with pytest.raises(InputError, match=r"--camera c3vd, and images of 800 x 800. Expected the whole frame"):
         calibrated_camera("c3vd", 800, 800)
-    assert not is_refined(CameraSettings(model="c3vd"))
-    assert is_refined(CameraSettings(model="c3vd", refine=True))
-    assert is_refined(CameraSettings())
-    assert not is_refined(CameraSettings(model="PINHOLE", params=(1.0,)))
-    assert is_refined(CameraSettings(model="PINHOLE", params=(1.0,), refine=True))
-    assert not is_refined(CameraSettings(refine=False))
 
 
 @pytest.mark.parametrize("size", [(200, 120), (120, 200)])
@@ -76,22 +90,11 @@ def test_field_of_view_has_a_closed_form(model, degrees, size):
 
 
 @pytest.mark.parametrize("size", [(200, 120), (120, 200)])
-def test_distortion_is_that_of_the_border(size):
-    radial = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 125.0, *size)
-    radial.params = [125.0, 95.0, 63.0, -0.25]
-    assert distortion(radial) == pytest.approx(0.25 * 0.8**2)
-    fisheye = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL_FISHEYE", 125.0, *size)
-    fisheye.params = [125.0, 95.0, 63.0, 0.5]
-    assert distortion(fisheye) == pytest.approx(0.5 * 0.8**2)
-
-
-def test_an_unknown_camera_has_several_starts_and_a_known_one_has_one():
-    several = starts(CameraSettings(focal_factors=(0.6, 0.4)))
-    fisheye = "SIMPLE_RADIAL_FISHEYE"
-    assert several == [Start(fisheye, 0.6), Start(fisheye, 0.4), Start("SIMPLE_RADIAL", 0.6)]
-    assert starts(CameraSettings(model="PINHOLE", focal_factors=(0.6, 0.4)))[1:] == [Start("PINHOLE", 0.4)]
-    assert len(starts(CameraSettings(model="c3vd"))) == 1
-    assert len(starts(CameraSettings(model="PINHOLE", params=(1.0,)))) == 1
+@pytest.mark.parametrize(("model", "term"), [("SIMPLE_RADIAL", -0.25), ("SIMPLE_RADIAL_FISHEYE", 0.5)])
+def test_distortion_is_that_of_the_border(size, model, term):
+    camera = pycolmap.Camera.create_from_model_name(0, model, 125.0, *size)
+    camera.params = [125.0, 95.0, 63.0, term]
+    assert distortion(camera) == pytest.approx(abs(term) * 0.8**2)
 
 
 @pytest.mark.parametrize(

@@ -55,13 +55,10 @@ def test_sparse_depth_of_the_scene_counts():
     np.testing.assert_allclose(found.medians, 40.0, rtol=1e-5)
 
 
-def test_a_given_range():
+def test_given_ranges_and_frames_without_features():
     assert given_range(10.0, 40.0, 2).medians == (20.0, 20.0)
     with pytest.raises(InputError, match="0 < near < far"):
         given_range(0.0, 40.0, 2)
-
-
-def test_frames_without_features_are_refused():
     flat = torch.full((80, 96, 3), 90, dtype=torch.uint8)
     frames = [dataclasses.replace(frame, image=flat) for frame in wall_frames(sideways(4))]
     with pytest.raises(InputError, match="the depth range is unknown: 0 points"):
@@ -77,22 +74,30 @@ def along(distances):
     return centers
 
 
-def chosen(distances, depth=10.0, settings=SETTINGS, axes=None, sources=None):
+def chosen(distances, axes=None, sources=None):
     ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
-    directions = ahead if axes is None else axes
-    sources, depths = sources or range(len(distances)), [depth] * len(distances)
-    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2), settings)
+    directions, depths = ahead if axes is None else axes, [10.0] * len(distances)
+    sources = sources or range(len(distances))
+    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2), SETTINGS)
 
 
-def test_the_first_frame_beyond_each_baseline_on_either_side():
-    # A baseline of 0.1 at depth 10 is 1.
-    assert chosen([0.5 * k for k in range(12)])[6] == [2, 4, 8, 10]
+HALVES = [0.5 * k for k in range(12)]
 
 
-def test_other_frames_than_the_sources_are_no_neighbours():
-    found = chosen([0.5 * k for k in range(12)], sources=[0, 1, 2, 3, 5, 6, 7, 9, 11])
-    assert found[6] == [2, 3, 9, 11]
-    assert found[4] == [0, 2, 6, 9]  # itself no source, from sources alone
+@pytest.mark.parametrize(
+    ("distances", "sources", "expected"),
+    [
+        (HALVES, None, {6: [2, 4, 8, 10]}),  # a baseline of 0.1 at depth 10 is 1
+        (HALVES, [0, 1, 2, 3, 5, 6, 7, 9, 11], {6: [2, 3, 9, 11], 4: [0, 2, 6, 9]}),  # from sources alone
+        ([0.0] * 5, None, {key: [] for key in range(5)}),
+        ([0.0, 0.2, 0.4], None, {key: [] for key in range(3)}),
+        ([0.0, 9.0, 18.0], None, {key: [] for key in range(3)}),
+        (list(range(8)), None, {0: [1, 2, 4]}),  # 0.1 and 0.2, then 0.3, which is frame 4 by rounding, and 0.4
+    ],
+)
+def test_the_first_frame_beyond_each_baseline_on_either_side(distances, sources, expected):
+    found = chosen([float(distance) for distance in distances], sources=sources)
+    assert {frame: found[frame] for frame in expected} == expected
 
 
 def test_a_pause_changes_no_distance():
@@ -103,18 +108,10 @@ def test_a_pause_changes_no_distance():
 
 
 def test_at_an_end_the_other_side_gives_more():
-    first = chosen([1.0 * k for k in range(8)])[0]
-    assert first == [1, 2, 4]  # 0.1 and 0.2, then 0.3, which is frame 4 by rounding, and 0.4
     assert len(chosen([0.5 * k for k in range(20)])[0]) == 4
 
 
-def test_no_motion_gives_none():
-    assert chosen([0.0] * 5) == [[]] * 5
-    assert chosen([0.0, 0.2, 0.4]) == [[]] * 3
-
-
-def test_neither_too_far_nor_turned_away():
-    assert chosen([0.0, 9.0, 18.0]) == [[]] * 3
+def test_frames_turned_away_are_no_neighbours():
     axes = np.tile([0.0, 0.0, 1.0], (5, 1))
     axes[3] = [1.0, 0.0, 0.0]
     assert 3 not in chosen([1.0 * k for k in range(5)], axes=axes)[1]
@@ -243,13 +240,10 @@ def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
     # Without known depth the scale is a guess.
     guess = np.exp(prior.log_depth(frame, ALL, NOWHERE, NOWHERE, 40.0))
     assert np.median(guess) == pytest.approx(40.0, rel=1e-3)
-
-
-def test_a_larger_map_of_the_same_aspect_is_taken(tmp_path):
-    frame, depth = lit_frame()
-    np.save(tmp_path / "lit.npy", np.kron(depth, np.ones((2, 2))))
-    found = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
-    np.testing.assert_allclose(np.exp(found), depth, rtol=1e-3)
+    if suffix == "npy":  # a larger map of the same aspect is taken
+        np.save(tmp_path / "lit.npy", np.kron(values, np.ones((2, 2))))
+        found = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
+        np.testing.assert_allclose(np.exp(found), depth, rtol=1e-3)
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path):
