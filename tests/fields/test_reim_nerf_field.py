@@ -11,14 +11,13 @@ from pydantic import ValidationError
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.fields.mlp import cosine_embedding
 from coliags_plugin.fields.normalisation import surface_distances
 from coliags_plugin.fields.reim_nerf import RadianceMLP, ReimNerf, ReimNerfFieldSettings
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
-from tests.renderers.test_volume_renderer import sphere_scene
 from tests.scenes import camera_at, wall_scene
 
 SMALL = {"layers": 3, "width": 32, "skip": 1, "color_width": 16}
@@ -187,6 +186,8 @@ def test_other_refusals(tmp_path):
         ([], wall_scene(depth=False), "'depth' needs depth, and no training frame"),
         (["near_plane=500.0"], None, r"start at 500 and end at"),
         (["renderer=torch"], None, "draws gaussians3d, surfels, the field is made of radiance"),
+        (["losses.more={name: d-ssim, weight: 0.2}"], None, "loss term 'more' needs whole images"),
+        (["losses.more={name: scale-volume, weight: 0.2}"], None, "loss term 'more' is about Gaussians"),
     ):
         with pytest.raises(InputError, match=message):
             trainer(tmp_path / "run", overrides, scene)
@@ -270,23 +271,41 @@ def test_every_term_falls(tmp_path):
         assert late < 0.6 * early, name
 
 
+def sphere_scene():
+    """A ball of radius 1, red above, green to the left and blue in front, before black, seen from a ring."""
+    frames = []
+    for index in range(12):
+        angle = 2 * math.pi * index / 12
+        camera = camera_at(-6 * math.sin(angle), 0.8 * math.sin(3 * angle), -6 * math.cos(angle), 40, 32, yaw=angle)
+        rays = torch.nn.functional.normalize(camera.rays(), dim=-1)
+        along = -(rays * camera.center).sum(-1)
+        nearest = (camera.center + along[..., None] * rays).norm(dim=-1)
+        reach = along - (1 - nearest.clamp_max(1) ** 2).sqrt()
+        points = camera.center + reach[..., None] * rays
+        color = torch.where(nearest[..., None] < 1, 0.5 + 0.4 * points, 0.0)
+        depth = torch.where(nearest < 1, reach / camera.rays().norm(dim=-1), torch.nan).float()
+        image = (255 * color.clamp(0, 1)).round().to(torch.uint8)
+        frames.append(Frame(f"{index:04d}", index, image, camera, depth))
+    train, test = [f for f in frames if f.index % 6], [f for f in frames if f.index % 6 == 0]
+    points = torch.cat([f.camera.unproject(f.depth.double())[f.depth.isfinite()] for f in train])
+    return Scene("ball", train, {"test": test}, PointCloud(points), {"fingerprint": "ball"})
+
+
 @pytest.mark.thorough
 def test_a_ball_is_learnt_in_colour_and_depth(tmp_path):
     scene = sphere_scene()
-    frame = scene.train[0]
-    points = torch.cat([f.camera.unproject(f.depth.double())[f.depth.isfinite()] for f in scene.train])
-    scene = replace(scene, points=PointCloud(points))
     options = ["losses.depth.share=1.0", "losses.depth-coarse.share=1.0", "renderer.opaque_end=false"]
     options += ["sampler.pixels=320", "sampler.frames=10", "field.density_noise=0.0"]
     options += ["optimizers.coarse.lr=0.01", "optimizers.fine.lr=0.01"]
     run = trainer(tmp_path / "run", options, scene, steps=200)
     rows = [run.take_step() for _ in range(200)]
-    assert sum(row["psnr"] for row in rows[-10:]) / 10 > 22
-    with torch.no_grad():
-        output = run.model.render(frame.camera, ("depth_accumulated",))
-    hit = frame.depth.isfinite()
-    assert output.alpha[hit].mean() > 0.95
-    assert (output["depth_accumulated"] - frame.depth)[hit].abs().median() < 0.1  # of a ball of radius 1, 6 away
+    assert sum(row["psnr"] for row in rows[-10:]) / 10 > 22 and "gaussians" not in rows[0]
+    for frame in (scene.train[0], scene.test_sets["test"][1]):
+        with torch.no_grad():
+            output = run.model.render(frame.camera, ("depth_accumulated",))
+        hit = frame.depth.isfinite()
+        assert output.alpha[hit].mean() > 0.95
+        assert (output["depth_accumulated"] - frame.depth)[hit].abs().median() < 0.1  # of a ball of radius 1, 6 away
 
 
 def test_rates_are_halved_at_shares_of_the_run(tmp_path):

@@ -75,8 +75,6 @@ SCENES = [
     for primitive, names in zip(PRIMITIVES, (solids.SCENES, surfels.SCENES), strict=True)
     for name in (*names, "thousands")
 ]
-#: Scenes in which most pixels see many Gaussians.
-CROWDED = ("needles", "around the camera", "opaque", "thousands")
 
 
 def few(pixels):
@@ -178,18 +176,8 @@ def with_features(gaussians):
 
 
 @by_each_at_length
-@pytest.mark.parametrize(("primitive", "name"), [scene for scene in SCENES if scene[1] not in CROWDED])
+@pytest.mark.parametrize(("primitive", "name"), SCENES)
 def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
-    check_against_the_definition(renderer, primitive, name)
-
-
-@by_each_at_length
-@pytest.mark.parametrize(("primitive", "name"), [scene for scene in SCENES if scene[1] in CROWDED])
-def test_crowds_agree_with_the_definition_in_float64(renderer, primitive, name):
-    check_against_the_definition(renderer, primitive, name)
-
-
-def check_against_the_definition(renderer, primitive, name):
     gaussians, camera = scene(primitive, name)
     ignored = on_a_cutoff(gaussians, camera)
     assert int(ignored.sum()) <= few(ignored.numel())
