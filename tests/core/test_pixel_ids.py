@@ -29,15 +29,6 @@ def test_numbers_are_splitmix64_of_frame_pixel_and_seed(frame, pixel, seed):
     assert fixed_uniform(ids, seed).item() == (splitmix64(ids.item() ^ splitmix64(seed)) >> 11) / 2**53
 
 
-def test_numbers_are_even_and_those_of_other_frames_and_seeds_unrelated():
-    pixels = torch.arange(50_000)
-    kinds = [fixed_uniform(pixel_ids(frame, pixels), seed) for frame, seed in ((0, 0), (1, 0), (0, 1))]
-    for numbers in kinds:
-        assert (torch.histc(numbers, 20, 0, 1) - 2500).abs().max() < 250
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        assert torch.corrcoef(torch.stack([kinds[a], kinds[b]]))[0, 1].abs() < 0.02
-
-
 def test_a_pixel_has_one_identifier_however_it_is_drawn():
     first, second = wall_scene().train[:2]
     height, width = first.image.shape[:2]

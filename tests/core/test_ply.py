@@ -91,30 +91,20 @@ def test_refused(tmp_path, content, message):
         read_vertices(tmp_path / "p.ply")
 
 
-def test_points_with_and_without_colours(tmp_path):
+def test_written_files_are_read_by_open3d(tmp_path):
     import open3d
 
-    positions, colors = np.arange(6.0).reshape(2, 3), np.array([[1, 2, 3], [255, 0, 128]], np.uint8)
+    positions, colors = np.arange(9.0).reshape(3, 3) ** 2, np.array([[1, 2, 3], [255, 0, 128], [9, 8, 7]], np.uint8)
     write_ply(tmp_path / "folder" / "points.ply", point_properties(positions, colors))
     cloud = open3d.io.read_point_cloud(str(tmp_path / "folder" / "points.ply"))
     np.testing.assert_array_equal(cloud.points, positions)
     np.testing.assert_allclose(cloud.colors, colors / 255.0)
-    write_ply(tmp_path / "plain.ply", point_properties(positions))
-    assert not open3d.io.read_point_cloud(str(tmp_path / "plain.ply")).has_colors()
-
-
-def test_triangles_and_a_comment(tmp_path):
-    import open3d
-
-    positions = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     write_ply(tmp_path / "mesh.ply", point_properties(positions), np.array([[0, 1, 2]]), "millimetres")
     mesh = open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
-    assert np.asarray(mesh.triangles).tolist() == [[0, 1, 2]]
+    assert np.asarray(mesh.triangles).tolist() == [[0, 1, 2]] and not mesh.has_vertex_colors()
     np.testing.assert_array_equal(mesh.vertices, positions)
     assert b"\ncomment millimetres\n" in (tmp_path / "mesh.ply").read_bytes()
-
-
-def test_other_types_become_float32(tmp_path):
+    # Other types become float32.
     write_ply(tmp_path / "rows.ply", {"x": np.array([1, 2]), "weight": np.array([0.5, 0.25])})
     header, _, body = (tmp_path / "rows.ply").read_bytes().partition(b"end_header\n")
     assert header.endswith(b"element vertex 2\nproperty float x\nproperty float weight\n")

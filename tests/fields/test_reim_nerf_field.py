@@ -300,12 +300,12 @@ def test_a_ball_is_learnt_in_colour_and_depth(tmp_path):
     run = trainer(tmp_path / "run", options, scene, steps=200)
     rows = [run.take_step() for _ in range(200)]
     assert sum(row["psnr"] for row in rows[-10:]) / 10 > 22 and "gaussians" not in rows[0]
-    for frame in (scene.train[0], scene.test_sets["test"][1]):
+    for frame, error in ((scene.train[0], 0.1), (scene.test_sets["test"][1], 0.4)):  # of a ball of radius 1, 6 away
         with torch.no_grad():
             output = run.model.render(frame.camera, ("depth_accumulated",))
         hit = frame.depth.isfinite()
         assert output.alpha[hit].mean() > 0.95
-        assert (output["depth_accumulated"] - frame.depth)[hit].abs().median() < 0.1  # of a ball of radius 1, 6 away
+        assert (output["depth_accumulated"] - frame.depth)[hit].abs().median() < error
 
 
 def test_rates_are_halved_at_shares_of_the_run(tmp_path):
