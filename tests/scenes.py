@@ -8,8 +8,13 @@ from pathlib import Path
 import torch
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
+from coliags_plugin.geometry.poses.c3vd import matrix_lines
+from coliags_plugin.phantom.layouts.c3vd import depth_steps
 
 
 def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, yaw: float = 0.0) -> Camera:
@@ -67,6 +72,19 @@ def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24,
         points=None if depth else scene.points,
     )
     return folder
+
+
+def write_c3vd_scene(folder, images, camera_to_world, intrinsics, *, depths=None, points=None):
+    """A whole undistorted scene, with all digits of its poses; depth in mm, NaN where unknown."""
+    for index, image in enumerate(images):
+        write_image(folder / f"images/{index:04d}_color.png", image)
+        if depths is not None:
+            write_image(folder / f"depths/{index:04d}_depth.png", depth_steps(depths[index]))
+    atomic_write(folder / "camera_pose.txt", matrix_lines(camera_to_world))
+    write_camera_json(folder / "camera.json", intrinsics, w=intrinsics.width, h=intrinsics.height)
+    if points is not None:
+        colors = None if points.colors is None else points.colors.numpy()
+        write_ply(folder / "points3D.ply", point_properties(points.positions.numpy(), colors))
 
 
 #: Overrides that make a shipped method small enough for a test.

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from tests.scenes import write_c3vd_scene
 
 RADIUS, END = 20.0, 60.0
 WIDTH, HEIGHT = 160, 128

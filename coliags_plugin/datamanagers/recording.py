@@ -16,6 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.rectification import Rectification
+from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 
 
 @dataclass(frozen=True)
@@ -99,11 +100,13 @@ def _readable(path: Path) -> Iterator[None]:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable file", "Restore it") from error
 
 
-def check_pose_count(file: Path, poses: int, images: int) -> None:
-    """Raise InputError if the numbers of poses and images differ."""
-    if poses != images:
+def poses_of_images(file: Path, images: int) -> C3vdPoses:
+    """The poses of a file of C3VD's form, of which every image must have one."""
+    poses = read_poses(file)
+    if len(poses.camera_to_world) != images:
         raise InputError(
-            f"{file} has {poses} poses for {images} images",
+            f"{file} has {len(poses.camera_to_world)} poses for {images} images",
             "a pose for every image, in order",
             "Restore the missing ones, or remove the surplus at the end",
         )
+    return poses

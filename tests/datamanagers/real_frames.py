@@ -11,9 +11,9 @@ import torch
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
+from tests.scenes import write_c3vd_scene
 
 
 def real_lens(shared_data: Path) -> FisheyeLens:
@@ -62,5 +62,5 @@ def undistort_real_frames(shared_data: Path, out: Path, width: int, height: int,
         raise RuntimeError("the chosen pinhole sees beyond the crop")
     images = [undistortion.image(read_rgb(folder / frame["file_path"])) for frame in frames]
     camera_to_world = np.array([frame["c2w"] for frame in frames])
-    write_c3vd_scene(out, images, camera_to_world, pinhole, points=sparse_points(shared_data), overwrite=True)
+    write_c3vd_scene(out, images, camera_to_world, pinhole, points=sparse_points(shared_data))
     return out

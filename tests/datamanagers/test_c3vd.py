@@ -18,11 +18,11 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
-from coliags_plugin.datamanagers.c3vd.writer import depth_steps
-from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read_camera_intrinsics
+from coliags_plugin.datamanagers.c3vd_v2.reader import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
+from coliags_plugin.phantom.layouts.c3vd import depth_steps
 from tests.datamanagers.kinds import write
 from tests.datamanagers.wall_scenes import (
     PINHOLE,
@@ -306,14 +306,6 @@ def test_a_folder_of_something_else(tmp_path):
         load(tmp_path)
 
 
-def test_what_the_writer_refuses(tmp_path, undistorted):
-    with pytest.raises(InputError, match="9 images, 9 poses and 1 depths"):
-        write_undistorted(tmp_path / "wall", depths=[np.ones((48, 64))])
-    assert not (tmp_path / "wall").exists()
-    write_undistorted(tmp_path / "wall", count=2)
-    with pytest.raises(InputError, match="already exists"):
-        write_undistorted(tmp_path / "wall", count=2)
-    write_undistorted(tmp_path / "wall", count=3, overwrite=True)
-    assert len(list((tmp_path / "wall" / "images").iterdir())) == 3
+def test_a_written_scene_is_read_back(undistorted):
     assert read_intrinsics(undistorted / "camera.json") == PINHOLE
     assert off_wall(load(undistorted).points.positions.numpy()).max() < 0.002

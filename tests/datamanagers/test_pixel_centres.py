@@ -12,11 +12,9 @@ import pytest
 import torch
 
 from coliags_plugin.config.registry import phantom_layouts
-from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.formats import format_of, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import PhantomFrame, WallPoints
@@ -56,12 +54,6 @@ def poses() -> np.ndarray:
     return result
 
 
-def frames() -> list[Frame]:
-    image, depth = torch.from_numpy(spot(PinholeLens.of(PINHOLE))), torch.full((HEIGHT, WIDTH), 20.0)
-    cameras = [Camera.of(PINHOLE, torch.from_numpy(pose)) for pose in poses()]
-    return [Frame(f"{index:04d}", index, image, camera, depth) for index, camera in enumerate(cameras)]
-
-
 def write_layout(folder: Path, name: str) -> Lens:
     """The spot in a phantom's layout: a point of the wall where frame INDEX sees it."""
     layout = phantom_layouts.get(name)()
@@ -97,13 +89,6 @@ def test_a_spot_is_read_where_a_layout_wrote_it(name, tmp_path):
     assert (frame.sparse_depth is not None) == (name == "colmap")
     if frame.sparse_depth is not None:
         np.testing.assert_allclose(frame.sparse_depth.pixels[0], spot_found(frame.image), atol=0.05)
-
-
-def test_a_spot_is_read_where_a_scene_writer_wrote_it(tmp_path):
-    points = PointCloud(torch.zeros(1, 3), None)
-    images = [frame.image.numpy() for frame in frames()]
-    write_c3vd_scene(tmp_path / "scene", images, poses(), PINHOLE, points=points)
-    check(tmp_path / "scene", "c3vd", PINHOLE)
 
 
 def of_json(name: str, key: str = "cx") -> Callable[[Path], float]:

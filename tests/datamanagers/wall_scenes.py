@@ -12,10 +12,10 @@ import tests.layouts  # noqa: F401  (registers them)
 from coliags_plugin.config.registry import datamanagers, phantom_layouts
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, PhantomFrame, WallPoints
+from tests.scenes import write_c3vd_scene
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])

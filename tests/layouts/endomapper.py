@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.datamanagers.rgbd.writer import TRAJECTORY, write_frame
+from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import FisheyeLens
 from coliags_plugin.geometry.lenses.vicalib import TYPE
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout
-from coliags_plugin.phantom.layouts.rgbd import DEPTH_SCALE
+from coliags_plugin.phantom.layouts.rgbd import DEPTH_SCALE, depth_steps
 
 CALIBRATION = "calibration.xml"
 #: Like a colonoscope's: 150 degrees of view across the frame.
@@ -37,10 +37,13 @@ class EndoMapperLayout(Layout):
     def write_frame(self, folder, frame):
         height, width = frame.z_depth.shape
         _, lit = self.lens(width, height)
-        write_frame(folder, f"{frame.index:04d}.png", frame.color, frame.z_depth, DEPTH_SCALE, lit)
+        name = f"{frame.index:04d}.png"
+        write_image(folder / "rgb" / name, frame.color)
+        write_image(folder / "depth" / name, depth_steps(frame.z_depth))
+        write_mask(folder / "mask" / name, lit)
 
     def write_sequence(self, folder, part, poses, lens):
-        tum.write(folder / TRAJECTORY, Trajectory(poses, timestamps=np.arange(len(poses), dtype=np.float64)))
+        tum.write(folder / "trajectory.txt", Trajectory(poses, timestamps=np.arange(len(poses), dtype=np.float64)))
         atomic_write(folder / CALIBRATION, calibration_text(lens, DEPTH_SCALE))
         write_unit(folder, "mm")
 

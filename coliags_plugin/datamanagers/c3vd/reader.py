@@ -17,12 +17,11 @@ from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots, poses_of_images
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, octagon_mask
-from coliags_plugin.geometry.poses.c3vd import read_poses
 
 LAYOUTS = (
     "the raw release (NNNN_color.png, NNNN_depth.tiff and pose.txt in one folder) "
@@ -87,8 +86,7 @@ class SequenceDataManager(RecordedDataManager):
     def _shots(
         self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
-        poses = read_poses(files.poses)
-        check_pose_count(files.poses, len(poses.camera_to_world), len(files.images))
+        poses = poses_of_images(files.poses, len(files.images))
         rectification, described = self.rectification(files)
         shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, C3VD_DEPTH, seen, prefix)
         facts: dict[str, Any] = {

@@ -2,36 +2,216 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.datamanagers.c3vd_endogslam.poses import (
-    PARAMS,
-    PoseSource,
-    PreparedFiles,
-    SequencePoses,
-    load_poses,
-)
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
 from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots, poses_of_images
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
-from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, read_params
+from coliags_plugin.geometry.poses.c3vd import C3vdPoses
+from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices, read_params
+from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
+
+log = logging.getLogger(__name__)
+
+PARAMS = "params.npz"
+PoseSource = Literal["slam", "ground-truth"]
+
+#: Largest difference of params.npz's true poses from pose.txt, mm and degrees. Rounding is a thousandth of this;
+#: another sequence, or another order of frames, differs by millimetres.
+SAME_SEQUENCE = 0.05
+#: Ratio of the ATE to the spread of the cameras from which tracking counts as lost.
+LOST = 0.2
+
+
+@dataclass(frozen=True)
+class PreparedFiles:
+    """The files of one sequence, frame 0 first.
+
+    ``params`` is EndoGSLAM's result, ``cloud`` the optimised Gaussians of PR-Endo's release.
+    """
+
+    folder: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: Path | None
+    params: Path | None
+    cloud: Path | None
+
+
+@dataclass(frozen=True)
+class SequencePoses:
+    """The poses of a sequence in one world. Rigid, OpenCV axes, mm.
+
+    ``from_slam`` and ``from_file`` transform from EndoGSLAM's world and from that of pose.txt; None without the file.
+    """
+
+    camera_to_world: Float[np.ndarray, "N 4 4"]
+    from_slam: Float[np.ndarray, "4 4"] | None
+    from_file: Float[np.ndarray, "4 4"] | None
+    facts: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Slam:
+    """EndoGSLAM's trajectory aligned with the true one.
+
+    ``indices`` are the image indices of its F poses; ``from_true`` transforms from the true poses, relative to their
+    first camera, to EndoGSLAM's world.
+    """
+
+    params: EndoGslamParams
+    indices: Int[np.ndarray, "F"]
+    from_true: Float[np.ndarray, "4 4"]
+    facts: Mapping[str, Any]
+
+
+def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> SequencePoses:
+    """Load the poses of a sequence's images; ``params`` are the contents of ``files.params``.
+
+    ``slam``: EndoGSLAM's poses, in its world; images it did not track get their true poses, transformed to it.
+    ``ground-truth``: the true poses, in the world of pose.txt, or without it of the first camera.
+    """
+    count = len(files.images)
+    file = None if files.poses is None else poses_of_images(files.poses, count)
+    slam = None if params is None else _align_slam(files, params, file)
+    facts: dict[str, Any] = {
+        "poses": source,
+        "pose_convention": None if file is None else {"order": file.convention, **file.evidence},
+        "slam": None if slam is None else slam.facts,
+    }
+    if source == "slam" and slam is None:
+        raise InputError(
+            f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
+            "EndoGSLAM's result, for option poses: slam",
+            "Name it with --set datamanager.params_file=FILE, or --set datamanager.poses=ground-truth",
+        )
+    tracked = slam is not None and len(slam.indices) == count
+    if file is None and not tracked:
+        has = "" if slam is None else f", and {files.params} poses of {len(slam.indices)} of {count} images alone"
+        raise InputError(
+            f"{files.folder} has no pose.txt{has}",
+            "a pose for every image",
+            "Put the sequence's pose.txt of C3VD's release there",
+        )
+    if source == "slam" and slam is not None:
+        camera_to_world, from_file = slam.params.camera_to_world, None
+        if file is not None:
+            from_file = slam.from_true @ _inverse(file.camera_to_world[0])
+            if not tracked:
+                camera_to_world = from_file @ file.camera_to_world
+                camera_to_world[slam.indices] = slam.params.camera_to_world
+        return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
+    from_slam = None if slam is None else _inverse(slam.from_true)
+    if file is None:
+        assert slam is not None  # as tracked says
+        return SequencePoses(slam.params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
+    if from_slam is not None:
+        from_slam = file.camera_to_world[0] @ from_slam
+    return SequencePoses(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
+
+
+def _align_slam(files: PreparedFiles, params: EndoGslamParams, file: C3vdPoses | None) -> _Slam:
+    path, count, poses = files.params, len(files.images), len(params.camera_to_world)
+    indices = image_indices(poses, count)
+    if indices is None:
+        raise InputError(
+            f"{path} has {poses} poses for {count} images in {files.folder}",
+            f"{count} (one for every image) or {count - count // 8} (all but 7, 15, 23, ...)",
+            "Give the params.npz of this sequence, run on all of its images",
+        )
+    compared = None
+    if file is not None:
+        true = _inverse(file.camera_to_world[0]) @ file.camera_to_world[indices]
+        compared = _compared(files, params.true_camera_to_world, true, indices)
+    from_true = _rigid_alignment(params.true_camera_to_world, params.camera_to_world)
+    aligned = from_true @ params.true_camera_to_world
+    errors = np.linalg.norm(aligned[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
+    angles = _angles(aligned, params.camera_to_world)
+    ate, spread = float(np.sqrt(np.mean(errors**2))), float(aligned[:, :3, 3].std(axis=0).max())
+    if ate > LOST * spread:
+        log.warning(
+            "%s: EndoGSLAM's cameras are %.3g mm (RMS) from the true ones, which spread over %.3g mm: tracking failed "
+            "or stopped early",
+            path,
+            ate,
+            spread,
+        )
+    facts = {
+        "params": str(path),
+        "frames": poses,
+        "images": "every" if poses == count else "all but 7, 15, 23, ...",
+        "other_images": None if poses == count else "true poses, brought into the mapped world by a rigid fit",
+        "compared_with_pose_file": compared,
+        "ate_rmse_mm": ate,
+        "ate_max_mm": float(errors.max()),
+        "mean_rotation_error_deg": float(angles.mean()),
+    }
+    return _Slam(params, indices, from_true, facts)
+
+
+def _compared(
+    files: PreparedFiles,
+    stored: Float[np.ndarray, "F 4 4"],
+    true: Float[np.ndarray, "F 4 4"],
+    indices: Int[np.ndarray, "F"],
+) -> dict[str, float]:
+    """Largest differences between the true poses of params.npz and pose.txt."""
+    distances = np.linalg.norm(stored[:, :3, 3] - true[:, :3, 3], axis=1)
+    angles = _angles(stored, true)
+    worst = int(np.argmax(np.maximum(distances, angles)))
+    if max(distances[worst], angles[worst]) > SAME_SEQUENCE:
+        raise InputError(
+            f"{files.params}: the true pose of image {indices[worst]} is {distances[worst]:.3g} mm and "
+            f"{angles[worst]:.3g} degrees from that of {files.poses}",
+            f"both within {SAME_SEQUENCE:g}, both relative to the first camera",
+            "It belongs to another sequence or to other images: give this sequence's params.npz",
+        )
+    return {"largest_distance_mm": float(distances.max()), "largest_angle_deg": float(angles.max())}
+
+
+def _rigid_alignment(
+    source: Float[np.ndarray, "F 4 4"], target: Float[np.ndarray, "F 4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Rigid alignment of two trajectories of the same frames: mean relative rotation, then mean translation.
+
+    The rotation is estimated from orientations, since a colonoscope's path is nearly a straight line, and positions
+    leave the rotation about it undetermined.
+    """
+    rotations = target[:, :3, :3] @ source[:, :3, :3].transpose(0, 2, 1)
+    rotation = Rotation.from_matrix(rotations).mean().as_matrix()
+    translation = (target[:, :3, 3] - source[:, :3, 3] @ rotation.T).mean(axis=0)
+    return rigid(rotation[None], translation[None])[0]
+
+
+def _angles(first: Float[np.ndarray, "F 4 4"], second: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F"]:
+    return rotation_angles_deg(first[:, :3, :3] @ second[:, :3, :3].transpose(0, 2, 1))
+
+
+def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    return inverse(matrix[None])[0]
+
 
 LAYOUT = (
     "EndoGSLAM's C3VD: color/NNNN_color.png and depth/NNNN_depth.tiff with pose.txt, params.npz or both; "
@@ -150,8 +330,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 "pose.txt of the scene and of its rotation views, in one world",
                 f"Add it, or move {folder.name} away",
             )
-        rotation = c3vd_poses.read_poses(files.poses).camera_to_world
-        check_pose_count(files.poses, len(rotation), len(files.images))
+        rotation = poses_of_images(files.poses, len(files.images)).camera_to_world
         seen = find_seen_masks(folder, len(files.images))
         camera_to_world, depth_format = poses.from_file @ rotation, _depth_format(files)
         return make_shots(

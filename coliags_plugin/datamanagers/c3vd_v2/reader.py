@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from pathlib import Path
 from typing import Any, Literal
@@ -10,16 +11,114 @@ from typing import Any, Literal
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.c3vd.reader import SequenceDataManager, SequenceFiles
-from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION
-from coliags_plugin.geometry.lenses.models import LENSES, Lens
+from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 
 log = logging.getLogger(__name__)
+
+#: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is
+#: what v2 was probably rendered with, and unverified (docs/layouts/c3vd-v2.md 2). It counts pixel centres at integers:
+#: hence + 0.5.
+CANDIDATE_LENS = OmnidirectionalLens(
+    width=1350,
+    height=1080,
+    cx=677.739464094188 + 0.5,
+    cy=543.057997844875 + 0.5,
+    a0=767.733695862103,
+    a2=-0.000592506426558248,
+    a3=-2.69440266600040e-07,
+    a4=-2.16380341010063e-10,
+    c=1.0,
+    d=0.0,
+    e=0.0,
+)
+
+#: Order of the model's parameters on C3VD's page.
+ORDER = ("width", "height", "cx", "cy", "a0", "a1", "a2", "a3", "a4", "c", "d", "e")
+_NEEDED = frozenset({"cx", "cy", "a0", "a2", "a3", "a4"})
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NAMED = re.compile(rf"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*({_NUMBER.pattern})")
+
+
+def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
+    """Read a ``camera_intrinsics.txt``.
+
+    The file's format is not published. Two unambiguous ones are accepted: named numbers (``cx = 677.7``), or twelve
+    bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). The centre must be near
+    the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
+    """
+    text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
+    named, bare = _NAMED.findall(text), _bare(text)
+    if named:
+        values = _by_name(path, [(name.lower(), float(number)) for name, number in named])
+    elif bare is not None and len(bare) in (len(ORDER), len(ORDER) - 2):
+        values = dict(zip(ORDER[-len(bare) :], bare, strict=True))
+    else:
+        count = "text" if bare is None else f"{len(bare)} numbers"
+        raise _unclear(path, f"{count} without names")
+    width, height = values.pop("width", 1350.0), values.pop("height", 1080.0)
+    doubt = _doubt(values, width, height)
+    if doubt:
+        raise _unclear(path, doubt)
+    cx, cy, a0, a2, a3, a4, c, d, e = (values[name] for name in ORDER[2:] if name != "a1")
+    return OmnidirectionalLens(
+        width=round(width), height=round(height), cx=cx + 0.5, cy=cy + 0.5, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
+    )
+
+
+def _bare(text: str) -> list[float] | None:
+    """Numbers of a text; None if it holds anything else."""
+    words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
+    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else None
+
+
+def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
+    names = [name for name, _ in pairs]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    unknown = sorted(set(names) - set(ORDER))
+    missing = sorted(_NEEDED - set(names))
+    if repeated or unknown or missing:
+        faults = [
+            f"{what} {', '.join(listed)}"
+            for what, listed in (("no", missing), ("twice", repeated), ("unknown", unknown))
+            if listed
+        ]
+        raise _unclear(path, "; ".join(faults))
+    return {"a1": 0.0, "c": 1.0, "d": 0.0, "e": 0.0, **dict(pairs)}
+
+
+def _doubt(values: dict[str, float], width: float, height: float) -> str:
+    """Reason why a calibration is implausible for an omnidirectional colonoscope, or an empty string."""
+    if not all(map(math.isfinite, (*values.values(), width, height))) or min(width, height) < 1.0:
+        return f"an image of {width:g} x {height:g}, or numbers that are not finite"
+    off_middle = max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5))
+    doubts = {
+        f"an image of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
+        f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}": off_middle
+        > 0.1,
+        f"a focal length a0 = {values['a0']:g} for {width:g} pixels": not 0.2 < values["a0"] / width < 2.0,
+        f"a1 = {values['a1']:g}, which is 0 in this model": values["a1"] != 0.0,
+        f"c, d, e = {values['c']:g}, {values['d']:g}, {values['e']:g}, far from 1, 0, 0": max(
+            abs(values["c"] - 1.0), abs(values["d"]), abs(values["e"])
+        )
+        > 0.1,
+    }
+    return next((doubt for doubt, holds in doubts.items() if holds), "")
+
+
+def _unclear(path: Path, seen: str) -> InputError:
+    return InputError(
+        f"{path} is ambiguous or implausible: {seen}",
+        f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
+        "Rewrite it in this format, or --set datamanager.lens=v2 (an unverified candidate), or v1 (C3VD's own)",
+    )
+
 
 LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
 #: Announced for the release; its location and format are not documented.

@@ -2,27 +2,252 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import posixpath
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 from pydantic import Field
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio.files import FILE, PixelCenters, Transforms
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
-from coliags_plugin.datamanagers.reading.files import short_names, unposed_images, warn_of_unposed
+from coliags_plugin.datamanagers.reading.files import (
+    first_few,
+    named_file,
+    short_names,
+    unposed_images,
+    warn_of_unposed,
+)
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import FACTORS, Unit, printed_unit
-from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, PinholeLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
+
+FILE = "transforms.json"
+#: Key of the list of frames that estimated depth was made from.
+ESTIMATED_FROM = "depth_estimated_from"
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+
+PixelCenters = Literal["half", "integer"]
+
+#: nerfstudio's camera models and their distortion parameters; others must be 0 or absent.
+_MODELS: Mapping[str, tuple[str, ...]] = {
+    "OPENCV": ("k1", "k2", "k3", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+}
+_BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """An entry of ``frames``: its existing files and its camera."""
+
+    name: str
+    image: Path
+    camera: Lens
+    depth: Path | None
+    mask: Path | None
+    confidence: Path | None
+
+
+class Transforms:
+    """Contents of a ``transforms.json`` whose poses have been read before, so that its structure is valid.
+
+    ``outside`` tells whether it may name files outside of its folder.
+    """
+
+    def __init__(self, path: Path, outside: bool = False) -> None:
+        self.path, self._outside = path, outside
+        self.content: dict[str, Any] = read_json(path, "a transforms.json")
+        self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
+
+    def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[FrameFiles]:
+        """Frame entries by name; depth and confidence are there for all frames or for none."""
+        images = self._images(names)
+        depths = self._for_all_or_none(names, "depth_file_path", "depth")
+        confidences = self._for_all_or_none(names, "confidence_file_path", "confidence")
+        if any(confidences) and not any(depths):
+            raise InputError(
+                f"{self.path}: the frames have a confidence_file_path, but no depth_file_path",
+                "confidence beside the depth that it is about",
+                "Add depth_file_path, or remove confidence_file_path",
+            )
+        # Without a size in the file, all images must have the size of the first.
+        first_size = cache(lambda: size_of(images[0]))
+        return [
+            FrameFiles(
+                name,
+                image,
+                _camera_of(
+                    {**self.content, **self.frames[name]}, f"{self.path}, frame {name}", pixel_centers, first_size
+                ),
+                depth,
+                self._file(name, "mask_path"),
+                confidence,
+            )
+            for name, image, depth, confidence in zip(names, images, depths, confidences, strict=True)
+        ]
+
+    def points_file(self) -> Path | None:
+        """The file of ``ply_file_path``; None if there is none."""
+        name = self.content.get("ply_file_path")
+        if name is None:
+            return None
+        path = self._named(str(name))
+        if not path.is_file():
+            raise InputError(f"{self.path}: no file {path}", "the point cloud of ply_file_path", "Restore or remove it")
+        return path
+
+    def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
+        """Transform points of the file into the world of its poses, :mod:`coliags_plugin.geometry.poses.nerfstudio`."""
+        applied = np.array(self.content.get("applied_transform", np.eye(4)), np.float64)[:3]
+        unscaled = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
+        return np.asarray(unscaled @ applied[:, :3])
+
+    def split(self, names: Sequence[str]) -> dict[str, list[int]] | None:
+        """Indices of training and test frames among ``names``; None if the file has no split.
+
+        Test frames are those of ``test_filenames`` or, if empty, of ``val_filenames``.
+        """
+        listed = {part: self.content.get(f"{part}_filenames") for part in ("train", "val", "test")}
+        if not listed["train"]:
+            return None
+        test = "test" if listed["test"] else "val"
+        chosen = {
+            "train": self._indices("train_filenames", listed["train"], names),
+            "test": self._indices(f"{test}_filenames", listed[test] or [], names),
+        }
+        if both := set(chosen["train"]) & set(chosen["test"]):
+            name = names[min(both)]
+            raise InputError(f"{self.path}: {name} is in train_filenames and {test}_filenames", "one of the two")
+        return chosen
+
+    def made_from(self, names: Sequence[str]) -> dict[str, list[int]]:
+        """Indices among ``names`` of the frames that estimated depth was made from, if the file tells."""
+        listed = self.content.get(ESTIMATED_FROM)
+        return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed, names)}
+
+    def depth_unit(self) -> float | None:
+        """World units before applied_scale per stored depth unit; None if not given."""
+        if "depth_unit_scale_factor" not in self.content:
+            return None
+        return read_number(self.content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
+
+    def _indices(self, key: str, listed: Any, names: Sequence[str]) -> list[int]:
+        index_of = {posixpath.normpath(name): index for index, name in enumerate(names)}
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{self.path}: {key} is not a list of names", "file_paths of frames")
+        unknown = [name for name in listed if posixpath.normpath(name) not in index_of]
+        if unknown:
+            hint = did_you_mean(unknown[0], index_of)
+            raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
+        return sorted({index_of[posixpath.normpath(name)] for name in listed})
+
+    def _images(self, names: Sequence[str]) -> list[Path]:
+        folder = self.path.parent
+        found: list[Path | None] = []
+        for name in names:
+            candidates = [self._named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES)]
+            found.append(next((path for path in candidates if path.is_file()), None))
+        missing = [name for name, path in zip(names, found, strict=True) if path is None]
+        if missing:
+            raise InputError(
+                f"{self.path}: {len(missing)} of {len(names)} frames have no image in {folder}: {first_few(missing)}",
+                f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
+                "Restore them, or remove their frames",
+            )
+        return cast(list[Path], found)
+
+    def _named(self, name: str) -> Path:
+        return named_file(self.path.parent, name, str(self.path), self._outside)
+
+    def _for_all_or_none(self, names: Sequence[str], key: str, what: str) -> list[Path | None]:
+        files = [self._file(name, key) for name in names]
+        if None in files and any(files):
+            lone = names[files.index(None)]
+            raise InputError(
+                f"{self.path}: {sum(map(bool, files))} of {len(files)} frames have a {key}; {lone} has not",
+                f"{what} for every frame, or for none",
+                "Add the missing ones",
+            )
+        return files
+
+    def _file(self, name: str, key: str) -> Path | None:
+        value = self.frames[name].get(key)
+        if value is None:
+            return None
+        path = self._named(str(value))
+        if not path.is_file():
+            raise InputError(f"{self.path}, frame {name}: no file {path}", f"the file of {key}", "Restore it")
+        return path
+
+
+def _camera_of(
+    values: Mapping[str, Any], where: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
+) -> Lens:
+    """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
+
+    ``values`` are the keys of the file, overlaid with those of the frame; ``where`` names the frame in messages.
+    ``stored_size`` returns width and height of the image; it is called only if the file has no size.
+    """
+    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if not isinstance(model, str) or model not in _MODELS:
+        raise InputError(f"{where}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
+    width, height = image_size(values, where) if "w" in values or "h" in values else stored_size()
+    fx, fy = _focal_lengths(values, where, width, height)
+    # The default principal point is the image centre in either convention.
+    shift = 0.0 if pixel_centers == "half" else 0.5
+    cx = read_number(values, "cx", where) + shift if "cx" in values else 0.5 * width
+    cy = read_number(values, "cy", where) + shift if "cy" in values else 0.5 * height
+    if min(fx, fy, width, height) <= 0.0:
+        raise InputError(f"{where}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
+    bends = {key: read_number(values, key, where) for key in _BENDS if values.get(key)}
+    if wrong := sorted(set(bends) - set(_MODELS[model])):
+        meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
+        raise InputError(
+            f"{where}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
+            f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
+            "Undistort the images, or correct camera_model",
+        )
+    if model == "OPENCV_FISHEYE":
+        k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
+        return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+    if not bends:
+        return PinholeLens(fx, fy, cx, cy, width, height)
+    k1, k2, k3, p1, p2 = (bends.get(key, 0.0) for key in _MODELS[model])
+    return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+
+def _focal_lengths(values: Mapping[str, Any], where: str, width: int, height: int) -> tuple[float, float]:
+    """Horizontal and vertical focal length, pixels; equal if only one is given."""
+    lengths: dict[str, float] = {}
+    for axis, pixels in (("x", width), ("y", height)):
+        if f"fl_{axis}" in values:
+            lengths[axis] = read_number(values, f"fl_{axis}", where)
+        elif f"camera_angle_{axis}" in values:
+            expected = "radians, above 0 and below pi"
+            angle = read_number(values, f"camera_angle_{axis}", where, expected, above=0.0, below=math.pi)
+            lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
+    if not lengths:
+        raise InputError(f"{where}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
+    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
+
 
 #: Files that identify RotateColon instead, whose images are named by number and whose depth is scaled.
 _ROTATECOLON = ("train_views", "transforms_test.json")

@@ -13,7 +13,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.datamanagers.nerfstudio.files import ESTIMATED_FROM
+from coliags_plugin.datamanagers.nerfstudio.reader import ESTIMATED_FROM
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 _POINTS = "points.ply"

@@ -42,11 +42,6 @@ EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-N
 C3VD_RANGE = 100.0
 #: Digits tried of numbers in file names.
 _DIGITS = 6
-#: Keys that have the same value in all files of a sequence.
-_SHARED = (
-    *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "w", "h"),
-    *("camera_model", "scene_scale", "distmap_scale", "scene_T"),
-)
 
 
 @dataclass(frozen=True)
@@ -56,23 +51,6 @@ class FrameEntry:
     image: Path
     distances: Path | None
     camera_to_world: Float[np.ndarray, "4 4"]
-
-
-@dataclass(frozen=True)
-class ReimNerfSequence:
-    """Combined contents of a folder's JSON files; frames in video order, ``parts`` are indices into them.
-
-    The images are distorted by ``lens``. ``scene_scale`` is in normalised units per mm, ``scene_shift`` is added to
-    positions in mm before scaling, and ``distmap_scale`` is the normalised distance of the stored value 65535.
-    """
-
-    files: Mapping[str, Path]
-    lens: FisheyeLens
-    scene_scale: float
-    scene_shift: Float[np.ndarray, "3"]
-    distmap_scale: float
-    frames: tuple[FrameEntry, ...]
-    parts: Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,51 +121,64 @@ class ReimNerfDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        sequence = read_sequence(path, settings.outside_files)
-        if settings.split == "own" and "true_test" not in sequence.parts:
+        require_folder(path, EXPECTED)
+        files = {part: file for part in PARTS if (file := path / f"transforms_{part}.json").is_file()}
+        if "train" not in files:
+            raise InputError(f"{path} holds {inventory(path)}", EXPECTED, "Add transforms_train.json")
+        if settings.split == "own" and "true_test" not in files:
             raise InputError(
                 f"{path} has no transforms_true_test.json",
                 "the test frames of split 'own'",
                 "Add it, or choose another split",
             )
-        file, lens = sequence.files["train"], sequence.lens
+        contents = {part: _read(file) for part, file in files.items()}
+        file, first = files["train"], contents["train"]
+        lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
+        distmap_scale = read_number(
+            {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
+        )
+        frames: dict[str, FrameEntry] = {}
+        frames_of = {}
+        for part, content in contents.items():
+            frames_of[part] = _frames(path, files[part], content, scale, shift, settings.outside_files)
+            frames = frames_of[part] | frames
+        unordered = [*frames]
+        names = [unordered[index] for index in natural_order(unordered)]
+        if len({frame.distances is None for frame in frames.values()}) > 1:
+            lone = next(name for name in names if frames[name].distances is None)
+            raise InputError(f"{path}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
+        parts = {part: [index for index, name in enumerate(names) if name in own] for part, own in frames_of.items()}
         mask = path / MASK_FILE if settings.mask else None
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
-        rectification = Rectification.through(
-            lens, file, self.working_size(lens.width, lens.height), settings.focal_scale, shows
-        )
-        size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
-        form = RayDistance(size, rectification.nearest(ray_cosines(lens)))
-        seen = find_seen_masks(path / "truth", len(sequence.frames))
-        images = [frame.image for frame in sequence.frames]
-        distances = [frame.distances for frame in sequence.frames]
-        poses = np.stack([frame.camera_to_world for frame in sequence.frames])
+        size = self.working_size(lens.width, lens.height)
+        rectification = Rectification.through(lens, file, size, settings.focal_scale, shows)
+        form = RayDistance(distmap_scale / 65535.0 / scale, rectification.nearest(ray_cosines(lens)))
+        seen = find_seen_masks(path / "truth", len(frames))
+        images, distances = ([getattr(frames[name], part) for name in names] for part in ("image", "distances"))
+        poses = np.stack([frames[name].camera_to_world for name in names])
         shots = make_shots(images, rectification, poses, distances, form, seen)
         warn_of_unposed(path, unposed_images(images, distances))
         large = [file for pair in zip(images, distances, strict=True) for file in pair]
-        parts = sequence.parts
+        facts: dict[str, Any] = {
+            "layout": "REIM-NeRF",
+            "lens": "fisheye of the JSON files",
+            "focal_scale": settings.focal_scale,
+            "mask": MASK_FILE if settings.mask else None,
+            **rectification.facts(),
+            "parts": {part: len(indices) for part, indices in parts.items()},
+            "pose_convention": {
+                "order": "camera-to-world, OpenGL axes, normalised",
+                "scene_scale": scale,
+                "scene_shift_mm": [float(value) for value in shift],
+            },
+        }
         return Recording(
             kind="REIM-NeRF layout",
             shots=shots,
-            facts=self._facts(sequence, rectification),
-            fingerprint=fingerprint(path, large, (*sequence.files.values(), mask)),
+            facts=facts,
+            fingerprint=fingerprint(path, large, (*files.values(), mask)),
             own_split={"train": parts["train"], "test": parts.get("true_test", ())},
         )
-
-    def _facts(self, sequence: ReimNerfSequence, rectification: Rectification) -> dict[str, Any]:
-        return {
-            "layout": "REIM-NeRF",
-            "lens": "fisheye of the JSON files",
-            "focal_scale": self.settings.focal_scale,
-            "mask": MASK_FILE if self.settings.mask else None,
-            **rectification.facts(),
-            "parts": {part: len(indices) for part, indices in sequence.parts.items()},
-            "pose_convention": {
-                "order": "camera-to-world, OpenGL axes, normalised",
-                "scene_scale": sequence.scene_scale,
-                "scene_shift_mm": [float(value) for value in sequence.scene_shift],
-            },
-        }
 
 
 def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
@@ -214,62 +205,6 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
     cosine = 1.0 / np.linalg.norm(rays, axis=1)
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
-
-
-def read_sequence(folder: Path, outside: bool = False) -> ReimNerfSequence:
-    """Read and combine the JSON files of a folder; they must not contradict each other.
-
-    ``outside`` tells whether files may be named outside of it.
-    """
-    require_folder(folder, EXPECTED)
-    files = {part: folder / f"transforms_{part}.json" for part in PARTS}
-    files = {part: file for part, file in files.items() if file.is_file()}
-    if "train" not in files:
-        raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Add transforms_train.json")
-    contents = {part: _read(file) for part, file in files.items()}
-    first = contents["train"]
-    for part, content in contents.items():
-        for key in _SHARED:
-            if first.get(key) != content.get(key):
-                raise InputError(
-                    f"{files[part]}: {key} differs from {files['train'].name}",
-                    "one camera and one scale for all files",
-                    "Write all files in one run",
-                )
-    lens = _lens(files["train"], first)
-    scale, shift = _normalisation(files["train"], first)
-    defaults = {"distmap_scale": math.pi, **first}
-    distmap_scale = read_number(defaults, "distmap_scale", files["train"], "a number above 0", above=0.0)
-    frames: dict[str, FrameEntry] = {}
-    names_of: dict[str, list[str]] = {}
-    for part, content in contents.items():
-        names_of[part] = []
-        for name, frame in _frames(folder, files[part], content, scale, shift, outside):
-            known = frames.setdefault(name, frame)
-            if known.distances != frame.distances or not np.allclose(
-                known.camera_to_world, frame.camera_to_world, atol=1e-4
-            ):
-                raise InputError(
-                    f"{files[part]}: pose or distance map of {name} differs from another file's",
-                    "the same values for a frame in all files",
-                    "Write all files in one run",
-                )
-            names_of[part].append(name)
-    names = list(frames)
-    names = [names[index] for index in natural_order(names)]
-    index_of = {name: index for index, name in enumerate(names)}
-    if sum(frame.distances is not None for frame in frames.values()) not in (0, len(frames)):
-        lone = next(name for name in names if frames[name].distances is None)
-        raise InputError(f"{folder}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
-    return ReimNerfSequence(
-        files,
-        lens,
-        scale,
-        shift,
-        distmap_scale,
-        tuple(frames[name] for name in names),
-        {part: tuple(sorted(index_of[name] for name in names)) for part, names in names_of.items()},
-    )
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -304,8 +239,10 @@ def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float
 
 def _frames(
     folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"], outside: bool
-) -> list[tuple[str, FrameEntry]]:
-    result, names, matrices = [], [], []
+) -> dict[str, FrameEntry]:
+    """Frames of one file by the names of their images."""
+    result: dict[str, FrameEntry] = {}
+    names, matrices = [], []
     for index, frame in enumerate(content["frames"]):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
@@ -335,7 +272,7 @@ def _frames(
                     "every named file",
                     "Restore it",
                 )
-        result.append((name, FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
+        result[name] = FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)
     return result
 
 

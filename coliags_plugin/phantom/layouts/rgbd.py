@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt16
 
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
-from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses import tum
@@ -27,17 +27,26 @@ class RGBDLayout(Layout):
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""
-        write_frame(folder, f"{_time(frame.index)}.png", frame.color, frame.z_depth, DEPTH_SCALE)
+        name = f"{_time(frame.index)}.png"
+        write_image(folder / "rgb" / name, frame.color)
+        write_image(folder / "depth" / name, depth_steps(frame.z_depth))
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
         times = [_time(index) for index in range(len(poses))]
         tum.write(folder / "groundtruth.txt", Trajectory(poses, timestamps=np.array(times, np.float64)))
-        write_camera_json(folder / CAMERA, lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
+        write_camera_json(folder / "camera.json", lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
         write_unit(folder, "mm")
         for kind in ("rgb", "depth"):
             lines = ["# timestamp filename", *(f"{time} {kind}/{time}.png" for time in times)]
             atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
+
+
+def depth_steps(depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
+    """z-depth, mm, in 16-bit steps; 0 where unknown or out of range."""
+    known = np.isfinite(depth) & (depth > 0.0)
+    steps = np.maximum(np.rint(np.where(known, depth, 0.0) * DEPTH_SCALE), 1)
+    return np.where(known & (steps <= 65_535), steps, 0).astype(np.uint16)
 
 
 def _time(index: int) -> str:

@@ -14,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import first_few
-from coliags_plugin.datamanagers.rotatecolon.exr_depth import read_exr_channel
+from coliags_plugin.datamanagers.rotatecolon.reader import read_exr_channel
 from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 
 

@@ -21,9 +21,9 @@ from coliags_plugin.checks.data.reprojection import CHANGES, Pair, agreement, be
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
+from tests.scenes import write_c3vd_scene
 from tests.textured_tube import tube_frames
 
 

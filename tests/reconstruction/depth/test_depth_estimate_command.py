@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.datamanagers.units import write_unit
@@ -26,6 +25,7 @@ from coliags_plugin.reconstruction.depth.work_files import WorkFolder
 from tests import commands
 from tests.commands import run
 from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames
+from tests.scenes import write_c3vd_scene
 
 COUNT = 9
 OPTIONS = ("--set", "depth.features.highlight_level=256", "--jobs", 2)
