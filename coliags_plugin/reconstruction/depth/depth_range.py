@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.depth.settings import MAX_TURN
 from coliags_plugin.reconstruction.structure.features import (
     Features,
     FeatureSettings,
@@ -56,13 +57,8 @@ def given_range(near: float, far: float, count: int) -> DepthRange:
     return DepthRange(near, far, (float(np.sqrt(near * far)),) * count)
 
 
-def find_range(
-    frames: Sequence[Frame], settings: FeatureSettings, max_turn: float, progress: Progress | None = None
-) -> DepthRange:
-    """Depth range from points triangulated between pairs of frames, or from sparse depth where the scene has some.
-
-    ``max_turn``: largest angle between the optical axes of a pair, degrees.
-    """
+def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Progress | None = None) -> DepthRange:
+    """Depth range from points triangulated between pairs of frames, or from sparse depth where the scene has some."""
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
         depths_by_frame = [
             np.zeros(0)
@@ -86,7 +82,7 @@ def find_range(
             partners = [index + step for step in _STEPS if index + step < len(frames)]
             partners += [index - step for step in _STEPS if index - step >= 0 and not partners]
             depths = [
-                triangulated_depths(features_of(index), features_of(other), frames[index], frames[other], max_turn)
+                triangulated_depths(features_of(index), features_of(other), frames[index], frames[other])
                 for other in partners
             ]
             if depths:
@@ -96,9 +92,7 @@ def find_range(
     return _range_of(depths_by_frame, "points triangulated between frames")
 
 
-def triangulated_depths(
-    first: Features, second: Features, one: Frame, other: Frame, max_turn: float
-) -> Float[np.ndarray, "K"]:
+def triangulated_depths(first: Features, second: Features, one: Frame, other: Frame) -> Float[np.ndarray, "K"]:
     """z-depths, in the first frame, of its features that match along epipolar lines and are seen at a sufficient angle.
 
     NaN for all others.
@@ -107,7 +101,7 @@ def triangulated_depths(
     cameras = (one.camera, other.camera)
     rotation, translation = relative_pose(cameras)
     turn = np.degrees(np.arccos(np.clip(float(one.camera.optical_axis @ other.camera.optical_axis), -1.0, 1.0)))
-    if not np.linalg.norm(translation) > 0.0 or turn > max_turn:
+    if not np.linalg.norm(translation) > 0.0 or turn > MAX_TURN:
         return depths
     pairs = epipolar_matches(first, second, cameras, _ERROR, 0.8, 0.7)
     turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T

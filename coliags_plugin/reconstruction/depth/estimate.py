@@ -18,8 +18,14 @@ from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.reconstruction.depth.completion import complete, data_weight, first_belief, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, depth_confidence, fuse_frame, sweep_weight
-from coliags_plugin.reconstruction.depth.priors import DepthPrior
-from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
+from coliags_plugin.reconstruction.depth.settings import (
+    MAX_BASELINE,
+    MAX_TURN,
+    SWEEPS,
+    DepthEstimationSettings,
+    Sweep,
+)
 from coliags_plugin.reconstruction.depth.sweeping import Swept, ratios, sweep_frame
 from coliags_plugin.reconstruction.depth.views import Guide, Map, guide_of
 from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
@@ -48,7 +54,7 @@ class Estimation:
         self,
         frames: Sequence[Frame],
         sources: Sequence[int],
-        prior: DepthPrior,
+        prior: LightPrior | FilePrior,
         depth_range: DepthRange,
         settings: DepthEstimationSettings,
         work: WorkFolder,
@@ -66,7 +72,7 @@ class Estimation:
     def run(self) -> None:
         """Run all passes that are not done."""
         with _one_thread_of_opencv():
-            for number, sweep in enumerate(self.settings.sweeps):
+            for number, sweep in enumerate(SWEEPS):
                 self._pass(number, sweep)
 
     def result(self, index: int) -> tuple[Map, Map, str]:
@@ -77,18 +83,18 @@ class Estimation:
         arrays = self.work.load(self.last, index)
         return arrays["depth"], arrays["confidence"], str(arrays["distrust"])
 
-    def _pass(self, number: int, sweep: SweepSettings) -> None:
+    def _pass(self, number: int, sweep: Sweep) -> None:
         neighbours = self._neighbours(number, sweep)
         self._sweep(number, sweep, neighbours)
         self._fuse(number, sweep, neighbours)
         self.medians = self.work.value(f"medians-{number}", self._medians)
 
-    def _neighbours(self, number: int, sweep: SweepSettings) -> list[list[int]]:
+    def _neighbours(self, number: int, sweep: Sweep) -> list[list[int]]:
         centers = camera_centers(self.frames)
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
         neighbours: list[list[int]] = self.work.value(
             f"neighbours-{number}",
-            lambda: choose_neighbours(centers, axes, self.sources, self.medians, sweep.baselines, self.settings),
+            lambda: choose_neighbours(centers, axes, self.sources, self.medians, sweep.baselines),
         )
         lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in neighbours)
         if lonely == len(neighbours):
@@ -97,11 +103,11 @@ class Estimation:
                 f"no frame has {FEWEST_NEIGHBOURS} others at a distance of {100 * min(sweep.baselines):g} % "
                 f"of the depth or more: the path spans {span:.3g}, the median depth is {np.median(self.medians):.3g}",
                 "a camera that moves: rotation alone gives no depth",
-                "Use a longer stretch, check the poses, or lower the baselines of depth.sweeps",
+                "Use a longer stretch, or check the poses",
             )
         return neighbours
 
-    def _sweep(self, number: int, sweep: SweepSettings, neighbours: Sequence[Sequence[int]]) -> None:
+    def _sweep(self, number: int, sweep: Sweep, neighbours: Sequence[Sequence[int]]) -> None:
         base, guides = self.last, self._guides(sweep.reduction)
         factors = ratios(sweep, (self.range.near, self.range.far))
 
@@ -115,11 +121,11 @@ class Estimation:
             if len(others) < FEWEST_NEIGHBOURS:
                 nothing = np.zeros_like(surface)
                 return vars(Swept(surface, nothing, nothing))
-            return vars(sweep_frame(guide, others, surface, factors, sweep, self.settings))
+            return vars(sweep_frame(guide, others, surface, factors, sweep))
 
         self._stage(f"swept-{number}", swept, f"sweep {number + 1}")
 
-    def _fuse(self, number: int, sweep: SweepSettings, neighbours: Sequence[Sequence[int]]) -> None:
+    def _fuse(self, number: int, sweep: Sweep, neighbours: Sequence[Sequence[int]]) -> None:
         swept, guides = self.last, self._guides(sweep.reduction)
         low, high = np.log(self.range.near), np.log(self.range.far)
 
@@ -210,7 +216,6 @@ def choose_neighbours(
     sources: Sequence[int],
     depths: Sequence[float],
     baselines: Sequence[float],
-    settings: DepthEstimationSettings,
 ) -> list[list[int]]:
     """Neighbours of every frame of a video: for each baseline the first source so far away, before and after it.
 
@@ -219,12 +224,12 @@ def choose_neighbours(
     """
     baselines = sorted(baselines)
     farther = [baselines[-1] + (baselines[-1] / len(baselines)) * step for step in range(1, len(baselines) + 1)]
-    least_cosine = np.cos(np.radians(settings.max_turn))
+    least_cosine = np.cos(np.radians(MAX_TURN))
     candidates = np.asarray(sources)
     neighbours = []
     for index in range(len(centers)):
         distance = np.linalg.norm(centers - centers[index], axis=1) / depths[index]
-        is_candidate = (axes @ axes[index] >= least_cosine) & (distance <= settings.max_baseline)
+        is_candidate = (axes @ axes[index] >= least_cosine) & (distance <= MAX_BASELINE)
         before, after = candidates[candidates < index][::-1], candidates[candidates > index]
         sides = [_first_beyond(distance, side, is_candidate, baselines) for side in (before, after)]
         for own, other, side in ((0, 1, before), (1, 0, after)):

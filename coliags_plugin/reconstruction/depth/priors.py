@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,23 +16,6 @@ from coliags_plugin.datamanagers.reading.files import first_few
 from coliags_plugin.datamanagers.rotatecolon.reader import read_exr_channel
 from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 
-
-class DepthPrior(ABC):
-    """Gives every pixel of a frame a depth, fitted to where depth is known."""
-
-    @abstractmethod
-    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
-        """Log of z-depth at every pixel of a frame, of the size of the maps or larger, fitted to its known depth.
-
-        ``usable``: neither masked nor near a highlight; ``known``: log of z-depth, anything where its ``weight``, 0 to
-        1, is 0; ``typical``: z-depth of a typical pixel, for a frame without known depth.
-        """
-
-    @abstractmethod
-    def described(self) -> str:
-        """What determines the prior, to tell whether work files are of the same one."""
-
-
 #: Exponent from stored to linear intensity, and the least linear intensity.
 _GAMMA, _DARKEST = 2.2, 2e-4
 #: Standard deviations of smoothing, pixels; the last that reaches usable pixels counts.
@@ -42,7 +24,7 @@ _SIGMAS = (24.0, 6.0, 1.5)
 _LAW_WEIGHT = 20.0
 
 
-class LightPrior(DepthPrior):
+class LightPrior:
     """Log depth as a polynomial of log red, log green and the cosine to the optical axis, fitted to each frame.
 
     Seven numbers: constant, both logarithms, their squares and product, and the cosine. Where depth is hardly known
@@ -50,7 +32,11 @@ class LightPrior(DepthPrior):
     """
 
     def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
-        """See :class:`DepthPrior`."""
+        """Log of z-depth at every pixel of a frame, of the size of the maps or larger, fitted to its known depth.
+
+        ``usable``: neither masked nor near a highlight; ``known``: log of z-depth, anything where its ``weight``, 0 to
+        1, is 0; ``typical``: z-depth of a typical pixel, for a frame without known depth.
+        """
         import cv2
 
         size = (known.shape[1], known.shape[0])
@@ -71,7 +57,7 @@ class LightPrior(DepthPrior):
         return np.asarray((columns @ fitted).reshape(known.shape), np.float32)
 
     def described(self) -> str:
-        """See :class:`DepthPrior`."""
+        """What determines the prior, to tell whether work files are of the same one."""
         return "light"
 
 
@@ -101,7 +87,7 @@ _ASPECT = 0.02
 _FEWEST = 50
 
 
-class FilePrior(DepthPrior):
+class FilePrior:
     """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth."""
 
     def __init__(self, files: Mapping[str, Path]) -> None:
@@ -126,14 +112,14 @@ class FilePrior(DepthPrior):
         return prior
 
     def described(self) -> str:
-        """See :class:`DepthPrior`: names and a hash of the contents."""
+        """What determines the prior: names and a hash of the contents."""
         digest = hashlib.sha256()
         for name, path in self.files.items():
             digest.update(name.encode() + path.read_bytes())
         return digest.hexdigest()
 
     def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
-        """See :class:`DepthPrior`; unknown pixels of a map take the typical depth."""
+        """See :meth:`LightPrior.log_depth`; unknown pixels of a map take the typical depth."""
         import cv2
 
         size = (known.shape[1], known.shape[0])

@@ -22,7 +22,7 @@ from coliags_plugin.datamanagers.splits import split_options
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
-from coliags_plugin.reconstruction.depth.priors import DepthPrior, FilePrior, LightPrior
+from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
@@ -72,7 +72,7 @@ def estimate_scene(
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
     check_video(frames, sources)
-    prior: DepthPrior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
+    prior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
     described = {
         "version": _VERSION,
         "data": scene.provenance["fingerprint"],
@@ -113,8 +113,8 @@ def _range(
     """The range stated, or that of the sources; other frames' medians are interpolated between theirs."""
     if request.near_far is not None:
         return given_range(*request.near_far, len(frames))
-    settings, used = request.settings, [frames[index] for index in sources]
-    kept = work.value("range", lambda: vars(find_range(used, settings.features, settings.max_turn, progress)))
+    used = [frames[index] for index in sources]
+    kept = work.value("range", lambda: vars(find_range(used, request.settings.features, progress)))
     medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(kept["medians"])))
     return DepthRange(kept["near"], kept["far"], tuple(medians.tolist()))
 

@@ -9,11 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.settings import Sweep
 from coliags_plugin.reconstruction.depth.views import Guide, Map
 
 #: Log of the factor on depth over which a hypothesis must have had rivals.
 _RIVALS = math.log(2.0)
+#: Standard deviation of the noise of log intensity, below which nothing matches.
+_NOISE = 0.01
+#: Part of the neighbours that counts at a pixel: the best-matching.
+_BEST_SHARE = 0.75
+#: Semi-global penalty P2 of a change by more than one hypothesis, and how much edges of the log image lower it.
+_LARGE_PENALTY, _EDGE_CONTRAST = 1.0, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +31,7 @@ class Swept:
     margin: Map  # by how much other depths match worse, after aggregation
 
 
-def ratios(sweep: SweepSettings, depth_range: tuple[float, float]) -> Float32[np.ndarray, "D"]:
+def ratios(sweep: Sweep, depth_range: tuple[float, float]) -> Float32[np.ndarray, "D"]:
     """Hypotheses as factors on the swept surface, equally spaced in their logarithm.
 
     The surface of a sweep of the whole range (``reach`` None) is at the nearest depth.
@@ -43,8 +49,7 @@ def sweep_frame(
     neighbours: Sequence[Guide],
     base: Map,
     factors: Float32[np.ndarray, "D"],
-    sweep: SweepSettings,
-    settings: DepthEstimationSettings,
+    sweep: Sweep,
 ) -> Swept:
     """Match a frame with its neighbours at multiples (ascending) of a surface of z-depth, and take the best.
 
@@ -67,8 +72,8 @@ def sweep_frame(
         np.stack([turn for turn, _ in pairs]),
         np.stack([shift for _, shift in pairs]),
         sweep.radius,
-        settings.noise**2,
-        settings.best_share,
+        _NOISE**2,
+        _BEST_SHARE,
         cost,
     )
     total = np.empty_like(cost)
@@ -76,8 +81,8 @@ def sweep_frame(
         cost,
         guide.intensity,
         np.float32(sweep.small_penalty),
-        np.float32(sweep.large_penalty),
-        np.float32(settings.edge_contrast),
+        np.float32(_LARGE_PENALTY),
+        np.float32(_EDGE_CONTRAST),
         total,
     )
     index, fit, margin = (np.empty(shape, np.float32) for _ in range(3))

@@ -263,8 +263,6 @@ def test_bad_options_are_refused(wall, tmp_path, capsys):
     assert "--jobs 0" in refused(capsys, wall, *out, "--jobs", 0)
     assert "Did you mean 'agreement'" in refused(capsys, wall, *out, "--set", "depth.agrement=0.1")
     assert "no such folder" in refused(capsys, wall, *out, "--prior", tmp_path / "none")
-    reach = "depth.sweeps=[{reduction: 2, reach: 0.1}]"
-    assert "the first has reach 0.1" in refused(capsys, wall, *out, "--set", reach)
     assert "a folder apart from the input" in refused(capsys, wall, "--output", wall / "inside")
     assert not (tmp_path / "out").exists()
 

@@ -8,7 +8,7 @@ import pytest
 from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, fuse_frame
 from coliags_plugin.reconstruction.depth.numba_kernels.fusion import vote
 from coliags_plugin.reconstruction.depth.numba_kernels.sweep import aggregate, pick, sweep
-from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.settings import SWEEPS, Sweep
 from coliags_plugin.reconstruction.depth.sweeping import ratios, sweep_frame
 from coliags_plugin.reconstruction.depth.views import Pose, guide_of
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
@@ -114,22 +114,22 @@ def test_the_parabola_finds_the_minimum_between_steps():
 INNER = (slice(12, -12), slice(16, -16))
 
 
-def swept(sweep_settings, base_of):
+def swept(sweep, base_of):
     """The middle one of five frames swept from a surface that is made of its true depth, and that depth."""
     frames = wall_frames(sideways(5))
     guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
     truth = wall_depth(frames[2].camera)
-    factors, base = ratios(sweep_settings, (20.0, 80.0)), base_of(truth).astype(np.float32)
+    factors, base = ratios(sweep, (20.0, 80.0)), base_of(truth).astype(np.float32)
     others = [guides[k] for k in (0, 1, 3, 4)]
-    return sweep_frame(guides[2], others, base, factors, sweep_settings, DepthEstimationSettings()), truth
+    return sweep_frame(guides[2], others, base, factors, sweep), truth
 
 
 def test_a_plane_seen_by_cameras_at_known_places():
-    sweep_settings = SweepSettings(step=0.02)
-    factors = ratios(sweep_settings, (20.0, 80.0))
+    sweep = Sweep(step=0.02)
+    factors = ratios(sweep, (20.0, 80.0))
     assert factors[0] == 1.0
     assert factors[-1] == pytest.approx(4.0)
-    found, truth = swept(sweep_settings, lambda truth: np.full(truth.shape, 20.0))
+    found, truth = swept(sweep, lambda truth: np.full(truth.shape, 20.0))
     error = np.abs(found.depth / truth - 1.0)[INNER]
     assert np.median(error) < 0.01
     assert np.percentile(error, 90) < 0.03
@@ -139,7 +139,7 @@ def test_a_plane_seen_by_cameras_at_known_places():
 def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
     """A smoothness that holds to the shape of the swept surface would keep part of its error: far lumens too near."""
     across = np.linspace(-0.06, 0.06, 96)
-    found, truth = swept(DepthEstimationSettings().sweeps[-1], lambda truth: truth * np.exp(across)[None])
+    found, truth = swept(SWEEPS[-1], lambda truth: truth * np.exp(across)[None])
     error = np.log(found.depth / truth)[INNER]
     assert np.median(np.abs(error)) < 0.004
     trend = np.polyfit(np.broadcast_to(across, truth.shape)[INNER].ravel(), error.ravel(), 1)[0]

@@ -18,7 +18,6 @@ from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
 from coliags_plugin.reconstruction.depth.fusion import depth_confidence
 from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
-from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Pose
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
@@ -28,7 +27,7 @@ FEATURES = FeatureSettings(highlight_level=256)
 
 def test_features_give_the_range_in_any_unit():
     frames = wall_frames(sideways(8))
-    found = find_range(frames, FEATURES, 40.0)
+    found = find_range(frames, FEATURES)
     depths = [wall_depth(frame.camera) for frame in frames]
     assert 0.4 * min(map(np.min, depths)) < found.near < min(map(np.min, depths))
     assert max(map(np.max, depths)) < found.far < 3.0 * max(map(np.max, depths))
@@ -38,7 +37,7 @@ def test_features_give_the_range_in_any_unit():
         pose = frame.camera.camera_to_world.clone()
         pose[:3, 3] *= 1e-3
         scaled.append(dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, camera_to_world=pose)))
-    smaller = find_range(scaled, FEATURES, 40.0)
+    smaller = find_range(scaled, FEATURES)
     assert smaller.near == pytest.approx(1e-3 * found.near, rel=1e-6)
     assert smaller.far == pytest.approx(1e-3 * found.far, rel=1e-6)
 
@@ -49,7 +48,7 @@ def test_sparse_depth_of_the_scene_counts():
     frames = [
         dataclasses.replace(frame, sparse_depth=SparseDepth(pixels, depths)) for frame in wall_frames(sideways(4, 0.0))
     ]
-    found = find_range(frames, FEATURES, 40.0)
+    found = find_range(frames, FEATURES)
     assert found.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
     assert found.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
     np.testing.assert_allclose(found.medians, 40.0, rtol=1e-5)
@@ -62,10 +61,7 @@ def test_given_ranges_and_frames_without_features():
     flat = torch.full((80, 96, 3), 90, dtype=torch.uint8)
     frames = [dataclasses.replace(frame, image=flat) for frame in wall_frames(sideways(4))]
     with pytest.raises(InputError, match="the depth range is unknown: 0 points"):
-        find_range(frames, FEATURES, 40.0)
-
-
-SETTINGS = DepthEstimationSettings(max_baseline=0.5)
+        find_range(frames, FEATURES)
 
 
 def along(distances):
@@ -78,7 +74,7 @@ def chosen(distances, axes=None, sources=None):
     ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
     directions, depths = ahead if axes is None else axes, [10.0] * len(distances)
     sources = sources or range(len(distances))
-    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2), SETTINGS)
+    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2))
 
 
 HALVES = [0.5 * k for k in range(12)]
