@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+#: RANSAC inlier threshold of the two-view geometry of any two frames that tracks link, pixels.
+_MAX_PAIR_ERROR = 2.0
+
+
 def _verify_pairs(database: Path, max_error: float, seed: int) -> None:
     """Verify the matches of all pairs by their two-view geometry."""
     import pycolmap
@@ -37,7 +41,7 @@ def map_tracks(database: Path, scratch: Path, settings: SfmSettings) -> list[pyc
     """
     import pycolmap
 
-    _verify_pairs(database, settings.tracks.max_pair_error, settings.seed)
+    _verify_pairs(database, _MAX_PAIR_ERROR, settings.seed)
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = settings.min_model_size
     mapper = options.mapper

@@ -91,7 +91,7 @@ def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
     near = np.zeros(len(followed), bool)
     for index, count in enumerate(followed):
         if index and count < settings.bridge_below:
-            near[max(0, index - 2 * settings.longest_bridge) : index + 2 * settings.longest_bridge] = True
+            near[max(0, index - 2 * _LONGEST_BRIDGE) : index + 2 * _LONGEST_BRIDGE] = True
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near, [0]])))
     return [range(first, end) for first, end in edges.reshape(-1, 2).tolist()]
 
@@ -165,12 +165,12 @@ class PointFinder:
                 break
             candidate, returned = _there_and_back(before.detail, after.detail, start, guess)
             column, row = np.clip(np.rint(candidate), 0, np.array(after.detail.shape[::-1]) - 1).astype(np.int64).T
-            found = np.linalg.norm(returned - start, axis=1) < self.settings.max_return
+            found = np.linalg.norm(returned - start, axis=1) < _MAX_RETURN
             correlation = correlation_at(before.detail, after.detail, start, candidate)
             score = np.where(found & after.usable[row, column], correlation, -1.0)
             better = score > scores[rows]
             moved[rows[better]], scores[rows[better]] = candidate[better], score[better]
-        alike = np.flatnonzero(scores > self.settings.min_correlation)
+        alike = np.flatnonzero(scores > _MIN_CORRELATION)
         return alike, moved[alike].astype(np.float32)
 
 
@@ -210,7 +210,7 @@ class _PointTracker:
         views of a patient showed the same wall, 23 or more did; between unrelated views at most 17, by chance.
         """
         alike, moved = self.finder.found(before, after)
-        consistent = epipolar_inliers(before.pixels[alike], moved, after.detail.shape, self.settings.max_error)
+        consistent = epipolar_inliers(before.pixels[alike], moved, after.detail.shape, _MAX_ERROR)
         if consistent.sum() < max(_FEWEST, _LEAST_SHARE * len(alike)):
             return alike[:0], moved[:0]
         return alike[consistent], moved[consistent]
@@ -218,7 +218,7 @@ class _PointTracker:
     def _bridge_later(self, before: View, followed: int) -> None:
         """Keep the view before a frame in which most points were lost, for the frames after it."""
         aged = [replace(bridge, age=bridge.age + 1) for bridge in self.bridges]
-        self.bridges = [bridge for bridge in aged if bridge.age <= self.settings.longest_bridge]
+        self.bridges = [bridge for bridge in aged if bridge.age <= _LONGEST_BRIDGE]
         if followed < self.settings.bridge_below:
             self.bridges.append(before)
 
@@ -243,9 +243,7 @@ class _PointTracker:
         free = view.usable.astype(np.uint8)
         for column, row in np.rint(view.pixels).astype(int).tolist():
             cv2.circle(free, (column, row), self.settings.spacing, 0, -1)
-        corners = cv2.goodFeaturesToTrack(
-            view.detail, missing, self.settings.quality, self.settings.spacing, mask=free, blockSize=7
-        )
+        corners = cv2.goodFeaturesToTrack(view.detail, missing, _QUALITY, self.settings.spacing, mask=free, blockSize=7)
         if corners is None:
             return view
         ids = np.arange(self.next_id, self.next_id + len(corners))
@@ -299,8 +297,15 @@ def _sampled(flow: Float32[np.ndarray, "h w 2"], pixels: Float32[np.ndarray, "K 
     return np.stack(channels, axis=1)
 
 
-#: Correlation from which a point is clearly found.
-_CLEAR = 0.8
+#: Least strength of a new corner, relative to the strongest.
+_QUALITY = 0.004
+#: Largest distance between a point and where following it back ends, pixels; least normalised cross-correlation of 11 x
+#: 11 pixels around a point, and that from which it is clearly found.
+_MAX_RETURN, _MIN_CORRELATION, _CLEAR = 0.7, 0.6, 0.8
+#: RANSAC inlier threshold of the epipolar geometry of neighbours, pixels.
+_MAX_ERROR = 2.5
+#: Number of frames in which lost points are searched for.
+_LONGEST_BRIDGE = 4
 #: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring
 #: frames its error hardly matters.
 _TYPICAL_FOCAL_FACTOR = 0.6

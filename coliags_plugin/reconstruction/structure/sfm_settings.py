@@ -59,27 +59,11 @@ class TrackSettings(Settings):
     )
     corners: int = Field(default=1400, ge=100, description="Number of points followed, topped up in every frame.")
     spacing: int = Field(default=6, ge=2, description="Least distance of a new corner from other points, pixels.")
-    quality: float = Field(
-        default=0.004, gt=0.0, lt=1.0, description="Least strength of a corner, relative to the strongest."
-    )
-    max_return: float = Field(
-        default=0.7, gt=0.0, description="Largest distance between a point and where following it back ends, pixels."
-    )
-    min_correlation: float = Field(
-        default=0.6, gt=-1.0, lt=1.0, description="Least normalised cross-correlation of 11 x 11 pixels around a point."
-    )
-    max_error: float = Field(
-        default=2.5, gt=0.0, description="RANSAC inlier threshold of the epipolar geometry of neighbours, pixels."
-    )
-    max_pair_error: float = Field(
-        default=2.0, gt=0.0, description="RANSAC inlier threshold of the two-view geometry of any two frames, pixels."
-    )
     bridge_below: int = Field(
         default=150,
         ge=0,
         description="Where fewer points survive, those lost are searched for again in the next frames; 0: never.",
     )
-    longest_bridge: int = Field(default=4, ge=0, description="Number of frames in which lost points are searched for.")
     longest_window: int = Field(
         default=400,
         ge=8,
