@@ -1,4 +1,4 @@
-"""Reads and writes EndoGSLAM's ``params.npz``: estimated poses, true poses and isotropic Gaussians.
+"""Reads and writes EndoGSLAM's ``params.npz``: estimated poses, true poses and Gaussians.
 
 Its world is the first camera of the sequence, its lengths are mm, its poses world-to-camera.
 """
@@ -30,13 +30,9 @@ SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
     "org_height": ((), (1,)),
     "means3D": (("N", 3),),
     "rgb_colors": (("N", 3),),
-    "log_scales": (("N", 1), ("N", 3)),
-    "keyframe_time_indices": (("K",),),
 }
 _POSES = ("cam_unnorm_rots", "cam_trans")
 _PINHOLE = ("intrinsics", "org_width", "org_height")
-#: Unused keys, which may be missing because tools that rewrite the file drop them.
-_SPARE = ("log_scales", "keyframe_time_indices")
 #: EndoGSLAM holds out frames 7, 15, 23, ... by default.
 _HELD_OUT_EVERY = 8
 
@@ -50,23 +46,17 @@ class EndoGslamParams:
     intrinsics: Intrinsics  # of all images
     means: Float[np.ndarray, "N 3"]  # centres of the Gaussians; N may be 0. float64
     rgb_colors: Float[np.ndarray, "N 3"]  # colours, nominally in [0, 1]; may lie a little outside. float64
-    # Logarithms of the standard deviations, one column if Gaussians are isotropic; None if missing.
-    log_scales: Float[np.ndarray, "N C"] | None
-    keyframes: Int[np.ndarray, "K"] | None  # indices of keyframes; None if missing
 
 
 def read_params(path: Path) -> EndoGslamParams:
-    """Read all contents of a ``params.npz``; ``log_scales`` and ``keyframe_time_indices`` may be missing."""
-    arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
-    keyframes = arrays.get("keyframe_time_indices")
+    """Read what is used of a ``params.npz``."""
+    arrays = _arrays(path, tuple(SHAPES))
     return EndoGslamParams(
         camera_to_world=_estimate(path, arrays),
         true_camera_to_world=_truth(path, arrays),
         intrinsics=_intrinsics(path, arrays),
         means=arrays["means3D"],
         rgb_colors=arrays["rgb_colors"],
-        log_scales=arrays.get("log_scales"),
-        keyframes=None if keyframes is None else keyframes.astype(np.int64),
     )
 
 

@@ -64,8 +64,6 @@ def test_all_of_it_is_read(tmp_path):
     read = endogslam.read_params(saved(tmp_path / "params.npz"))
     np.testing.assert_array_equal(read.means, arrays["means3D"])
     np.testing.assert_array_equal(read.rgb_colors, arrays["rgb_colors"])
-    np.testing.assert_array_equal(read.log_scales, arrays["log_scales"])
-    assert read.keyframes.tolist() == [0, 3]
     # Pixel centres at integers become integers + 0.5.
     assert read.intrinsics == Intrinsics(400.0, 401.0, 334.1 + 0.5, 273.9 + 0.5, 675, 540)
     np.testing.assert_allclose(read.intrinsics.opencv_matrix(), arrays["intrinsics"], atol=1e-12)
@@ -73,18 +71,6 @@ def test_all_of_it_is_read(tmp_path):
     np.testing.assert_array_equal(estimate.camera_to_world, read.camera_to_world)
     np.testing.assert_array_equal(truth.camera_to_world, read.true_camera_to_world)
     assert estimate.intrinsics == read.intrinsics
-
-
-@pytest.mark.parametrize(
-    "missing", [("log_scales",), ("keyframe_time_indices",), ("log_scales", "keyframe_time_indices")]
-)
-def test_what_nothing_is_made_from_may_be_missing(tmp_path, missing):
-    arrays = params()
-    read = endogslam.read_params(saved(tmp_path / "params.npz", **dict.fromkeys(missing)))
-    assert (read.log_scales is None) == ("log_scales" in missing)
-    assert (read.keyframes is None) == ("keyframe_time_indices" in missing)
-    np.testing.assert_array_equal(read.means, arrays["means3D"])
-    assert len(read.camera_to_world) == FRAMES
 
 
 def test_poses_alone_can_be_read(tmp_path):
@@ -101,7 +87,7 @@ def test_one_message_names_every_fault(tmp_path):
         cam_trans=np.zeros((1, 3, 4)),
         means3D=None,
         rgb_colors=np.zeros((GAUSSIANS, 4)),
-        log_scales=np.full((GAUSSIANS, 1), np.nan),
+        intrinsics=np.full((3, 3), np.nan),
         org_width=np.array("wide"),
     )
     with pytest.raises(InputError) as caught:
@@ -111,7 +97,7 @@ def test_one_message_names_every_fault(tmp_path):
         "cam_trans has the shape [1, 3, 4], not [1, 3, 5]",
         "no means3D",
         "rgb_colors has the shape [7, 4], not [N, 3]",
-        "log_scales holds numbers that are not finite",
+        "intrinsics holds numbers that are not finite",
         "org_width holds <U4, not numbers",
     ):
         assert fault in str(caught.value)
