@@ -55,23 +55,27 @@ def scene(folder):
     return C3VDDataManager(C3VDSettings()).load(folder)
 
 
+def each(scene: Scene, change) -> Scene:
+    """The scene with every frame changed."""
+    sets = {name: [change(frame.to("cpu")) for frame in frames] for name, frames in scene.test_sets.items()}
+    return replace(scene, train=[change(frame.to("cpu")) for frame in scene.train], test_sets=sets)
+
+
 def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Scene:
     """The scene with every frame's pose, depth, camera or image put through a function of it and its place."""
 
     def of(frame: Frame) -> Frame:
-        whole = frame.to("cpu")
-        if pose is not None:
-            whole = replace(whole, camera=replace(whole.camera, camera_to_world=pose(whole.camera.camera_to_world)))
-        if camera is not None:
-            whole = replace(whole, camera=camera(whole.camera))
-        if depth is not None:
-            whole = replace(whole, depth=depth(whole.depth))
-        if image is not None:
-            whole = replace(whole, image=image(whole.image, whole.index))
-        return whole
+        own = (
+            frame.camera if pose is None else replace(frame.camera, camera_to_world=pose(frame.camera.camera_to_world))
+        )
+        return replace(
+            frame,
+            camera=own if camera is None else camera(own),
+            depth=frame.depth if depth is None else depth(frame.depth),
+            image=frame.image if image is None else image(frame.image, frame.index),
+        )
 
-    sets = {name: [of(frame) for frame in frames] for name, frames in scene.test_sets.items()}
-    return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
+    return each(scene, of)
 
 
 def whats(scene: Scene) -> str:
@@ -123,14 +127,12 @@ def estimate(scene):
     generator = torch.Generator().manual_seed(0)
 
     def of(frame: Frame) -> Frame:
-        whole = frame.to("cpu")
-        depth = whole.depth * (1.0 + 0.03 * torch.randn(whole.depth.shape, generator=generator))
+        depth = frame.depth * (1.0 + 0.03 * torch.randn(frame.depth.shape, generator=generator))
         confidence = torch.full_like(depth, 0.9)
         depth[:80, :100], confidence[:80, :100] = 7.0, 0.3
-        return replace(whole, depth=depth, depth_confidence=confidence)
+        return replace(frame, depth=depth, depth_confidence=confidence)
 
-    sets = {name: [of(frame) for frame in frames] for name, frames in scene.test_sets.items()}
-    return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
+    return each(scene, of)
 
 
 @pytest.mark.thorough
@@ -139,12 +141,8 @@ def test_estimated_depth_is_judged_where_it_is_confident(estimate):
     assert check.findings == []
     assert 0.02 < check.agreement["given"].depth_error < 0.04
     assert "confidence of 0.8 or more" in page_text(check_page(check))
-    true = {
-        name: [replace(frame, depth_confidence=None) for frame in frames]
-        for name, frames in {"train": estimate.train, **estimate.test_sets}.items()
-    }
-    test = {"test": true["test"]}
-    assert "frames do not agree on the surface" in whats(replace(estimate, train=true["train"], test_sets=test))
+    true = each(estimate, lambda frame: replace(frame, depth_confidence=None))
+    assert "frames do not agree on the surface" in whats(true)
 
 
 @pytest.mark.parametrize(
@@ -160,23 +158,15 @@ def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
     }[wrong]
     of = {frame.name: pose for frame, pose in zip(estimate.video, given, strict=True)}
 
-    def posed(frames: list[Frame]) -> list[Frame]:
-        return [
-            replace(frame, camera=replace(frame.camera, camera_to_world=of[frame.name].clone())) for frame in frames
-        ]
+    def posed(frame: Frame) -> Frame:
+        return replace(frame, camera=replace(frame.camera, camera_to_world=of[frame.name].clone()))
 
-    sets = {name: posed(frames) for name, frames in estimate.test_sets.items()}
     what = "read as: world-to-camera" if wrong == "inverted" else "frames do not agree on the surface"
-    assert what in whats(replace(estimate, train=posed(estimate.train), test_sets=sets))
+    assert what in whats(each(estimate, posed))
 
 
 def test_depth_that_is_not_confident_anywhere_leaves_poses_to_the_images(estimate):
-    sets = {"train": estimate.train, **estimate.test_sets}
-    doubted = {
-        name: [replace(frame, depth_confidence=torch.zeros_like(frame.depth)) for frame in frames]
-        for name, frames in sets.items()
-    }
-    check = check_scene(replace(estimate, train=doubted["train"], test_sets={"test": doubted["test"]}))
+    check = check_scene(each(estimate, lambda frame: replace(frame, depth_confidence=0.0 * frame.depth_confidence)))
     assert (check.findings, check.agreement, check.matched_by) == ([], {}, "features")
 
 
