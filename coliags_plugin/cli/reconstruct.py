@@ -14,6 +14,7 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.pipeline.procedure.run import FinishedProcedure
+    from coliags_plugin.pipeline.stages import Record
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,8 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
         from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE
-        from coliags_plugin.reporting.text_formats import terminal_text
 
         given: dict[str, Any] = {
             "sfm.camera.model": self.camera,
@@ -101,27 +100,10 @@ class ReconstructCommand:
             threads=self.threads,
             ray_address=self.ray_address,
         )
-        if isinstance(made, FinishedProcedure):
-            self._tell(made)
-            return
-        record = made
-        stages, results = record.stages, results_of(record)
-        told = {name: stage for name, stage in stages.items() if "/" not in name}
-        lines = [f"{name}: {stage.summary}" for name, stage in told.items()]
-        lines += [
-            f"{self.output / path}: {content}" for stage in told.values() for path, content in stage.files.items()
-        ]
-        if len(results) > 1:
-            lines += [f"{self.output / one.submap.folder}: {one.submap.title}, likewise" for one in results[1:]]
-            lines += ["", terminal_text([submap_table(results)]), "", f"held-out PSNR: {held_out_text(results)}"]
-        lines += remarks(record)
-        print_summary(
-            "\n".join(lines),
-            {"stages": {name: asdict(stage) for name, stage in stages.items()}},
-            written=[self.output / PAGE_FILE],
-            then=[view_command(self.output / "run")],
-            as_json=self.json,
-        )
+        told = _procedure(made) if isinstance(made, FinishedProcedure) else _reconstruction(made)
+        export = coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")
+        then = [export if isinstance(made, FinishedProcedure) else view_command(self.output / "run")]
+        print_summary(*told, written=[self.output / PAGE_FILE], then=then, as_json=self.json)
 
     def _frames(self) -> dict[str, Any]:
         """Settings of which frames are used, None where nothing is given; times by the video's rate."""
@@ -136,29 +118,37 @@ class ReconstructCommand:
         every = self.every if self.frames_per_second is None else every_of(source, self.frames_per_second)
         return {"frames.first": first, "frames.last": last, "frames.every": every}
 
-    def _tell(self, made: FinishedProcedure) -> None:
-        """Print a line for each segment of a long video and for each join."""
-        from coliags_plugin.pipeline.page import held_out_text, results_of
-        from coliags_plugin.pipeline.stages import PAGE_FILE
 
-        lines = []
-        for (name, record), segment in zip(made.segments.items(), made.procedure.segments, strict=True):
-            told = [record.stages["poses"].summary.partition("\n")[0]] if "poses" in record.stages else ["not begun"]
-            told += [f"held-out PSNR: {held_out_text(results_of(record))}"] if "evaluate" in record.stages else []
-            lines.append(f"{name}, frames {segment.first} to {segment.last}: {'; '.join(told)}")
-        lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
-        for each in made.procedure.joins:
-            what = "joined" if each.joined else f"not joined: {each.reason}"
-            pairs = zip(each.segments, each.models, strict=True)
-            named = [f"{name}/{Path(model).name}" if model else name for name, model in pairs]
-            lines.append(f"{' and '.join(named)}: {what}")
-        stages = {
-            name: {stage: asdict(one) for stage, one in record.stages.items()} for name, record in made.segments.items()
-        }
-        print_summary(
-            "\n".join(lines),
-            {"segments": stages, "joins": [each.model_dump(mode="json") for each in made.procedure.joins]},
-            written=[self.output / PAGE_FILE],
-            then=[coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")],
-            as_json=self.json,
-        )
+def _reconstruction(record: Record) -> tuple[str, dict[str, Any]]:
+    """What a reconstruction came to, in lines and in JSON values."""
+    from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
+    from coliags_plugin.reporting.text_formats import terminal_text
+
+    stages, results = record.stages, results_of(record)
+    told = {name: stage for name, stage in stages.items() if "/" not in name}
+    lines = [f"{name}: {stage.summary}" for name, stage in told.items()]
+    lines += [f"{record.folder / path}: {content}" for stage in told.values() for path, content in stage.files.items()]
+    if len(results) > 1:
+        lines += [f"{record.folder / one.submap.folder}: {one.submap.title}, likewise" for one in results[1:]]
+        lines += ["", terminal_text([submap_table(results)]), "", f"held-out PSNR: {held_out_text(results)}"]
+    return "\n".join([*lines, *remarks(record)]), {"stages": {name: asdict(stage) for name, stage in stages.items()}}
+
+
+def _procedure(made: FinishedProcedure) -> tuple[str, dict[str, Any]]:
+    """A line for each segment of a long video and for each join, and the same in JSON values."""
+    from coliags_plugin.pipeline.page import held_out_text, results_of
+
+    lines = []
+    for (name, record), segment in zip(made.segments.items(), made.procedure.segments, strict=True):
+        told = [record.stages["poses"].summary.partition("\n")[0]] if "poses" in record.stages else ["not begun"]
+        told += [f"held-out PSNR: {held_out_text(results_of(record))}"] if "evaluate" in record.stages else []
+        lines.append(f"{name}, frames {segment.first} to {segment.last}: {'; '.join(told)}")
+    lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
+    for each in made.procedure.joins:
+        named = [f"{name}/{Path(model).name}" if model else name for name, model in each.keys]
+        lines.append(f"{' and '.join(named)}: {'joined' if each.joined else f'not joined: {each.reason}'}")
+    segments = {
+        name: {key: asdict(one) for key, one in record.stages.items()} for name, record in made.segments.items()
+    }
+    joins = [each.model_dump(mode="json") for each in made.procedure.joins]
+    return "\n".join(lines), {"segments": segments, "joins": joins}

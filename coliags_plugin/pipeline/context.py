@@ -72,15 +72,11 @@ class StageContext:
         """Files and folders that are given."""
         return tuple(path for path in (self.out, self.source, self.mask) if path is not None)
 
-    def of(self, submap: Submap) -> StageContext:
-        """The same for another model of the posed scene."""
-        return replace(self, submap=submap)
-
     def submaps(self) -> list[StageContext]:
         """One for every model that is reconstructed, the largest first, as far as poses are there."""
         if self.data_format not in (None, "colmap") or not self.posed.is_dir():
             return [self]
-        return [self.of(submap) for submap in find_submaps(self.posed, self.settings.least_submap)]
+        return [replace(self, submap=submap) for submap in find_submaps(self.posed, self.settings.least_submap)]
 
     @property
     def folder(self) -> Path:

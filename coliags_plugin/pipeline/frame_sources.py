@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
@@ -56,44 +56,24 @@ class Span:
         return one_field(image) if self.deinterlace else image
 
 
-class FrameSource(Protocol):
-    """Frames in order, read anew by every iteration."""
-
-    @property
-    def path(self) -> Path:
-        """The file or folder."""
-
-    @property
-    def span(self) -> Span:
-        """Which of its frames."""
-
-    @property
-    def expected(self) -> int:
-        """Number of frames by what the file says, at least 1; for progress alone."""
-
-    def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names, which sort in frame order, and RGB images, all of one size."""
-
-    @property
-    def rate(self) -> float | None:
-        """Frames a second; None where it is not known."""
-
-
 @dataclass(frozen=True)
 class ImageFolder:
-    """Images of a folder, in the natural order of their names."""
+    """Images of a folder, in the natural order of their names.
+
+    As of the others: iterations read names, which sort in frame order, and RGB images, all of one size, anew.
+    """
 
     path: Path
-    span: Span = Span()
-    rate: float | None = None
+    span: Span = Span()  # which of them
+    rate: float | None = None  # frames a second: unknown
 
     @property
     def expected(self) -> int:
-        """Number of images."""
+        """Number of frames by what files say, at least 1; for progress alone."""
         return self.span.count(len(list_images(self.path)))
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Stems of the file names, and images; see :class:`FrameSource`."""
+        """Stems of the file names, and images."""
         images = list_images(self.path)
         shape: tuple[int, ...] | None = None
         named = list(zip(file_names([path.stem for path in images], ""), images, strict=True))
@@ -143,7 +123,7 @@ class VideoFile:
             video.release()
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names ``frame_000000``, ... by their number in the video, and images; see :class:`FrameSource`.
+        """Names ``frame_000000``, ... by their number in the video, and images.
 
         Where the file is damaged and goes on behind that, the frames between are black.
         """
@@ -203,7 +183,7 @@ class VideoFiles:
         return VideoFile(self.files[0]).rate
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names ``frame_000000``, ... and images; see :class:`FrameSource`. Where a file ends too early, black ones."""
+        """Names ``frame_000000``, ... and images. Where a file ends too early, black ones."""
         start, image = 0, None
         for file in self.files:
             count, first = VideoFile(file).expected, max(0, self.span.first - start)
@@ -219,6 +199,10 @@ class VideoFiles:
                 for missing in range(number, last + 1 if image is not None else 0):
                     yield f"frame_{start + missing:06d}", np.zeros_like(image)
             start += count
+
+
+#: Frames in order, read anew by every iteration.
+FrameSource = ImageFolder | VideoFile | VideoFiles
 
 
 def _go_to(video: cv2.VideoCapture, span: Span) -> int:
@@ -312,6 +296,17 @@ def _opened(path: Path) -> cv2.VideoCapture:
     return video
 
 
+def watched(
+    source: FrameSource, what: str, progress: Progress | None
+) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
+    """Names and images of a source; each is reported when the next one is asked for."""
+    expected = source.expected
+    for done, frame in enumerate(source, start=1):
+        yield frame
+        if progress is not None:
+            progress(what, done, max(done, expected))
+
+
 def every_of(source: FrameSource, rate: float) -> int:
     """Of how many frames one is used for about so many a second.
 
@@ -328,13 +323,8 @@ def every_of(source: FrameSource, rate: float) -> int:
             "Use one of every n frames: --every N",
         )
     every = max(1, round(own / rate))
-    log.info(
-        "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second",
-        source.path,
-        own,
-        every,
-        own / every,
-    )
+    what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
+    log.info(what, source.path, own, every, own / every)
     return every
 
 
@@ -382,14 +372,11 @@ def image_files(
     frames = chosen_frames(source, FrameSettings())
     with tempfile.TemporaryDirectory(prefix="coliags-frames-") as scratch:
         files = []
-        expected = frames.expected
-        for done, (name, image) in enumerate(frames, start=1):
+        for name, image in watched(frames, "read frames", progress):
             files.append(Path(scratch) / f"{name}.png")
             write_image(files[-1], image)
             if look is not None:
                 look(image)
-            if progress is not None:
-                progress("read frames", done, max(done, expected))
         yield files
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +25,7 @@ from coliags_plugin.pipeline.frame_selection import (
     reduced,
     sharpest_frames,
 )
-from coliags_plugin.pipeline.frame_sources import FrameSource
+from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.texture import sharpness
@@ -36,6 +35,7 @@ IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
 MADE = "what `coliags reconstruct` wrote"
 #: Name of a frame's file without its suffix, within its folder.
 FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
+_KEEP_MORE = ", or keep more frames with --every, --set frames.least_motion=0 or --set frames.least_sharpness=0"
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
 _FEWEST_STILL = 10
 
@@ -85,11 +85,9 @@ def write_frames(
     surroundings of the lens's image and overlays are found. Replaces the folder; returns a summary of one line.
     """
     given = None if mask is None else read_mask(mask)
-    survey, expected = FrameSurvey(source.path), source.expected
-    for done, (_, image) in enumerate(source, start=1):
+    survey = FrameSurvey(source.path)
+    for _, image in watched(source, "look at frames", progress):
         survey.add(image)
-        if progress is not None:
-            progress("look at frames", done, max(done, expected))
     found, sharpnesses = survey.mask(), survey.sharpnesses
     size, total = survey.size, len(sharpnesses)
     if given is not None and given.shape != size:
@@ -101,28 +99,25 @@ def write_frames(
     chosen, dropped = sharpest_frames(sharpnesses, settings)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
-        kept = []
-        for index, name, image, moved in _moving(source, set(chosen), settings, used, progress, total):
-            if not moved:
+        kept, last, left = [], None, set(chosen)
+        for index, (name, image) in enumerate(watched(source, "write frames", progress)):
+            if index not in left:
+                continue
+            gray = reduced(image)
+            if last is not None and motion(last, gray, used) < settings.least_motion:
                 dropped[index] = RESTING
                 continue
+            last = gray
             kept.append((index, name))
             write_image(scratch / IMAGES / f"{name}.png", image)
-        counts = Counter(dropped.values())
-        why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
         blurred &= {index for index, _ in kept}
-        if blurred:
-            why = ", ".join([f"{len(blurred)} blurred, of use for poses alone", *([why] if why else [])])
+        reasons = [f"{len(blurred)} blurred, of use for poses alone"] if blurred else []
+        why = ", ".join([*reasons, *(f"{n} {reason}" for reason, n in sorted(Counter(dropped.values()).items()))])
         if (count := len(kept) - len(blurred)) < FEWEST:
             raise InputError(
                 f"{count} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
                 f"at least {FEWEST}",
-                "Give a longer part of the video in which the camera moves"
-                + (
-                    ", or keep more frames with --every, --set frames.least_motion=0 or --set frames.least_sharpness=0"
-                    if dropped
-                    else ""
-                ),
+                f"Give a longer part of the video in which the camera moves{_KEEP_MORE if dropped else ''}",
             )
         if used is not None:
             write_mask(scratch / MASK, used)
@@ -205,24 +200,3 @@ class FrameSurvey:
         if count >= _FEWEST_STILL:
             mask &= ~overlays(darkest, brightest, self._sum / count)
         return None if mask.all() or len(self._sizes) > 1 else mask
-
-
-def _moving(
-    source: FrameSource,
-    chosen: set[int],
-    settings: FrameSettings,
-    mask: Bool[np.ndarray, "H W"] | None,
-    progress: Progress | None,
-    total: int,
-) -> Iterator[tuple[int, str, UInt8[np.ndarray, "H W 3"], bool]]:
-    """The chosen frames: index, name, image, and whether the image has moved since the last that had."""
-    last = None
-    for index, (name, image) in enumerate(source):
-        if progress is not None:
-            progress("write frames", index + 1, total)
-        if index not in chosen:
-            continue
-        gray = reduced(image)
-        moved = last is None or motion(last, gray, mask) >= settings.least_motion
-        last = gray if moved else last
-        yield index, name, image, moved

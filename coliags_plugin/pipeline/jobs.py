@@ -1,20 +1,39 @@
-"""Parts of a reconstruction as jobs for worker processes: what all sub-maps need, then each sub-map by itself."""
+"""Parts of a reconstruction as jobs for worker processes: what all sub-maps need, then each sub-map by itself.
+
+    python -m coliags_plugin.pipeline.jobs TASK
+
+is such a process; TASK is a :class:`PartTask` as JSON.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
 
 from coliags_plugin.core.errors import InterruptedRunError, NotWritableError
+from coliags_plugin.core.locks import locked
 from coliags_plugin.execution.choice import ExecutionOptions
 from coliags_plugin.execution.executors import Executor
 from coliags_plugin.execution.queue import Job, JobQueue
+from coliags_plugin.execution.tasks import Task, TaskOutcome
+from coliags_plugin.execution.worker import attempt, run_worker
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.page import write_index
-from coliags_plugin.pipeline.stages import Part, Record, Stage, check_options, part_name
-from coliags_plugin.pipeline.worker import PartTask
+from coliags_plugin.pipeline.settings import ReconstructionSettings
+from coliags_plugin.pipeline.stages import (
+    LOCK_FILE,
+    LOCK_SECONDS,
+    Part,
+    Record,
+    Stage,
+    check_options,
+    part_name,
+    run_stages,
+)
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
@@ -138,10 +157,8 @@ class PartJob(Job):
     def __init__(self, jobs: PartJobs, part: Part, stages: Sequence[Stage], size: int) -> None:
         self._jobs, self.part, self.stages, self.size = jobs, part, stages, size
         out = jobs.context.out.resolve()
-        self.key, self.title = (
-            f"{out} {part_name(part)}",
-            f"{out.name}, {'poses' if part is None else f'sub-map {part}'}",
-        )
+        self.key = f"{out} {part_name(part)}"
+        self.title = f"{out.name}, {'poses' if part is None else f'sub-map {part}'}"
 
     def task(self) -> PartTask:
         """See :class:`Job`."""
@@ -186,3 +203,49 @@ class PartJob(Job):
     def unwritable(self, reason: str, attempts: int) -> Sequence[Job]:
         """See :class:`Job`: the other parts are written to the same disk."""
         raise NotWritableError(f"{self.title}: {reason}", do="What is done is kept")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartTask(Task):
+    """The stages of one part of a reconstruction."""
+
+    worker: ClassVar[str] = "coliags_plugin.pipeline.jobs"
+    source: str
+    out: str
+    settings: str  # JSON
+    mask: str | None
+    data_format: str | None
+    part: Part
+
+
+def work(task: PartTask) -> TaskOutcome:
+    """Run the stages that are not done."""
+    return attempt(task.title, task.out, lambda: complete(task))
+
+
+def complete(task: PartTask) -> None:
+    """Run the stages that are not done.
+
+    Raises:
+        InputError: One cannot be done; what it says is in the record, too.
+    """
+    import torch
+
+    from coliags_plugin.engine.devices import choose_device
+
+    torch.set_num_threads(task.threads)
+    settings = ReconstructionSettings.model_validate_json(task.settings, strict=False)  # of lists
+    mask, out = None if task.mask is None else Path(task.mask), Path(task.out)
+    device = choose_device(task.device)
+    context = StageContext(out, Path(task.source), settings, mask, task.data_format, device)
+    name = part_name(task.part)
+    with locked(out / f"{LOCK_FILE}-{name}", out, LOCK_SECONDS):
+        record = Record.of(out, name)
+        record.places = context.places
+        failure = run_stages(stages_of(context), record, plan=lambda: stages_of(context), parts={task.part})
+        if failure is not None:
+            raise failure
+
+
+if __name__ == "__main__":
+    run_worker(lambda text: work(PartTask.from_json(text)))

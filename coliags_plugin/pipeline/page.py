@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -37,7 +37,6 @@ from coliags_plugin.reporting.model import (
     Value,
     as_cell,
     ranked_cells,
-    simple_table,
 )
 from coliags_plugin.reporting.numbers import area_text, duration
 
@@ -49,6 +48,8 @@ _KINDS = ("recorded.png", "depth.png", "flattened light.png")
 _LONG = 12
 #: Figures of a sub-map that have a mean over all, with their units.
 _MEASURED = {"psnr": "dB", "ssim": "1", "psnr_pose_refined": "dB", "psnr_training": "dB", "gap": "dB"}
+#: Columns that are left out where no sub-map has them.
+_WHERE_KNOWN = ("span", "psnr_pose_refined", "seen")
 #: Figures that are words.
 _TEXTS = ("unit", "depth_scale")
 #: What to do where the poses of a sub-map are suspect.
@@ -69,12 +70,14 @@ class SubmapResults:
     @property
     def figures(self) -> dict[str, Any]:
         """The numbers of all its stages; of a damaged record, those that are numbers."""
-        return {
+        found = {
             name: value
             for stage in self.stages.values()
             for name, value in stage.figures.items()
             if isinstance(value, str) == (name in _TEXTS) and isinstance(value, int | float | str)
         }
+        gap = {"gap": found["psnr_training"] - found["psnr"]} if {"psnr", "psnr_training"} <= found.keys() else {}
+        return found | gap
 
     @property
     def failure(self) -> str:
@@ -98,54 +101,54 @@ def submap_table(
 ) -> Table:
     """Figures of the sub-maps and their means; ``spans`` tell where in the video each is, ``names`` their names."""
     names = names or [f"{one.submap.number}{'' if one.submap.number else ', the largest'}" for one in results]
-    refined = any("psnr_pose_refined" in one.figures for one in results)
+    figures = [one.figures for one in results]
     columns = [
         Column("submap", "Sub-map", words=True),
         Column("frames", "Frames"),
-        *([Column("span", "In the video", words=True)] if spans else []),
+        Column("span", "In the video", words=True),
         Column("held_out", "Held out"),
         Column("psnr", "PSNR", "dB", "higher"),
         Column("ssim", "SSIM", "1", "higher"),
-        *([Column("psnr_pose_refined", "PSNR, pose refined", "dB")] if refined else []),
+        Column("psnr_pose_refined", "PSNR, pose refined", "dB"),
         Column("psnr_training", "PSNR of training views", "dB"),
         Column("gap", "Gap", "dB", "lower"),
         Column("area", "Area"),
-        *([Column("seen", "Seen", words=True)] if any(seen_of(one.figures) for one in results) else []),
+        Column("seen", "Seen", words=True),
         Column("steps", "Steps"),
         Column("time", "Time"),
     ]
-    rows: list[dict[str, Value | TableCell]] = []
-    measured: dict[str, list[float | None]] = {key: [] for key in _MEASURED}
-    for number, one in enumerate(results):
-        figures = one.figures
-        if "psnr" in figures and "psnr_training" in figures:
-            figures["gap"] = figures["psnr_training"] - figures["psnr"]
-        for key, values in measured.items():
-            values.append(figures.get(key))
-        rows.append(
-            {
-                "submap": names[number],
-                "frames": figures.get("frames"),
-                "span": spans[number] if spans else None,
-                "held_out": figures.get("held_out"),
-                "area": area_of(figures),
-                "seen": seen_of(figures),
-                "steps": figures.get("steps"),
-                "time": duration(sum(stage.seconds for stage in one.stages.values())),
-            }
-        )
+    rows: list[dict[str, Value | TableCell]] = [
+        {
+            **{key: own.get(key) for key in ("frames", "held_out", "steps")},
+            "submap": name,
+            "span": span,
+            "area": area_of(own),
+            "seen": seen_of(own),
+            "time": duration(sum(stage.seconds for stage in one.stages.values())),
+        }
+        for name, span, own, one in zip(names, spans or [None] * len(results), figures, results, strict=True)
+    ]
     if len(results) > 1:
-        for values in measured.values():
+        rows.append({"submap": "mean"})
+    for key, unit in _MEASURED.items():
+        values = [own.get(key) for own in figures]
+        if len(results) > 1:
             known = [value for value in values if value is not None]
             values.append(sum(known) / len(known) if known else None)
-        rows.append({"submap": "mean", "frames": None})
-    for key, unit in _MEASURED.items():
-        for row, cell in zip(rows, ranked_cells(measured[key], unit, None), strict=True):
+        for row, cell in zip(rows, ranked_cells(values, unit, None), strict=True):
             row[key] = cell
     for row, one in zip(rows, results, strict=False):
         if one.failure:
             row["psnr"] = replace(as_cell(row["psnr"]), note=one.failure)
-    return Table("", columns, rows, name="submaps")
+    there = {key for row in rows for key, value in row.items() if as_cell(value).text}
+    shown = [column for column in columns if column.key not in _WHERE_KNOWN or column.key in there]
+    return Table("", shown, rows, name="submaps")
+
+
+def table_of(columns: Sequence[Column], rows: Iterable[Sequence[Value | TableCell]], name: str = "") -> Table:
+    """A table of rows of as many values as there are columns."""
+    keys = [column.key for column in columns]
+    return Table("", columns, [dict(zip(keys, row, strict=True)) for row in rows], name=name)
 
 
 def area_of(figures: Mapping[str, Any]) -> str | None:
@@ -257,9 +260,10 @@ def _video(record: Record, atlas: AtlasRecord | None, posed: Path) -> Iterator[B
         )
         yield Figures([Image(EncodedImage.png(read_rgb(posed / RIBBON_FILE)), "", wide=True)])
     rows = list(_stretches(atlas, {one.submap.number for one in results_of(record)}))
-    table = simple_table(["Frames", "Number", "What", "Why"], rows)
-    table = replace(table, columns=[replace(column, words=column.key != "Number") for column in table.columns])
-    yield Folded(f"{len(rows)} stretches of frames, and why they end", [table], is_open=len(rows) <= _LONG)
+    columns = [Column(key, words=key != "Number") for key in ("Frames", "Number", "What", "Why")]
+    yield Folded(
+        f"{len(rows)} stretches of frames, and why they end", [table_of(columns, rows)], is_open=len(rows) <= _LONG
+    )
 
 
 def _stretches(atlas: AtlasRecord, reconstructed: set[int]) -> Iterator[Sequence[Value]]:
@@ -354,9 +358,5 @@ def _links(files: Mapping[str, str]) -> Bullets:
 
 
 def _stage_table(record: Record) -> Table:
-    columns = [Column("stage"), Column("result", words=True), Column("time")]
-    rows = [
-        {"stage": name, "result": stage.summary, "time": duration(stage.seconds)}
-        for name, stage in record.stages.items()
-    ]
-    return Table("", columns, rows)
+    rows = ([name, stage.summary, duration(stage.seconds)] for name, stage in record.stages.items())
+    return table_of([Column("stage"), Column("result", words=True), Column("time")], rows)

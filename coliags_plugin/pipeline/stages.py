@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -29,6 +29,8 @@ from coliags_plugin.core.text_files import without_places
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 #: Name of the file, and version of the schema of what a reconstruction records.
 RECORD_FILE, FORMAT = "reconstruction.json", 1
@@ -153,25 +155,27 @@ def _worker_file(name: str) -> str:
 
 
 def _read(file: Path) -> dict[str, StageRecord]:
+    return read_record(file, lambda _, content: _RECORDED.validate_python(content["stages"]), "Choose another --output")
+
+
+def read_record(file: Path, validate: Callable[[str, Any], T], do: str = "") -> T:
+    """Read a record by its text and JSON value; refused are damaged ones, and those of other versions of the package.
+
+    ``do`` is what to do about a damaged one.
+    """
     try:
-        content = parse_json(json_text(file))
-        check_format(file, content)
-        return _RECORDED.validate_python(content["stages"])
+        text = json_text(file)
+        content = parse_json(text)
+        if isinstance(content, dict) and content.get("format") != FORMAT:
+            raise InputError(
+                f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
+                f"format {FORMAT}, of version {__version__}",
+                "Choose another --output, or go on with that version",
+            )
+        return validate(text, content)
     except (OSError, ValueError, KeyError, TypeError) as error:
         told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
-        raise InputError(
-            f"cannot read {file}: {told}", "what `coliags reconstruct` wrote", "Choose another --output"
-        ) from error
-
-
-def check_format(file: Path, content: Any) -> None:
-    """Refuse the record of another version of this package."""
-    if isinstance(content, dict) and content.get("format") != FORMAT:
-        raise InputError(
-            f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
-            f"format {FORMAT}, of version {__version__}",
-            "Choose another --output, or go on with that version",
-        )
+        raise InputError(f"cannot read {file}: {told}", "what `coliags reconstruct` wrote", do) from error
 
 
 def _is_ours(path: Path) -> bool:

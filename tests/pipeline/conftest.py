@@ -14,9 +14,9 @@ from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, wr
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
+from coliags_plugin.pipeline.jobs import PartTask, work
 from coliags_plugin.pipeline.procedure import run
 from coliags_plugin.pipeline.stages import StageOutcome
-from coliags_plugin.pipeline.worker import PartTask, work
 from tests.pipeline.films import film
 from tests.reconstruction.seen_points import frame_model
 from tests.task_list import TaskList

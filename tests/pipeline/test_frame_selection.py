@@ -65,11 +65,8 @@ def test_the_mask_of_a_round_lens():
     mask = lens_mask(image)
     assert not mask[~inside].any()
     assert mask[(rows - 60) ** 2 + (columns - 80) ** 2 < 53**2].all()
-
-
-def test_a_full_image_needs_no_mask():
-    assert lens_mask(np.full((120, 160), 90, np.uint8)) is None
-    assert lens_mask(np.full((120, 160), 2, np.uint8)) is None  # a black video
+    for level in (90, 2):  # that of a full image, and of a black video
+        assert lens_mask(np.full((120, 160), level, np.uint8)) is None
 
 
 def survey(frames) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,6 +96,7 @@ def test_a_camera_that_rests_shows_no_overlays():
 
 
 def test_blur_lowers_sharpness():
+    assert reduced(np.zeros((1080, 1350, 3), np.uint8)).shape == (384, 480)
     image = film([0])[0]
     values = [sharpness(reduced(image if sigma == 0 else blurred(image, sigma))) for sigma in (0, 1, 2, 4)]
     assert values == sorted(values, reverse=True)
@@ -117,10 +115,6 @@ def test_highlights_do_not_make_a_blurred_frame_sharp():
     before = sharpness(reduced(image))
     image[50:54, 60:66] = 255
     assert sharpness(reduced(image)) == pytest.approx(before, rel=0.05)
-
-
-def test_large_frames_are_reduced():
-    assert reduced(np.zeros((1080, 1350, 3), np.uint8)).shape == (384, 480)
 
 
 @pytest.mark.parametrize("shift", [0, 1, 3, 8])

@@ -9,10 +9,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE, Procedure
 from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, Stage, StageOutcome, run_stages
-
-
-class Killed(BaseException):
-    """Ends a process wherever it is."""
+from tests.pipeline.conftest import Killed
 
 
 class Workshop:
@@ -48,7 +45,8 @@ def test_done_stages_are_left_out(tmp_path):
     shop = Workshop(tmp_path)
     assert shop.run() == ["first", "second", "third"]
     assert shop.run() == []
-    record = Record.of(tmp_path)
+    record, content = Record.of(tmp_path), json.loads((tmp_path / RECORD_FILE).read_text())
+    assert (content["format"], list(content["stages"])) == (1, ["first", "second", "third"])
     assert [stage.state for stage in record.stages.values()] == ["done"] * 3
     assert record.stages["second"].summary == "second is there"
     assert record.stages["third"].files == {"third.txt": "a file"}
@@ -58,6 +56,8 @@ def test_done_stages_are_left_out(tmp_path):
 def test_a_killed_run_goes_on(tmp_path, name):
     with pytest.raises(Killed):
         Workshop(tmp_path, kill=name).run()
+    with pytest.raises(InputError, match=f"stage {name} was made with value 0, not 1"):
+        Workshop(tmp_path).run(**{name: 1})
     order = ["first", "second", "third"]
     assert Workshop(tmp_path).run() == order[order.index(name) :]
 
@@ -72,13 +72,6 @@ def test_other_options_are_refused_or_repeat_what_depends_on_them(tmp_path):
     assert shop.run(overwrite=True, second=5) == ["second", "third"]
     assert (tmp_path / "third.txt").read_text() == "third"
     assert shop.run(second=5) == []
-
-
-def test_what_a_kill_has_left_is_not_mixed_with_other_options(tmp_path):
-    with pytest.raises(Killed):
-        Workshop(tmp_path, kill="second").run()
-    with pytest.raises(InputError, match="stage second was made with"):
-        Workshop(tmp_path).run(second=1)
 
 
 def test_a_stage_that_failed_can_be_tried_with_other_options(tmp_path):
@@ -106,13 +99,6 @@ def test_records_of_other_versions_are_refused(tmp_path):
         (tmp_path / name).write_text('{"format": 0, "version": "0.0.1", "stages": {}}')
         with pytest.raises(InputError, match=rf"{name} is of version 0\.0\.1 .*Choose another --output"):
             read(tmp_path)
-
-
-def test_the_record_is_json_with_version(tmp_path):
-    Workshop(tmp_path).run()
-    found = json.loads((tmp_path / RECORD_FILE).read_text())
-    assert found["format"] == 1
-    assert list(found["stages"]) == ["first", "second", "third"]
 
 
 def test_what_a_kill_leaves_before_the_record_is_no_hindrance(tmp_path):

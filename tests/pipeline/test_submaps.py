@@ -56,9 +56,6 @@ def test_each_sub_map_has_its_own_frames_and_unit(atlas, tmp_path, caplog):
         np.testing.assert_allclose(positions(scene.video), positions(tube_frames(COUNTS[number], 1.0)), 1e-4)
         assert context.folder == tmp_path / "out" / ("" if number == 0 else f"submap-{number}")
     assert "no pose" not in caplog.text  # the atlas says it
-
-
-def test_the_atlas_tells_the_unit_of_each_model(tmp_path):
     scene = write_atlas(tmp_path / "scene", units=("mm", "unknown", "unknown"))
     scenes = [context.open_posed() for context in context_of(scene, tmp_path / "out").submaps()]
     assert [one.is_metric for one in scenes] == [True, False]

@@ -133,35 +133,37 @@ def read_procedure(out: Path) -> ProcedureContents:
         )
     segments = [_read_segment(out, span, record) for span in record.segments]
     problems = [f"{one.span.name}: {one.problem}" for one in segments if one.problem]
-    survey: dict[str, np.ndarray] = {}
-    try:
-        if (out / SURVEY_FILE).is_file():
-            survey = read_arrays(out / SURVEY_FILE, MADE, optional=SURVEYED)
-            if any(values.shape != (record.frames,) or values.dtype.kind != "f" for values in survey.values()):
-                shapes = ", ".join(f"{name} {values.dtype} {[*values.shape]}" for name, values in survey.items())
-                raise InputError(f"{out / SURVEY_FILE} has {shapes}", f"a number for each of {record.frames} frames")
-    except InputError as error:
-        survey = {}
-        problems.append(_told(error, out))
+    survey = _attempt(lambda: _read_survey(out, record), out, problems) or {}
     submaps = sorted((submap for one in segments for submap in one.submaps), key=lambda submap: submap.first)
     return ProcedureContents(out, record, segments, submaps, survey, problems)
 
 
+def _read_survey(out: Path, record: Procedure) -> dict[str, np.ndarray]:
+    if not (out / SURVEY_FILE).is_file():
+        return {}
+    survey = read_arrays(out / SURVEY_FILE, MADE, optional=SURVEYED)
+    if any(values.shape != (record.frames,) or values.dtype.kind != "f" for values in survey.values()):
+        shapes = ", ".join(f"{name} {values.dtype} {[*values.shape]}" for name, values in survey.items())
+        raise InputError(f"{out / SURVEY_FILE} has {shapes}", f"a number for each of {record.frames} frames")
+    return survey
+
+
+def _attempt(read: Callable[[], T], folder: Path, problems: list[str]) -> T | None:
+    """What is read; None of what is damaged, which is said without the place of the folder, as that may be moved."""
+    try:
+        return read()
+    except InputError as error:
+        problems.append(str(error).replace(f"{folder}/", "").replace(str(folder), folder.name))
+        return None
+
+
 def _read_segment(out: Path, span: Segment, procedure: Procedure) -> SegmentContents:
     folder, problems = out / span.name, list[str]()
-
-    def attempt(read: Callable[[], T]) -> T | None:
-        try:
-            return read()
-        except InputError as error:
-            problems.append(_told(error, folder))
-            return None
-
-    record = attempt(lambda: Record.of(folder)) or Record(folder)
-    frames = attempt(lambda: FramesRecord.read(folder / "frames"))
+    record = _attempt(lambda: Record.of(folder), folder, problems) or Record(folder)
+    frames = _attempt(lambda: FramesRecord.read(folder / "frames"), folder, problems)
     kept = {one.frame: one.name for one in (frames.kept if frames else ()) if span.first <= one.frame <= span.last}
     why = {one.frame: one.why for one in (frames.dropped if frames else ())}
-    atlas = attempt(lambda: read_atlas(folder / "poses"))
+    atlas = _attempt(lambda: read_atlas(folder / "poses"), folder, problems)
     results = [one for one in results_of(record) if one.stages]
     submaps: list[ProcedureSubmap] = []
     if atlas is not None:
@@ -194,21 +196,14 @@ def _numbers(atlas: AtlasRecord, known: Mapping[str, int], procedure: Procedure)
 def _submaps(
     segment: str, atlas: AtlasRecord, numbers: Sequence[int], results: Mapping[int, SubmapResults]
 ) -> list[ProcedureSubmap]:
-    models: dict[str, dict[int, str]] = {}
-    units: dict[str, Unit] = {}
+    units, models = {stretch.model: stretch.unit for stretch in atlas.submaps}, dict[str, dict[int, str]]()
     for stretch in atlas.submaps:
-        units[stretch.model] = stretch.unit
         models.setdefault(stretch.model, {}).update({numbers[index]: atlas.frames[index] for index in stretch.frames})
     return [
         ProcedureSubmap(segment, model, units[model], dict(sorted(names.items())), results.get(int(Path(model).name)))
         for model, names in models.items()
         if names
     ]
-
-
-def _told(error: InputError, folder: Path) -> str:
-    """A message without the place of the folder, which may be moved."""
-    return str(error).replace(f"{folder}/", "").replace(str(folder), folder.name)
 
 
 def common_frames(procedure: ProcedureContents) -> dict[ModelKey, tuple[ModelKey, Float[np.ndarray, "4 4"]]]:

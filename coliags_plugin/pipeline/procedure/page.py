@@ -20,6 +20,7 @@ from coliags_plugin.pipeline.page import (
     scene_choice,
     seen_of,
     submap_table,
+    table_of,
 )
 from coliags_plugin.pipeline.procedure.contents import ProcedureContents, ProcedureSubmap, common_frames, read_procedure
 from coliags_plugin.pipeline.procedure.record import ModelKey
@@ -54,7 +55,6 @@ from coliags_plugin.reporting.model import (
     TableCell,
     Template,
     Value,
-    simple_table,
 )
 from coliags_plugin.reporting.numbers import area_text, counted, duration
 from coliags_plugin.results.reading import RESULT_FILE, read_result
@@ -199,7 +199,7 @@ def _map(procedure: ProcedureContents, first_of: Mapping[ModelKey, ModelKey]) ->
     )
     yield Template("submaps.html", {"blocks": blocks})
     if procedure.record.joins:
-        rows = [
+        rows: list[list[Value | TableCell]] = [
             [
                 " and ".join("/".join(filter(None, (name, Path(model).name))) for name, model in join.keys),
                 "joined" if join.joined else "apart",
@@ -218,8 +218,7 @@ def _map(procedure: ProcedureContents, first_of: Mapping[ModelKey, ModelKey]) ->
             Column("Position", unit="% of the depth"),
             Column("Why apart", words=True),
         ]
-        table = simple_table([column.key for column in columns], rows)
-        yield Folded("Joins of segments", [replace(table, columns=columns, name="joins")], is_open=len(rows) <= _NAMED)
+        yield Folded("Joins of segments", [table_of(columns, rows, "joins")], is_open=len(rows) <= _NAMED)
 
 
 def _times(procedure: ProcedureContents, submap: ProcedureSubmap) -> str:
@@ -335,8 +334,7 @@ def _without_pose(
         for share in [100.0 * count / procedure.record.frames]
     ]
     columns = [Column("Why"), Column("What", words=True), Column("Frames"), Column("Share", unit="% of the video")]
-    table = simple_table([column.key for column in columns], rows)
-    yield replace(table, columns=columns, name="reasons")
+    yield table_of(columns, rows, "reasons")
     lost = [one for one in stretches(procedure, states, codes) if one.state.style is None]
     longest = sorted(lost, key=lambda one: one.first - one.last)[:_LISTED]
     has_time = procedure.record.rate is not None
@@ -350,10 +348,7 @@ def _without_pose(
         ]
         for one in sorted(longest, key=lambda one: one.first)
     ]
-    table = simple_table(head, listed)
-    table = replace(
-        table, columns=[replace(column, words=column.key != "Number") for column in table.columns], name="stretches"
-    )
+    table = table_of([Column(key, words=key != "Number") for key in head], listed, "stretches")
     shown = f"the {_LISTED} longest of {len(lost)}" if len(lost) > _LISTED else str(len(lost))
     yield Folded(f"Stretches without a pose ({shown})", [table])
 

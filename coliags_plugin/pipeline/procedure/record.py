@@ -8,16 +8,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from coliags_plugin._version import __version__
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import json_text, parse_json
-from coliags_plugin.core.settings import first_error
 from coliags_plugin.pipeline.procedure.segments import Segment, Skipped, Stretch
-from coliags_plugin.pipeline.stages import FORMAT, check_format
+from coliags_plugin.pipeline.stages import FORMAT, read_record
 
 #: Name of the file.
 PROCEDURE_FILE = "procedure.json"
@@ -102,13 +99,7 @@ class Procedure(_Part):
         file = folder / PROCEDURE_FILE
         if not file.is_file():
             return None
-        try:
-            text = json_text(file)
-            check_format(file, parse_json(text))
-            return cls.model_validate_json(text, strict=True)
-        except (OSError, ValueError) as error:
-            told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
-            raise InputError(f"cannot read {file}: {told}", "what `coliags reconstruct` wrote") from error
+        return read_record(file, lambda text, _: cls.model_validate_json(text, strict=True))
 
 
 def _is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:

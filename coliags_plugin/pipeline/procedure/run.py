@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
@@ -25,7 +24,7 @@ from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.procedure.joins import PosedFrames, apart, joins, read_posed
 from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
-from coliags_plugin.pipeline.procedure.segments import SURVEY_FILE, Segment, Survey, checksum, cut, survey_video
+from coliags_plugin.pipeline.procedure.segments import SURVEY_FILE, Survey, checksum, cut, survey_video
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record
 from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
@@ -60,10 +59,9 @@ def reconstruct_procedure(
     executor = make_executor(execution)
     executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
     procedure, survey = _prepare(context, overwrite)
-    segments = _Segments(context, procedure, survey, executor, execution, overwrite)
-    total = sum(segment.count for segment in procedure.segments)
     if procedure.segments:
-        run_jobs(executor, execution, segments.jobs(), total)
+        jobs = _segment_jobs(context, procedure, survey, executor, execution, overwrite)
+        run_jobs(executor, execution, jobs, sum(segment.count for segment in procedure.segments))
     names = [segment.name for segment in procedure.segments]
     procedure = procedure.model_copy(update={"joins": _joins(context.out, procedure, names)})
     procedure.write(context.out)
@@ -114,12 +112,7 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
     source = chosen_frames(context.source, chosen)
     survey = survey_video(source, context.progress)
     segments, skipped = cut(survey, chosen, least)
-    shifted = [
-        Segment(each.first + chosen.first, each.last + chosen.first, f"segment-{number:03d}")
-        for number, each in enumerate(segments)
-    ]
-    left_out = [replace(each, first=each.first + chosen.first, last=each.last + chosen.first) for each in skipped]
-    seek = chosen.seek and _are_found(source, survey, [each.first for each in shifted])
+    seek = chosen.seek and _are_found(source, survey, [each.first for each in segments])
     height, width = survey.size
     procedure = Procedure(
         source=[context.source.name],
@@ -131,13 +124,13 @@ def _prepare(context: StageContext, overwrite: bool) -> tuple[Procedure, Survey]
         options=options,
         seek=seek,
         deinterlace=source.span.deinterlace,
-        segments=shifted,
-        skipped=left_out,
+        segments=segments,
+        skipped=skipped,
         joins=(),
     )
     procedure.write(out)
     survey.write(out)  # last: the folder is known for a procedure's from the record on, and surveyed anew without this
-    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(shifted), len(left_out))
+    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(segments), len(skipped))
     return procedure, survey
 
 
@@ -152,72 +145,50 @@ def _are_found(source: FrameSource, survey: Survey, numbers: Sequence[int]) -> b
     return True
 
 
-class _Segments:
-    """The segments as reconstructions of their own, whose camera is that of the one that is posed first."""
+def _segment_jobs(
+    context: StageContext,
+    procedure: Procedure,
+    survey: Survey,
+    executor: Executor,
+    execution: ExecutionOptions,
+    overwrite: bool,
+) -> list[Job]:
+    """Jobs that reconstruct the segments, first those of one that tells the camera of the others if it is not known.
 
-    def __init__(
-        self,
-        context: StageContext,
-        procedure: Procedure,
-        survey: Survey,
-        executor: Executor,
-        execution: ExecutionOptions,
-        overwrite: bool,
-    ) -> None:
-        self._context, self._procedure, self._overwrite = context, procedure, overwrite
-        self._executor, self._execution = executor, execution
-        self._mask = context.mask
-        if self._mask is None and survey.mask is not None:
-            self._mask = context.out / MASK
-            write_mask(self._mask, survey.mask)
-        followed = [
-            float(survey.followed[each.first - procedure.first : each.last + 1 - procedure.first].sum())
-            for each in procedure.segments
-        ]
-        #: Segments of which one is to tell the camera, the most promising first.
-        self._promising = sorted(range(len(followed)), key=lambda number: -followed[number])
-        self._begun: set[int] = set()
+    That is the segment in which most is followed; if it gets no poses, the next one.
+    """
+    known, mask = context.settings.sfm.camera, context.mask
+    if mask is None and survey.mask is not None:
+        mask = context.out / MASK
+        write_mask(mask, survey.mask)
+    followed = [
+        float(survey.followed[each.first - procedure.first : each.last + 1 - procedure.first].sum())
+        for each in procedure.segments
+    ]
+    left = sorted(range(len(followed)), key=lambda number: -followed[number])
 
-    def jobs(self) -> list[Job]:
-        """Those of the first segment to be posed, or of all where the camera is known."""
-        if has_known_camera(self._context.settings.sfm.camera):
-            return self._all(self._context.settings.sfm.camera)
-        return self._first()
-
-    def _first(self) -> list[Job]:
-        """Pose the most promising segment that is not begun, for the others to have its camera."""
-        number = next((number for number in self._promising if number not in self._begun), None)
-        if number is None:
-            return []
-        self._begun.add(number)
-
-        def others(jobs: PartJobs) -> list[Job]:
-            camera = _camera_of(jobs.context.posed)
-            return self._first() if camera is None else self._all(camera)
-
-        return self._part_jobs(number, self._context.settings.sfm.camera, others)
-
-    def _all(self, camera: CameraSettings) -> list[Job]:
-        """Every segment that is not begun, with a camera."""
-        left = [number for number in range(len(self._procedure.segments)) if number not in self._begun]
-        self._begun.update(left)
-        return [job for number in left for job in self._part_jobs(number, camera, None)]
-
-    def _part_jobs(self, number: int, camera: CameraSettings, then: Any) -> list[Job]:
-        segment, settings = self._procedure.segments[number], self._context.settings
-        frames = settings.frames.model_copy(
-            update={
-                "first": segment.first,
-                "last": segment.last,
-                "seek": self._procedure.seek,
-                "deinterlace": self._procedure.deinterlace,
-            }
-        )
-        sfm = settings.sfm.model_copy(update={"camera": camera})
+    def jobs_of(number: int, camera: CameraSettings, then: Callable[[PartJobs], list[Job]] | None = None) -> list[Job]:
+        segment, settings = procedure.segments[number], context.settings
+        span = {"first": segment.first, "last": segment.last}
+        span |= {"seek": procedure.seek, "deinterlace": procedure.deinterlace}
+        frames, sfm = settings.frames.model_copy(update=span), settings.sfm.model_copy(update={"camera": camera})
         own = settings.model_copy(update={"frames": frames, "sfm": sfm})
-        out = self._context.out / segment.name
-        context = replace(self._context, out=out, settings=own, mask=self._mask)
-        return PartJobs(context, self._executor, self._execution, self._overwrite, segment.count, then).jobs()
+        inside = replace(context, out=context.out / segment.name, settings=own, mask=mask)
+        return PartJobs(inside, executor, execution, overwrite, segment.count, then).jobs()
+
+    def first() -> list[Job]:
+        return jobs_of(left.pop(0), known, others) if left else []
+
+    def others(jobs: PartJobs) -> list[Job]:
+        camera = _camera_of(jobs.context.posed)
+        return first() if camera is None else all_left(camera)
+
+    def all_left(camera: CameraSettings) -> list[Job]:
+        numbers = sorted(left)
+        left.clear()
+        return [job for number in numbers for job in jobs_of(number, camera)]
+
+    return all_left(known) if has_known_camera(known) else first()
 
 
 def _camera_of(scene: Path) -> CameraSettings | None:

@@ -14,7 +14,7 @@ from pydantic import Field
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frame_selection import motion_and_survival, reduced
-from coliags_plugin.pipeline.frame_sources import FrameSource
+from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.frames import FrameSurvey
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.video import cut_where_lost
@@ -72,9 +72,9 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
     Raises:
         InputError: It has no frame that can be decoded, or frames of several sizes.
     """
-    whole, expected = FrameSurvey(source.path), source.expected
+    whole = FrameSurvey(source.path)
     followed, motions, checksums, last = list[float](), list[float](), list[int](), None
-    for done, (_, image) in enumerate(source, start=1):
+    for _, image in watched(source, "look at frames", progress):
         whole.add(image)
         gray = reduced(image)
         moved, share = (np.inf, 0.0) if last is None else motion_and_survival(last, gray)
@@ -82,8 +82,6 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
         followed.append(share)
         checksums.append(checksum(gray))
         last = gray
-        if progress is not None:
-            progress("look at frames", done, max(done, expected))
     mask, single = whole.mask(), np.float32
     return Survey(
         np.array(whole.sharpnesses, single), np.array(followed, single), np.array(motions, single),
@@ -129,7 +127,7 @@ class Skipped(Stretch):
     why: str = ""
 
 
-def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Stretch], list[Skipped]]:
+def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segment], list[Skipped]]:
     """Segments in order, and what is left out: where nothing is followed for long, and what is shorter than ``least``.
 
     Segments that follow each other without a gap share at most ``OVERLAP`` frames, times ``settings.every``.
@@ -140,23 +138,24 @@ def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Stret
     edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(np.int8), [0]])))
     gaps = [(first, stop) for first, stop in edges.reshape(-1, 2).tolist() if stop - first > _LONGEST_LOSS]
     bounds = [0, *(place for gap in gaps for place in gap), len(survey)]
-    skipped = [Skipped(first, stop - 1, "nothing of the frame before is seen, or no texture") for first, stop in gaps]
-    segments: list[Stretch] = []
+    skipped = [(first, stop - 1, "nothing of the frame before is seen, or no texture") for first, stop in gaps]
+    kept: list[tuple[int, int]] = []
     for start, stop in zip(bounds[::2], bounds[1::2], strict=True):
         if 0 < stop - start < least * settings.every:
-            skipped.append(Skipped(start, stop - 1, f"fewer than {least} frames of use between such stretches"))
+            skipped.append((start, stop - 1, f"fewer than {least} frames of use between such stretches"))
         elif stop > start:
-            segments += _split(survey, start, stop, settings)
-    return segments, sorted(skipped, key=lambda stretch: stretch.first)
+            kept += _split(survey, start, stop, settings)
+    began = settings.first  # of the survey, in the video
+    return (
+        [Segment(began + one, began + last, f"segment-{number:03d}") for number, (one, last) in enumerate(kept)],
+        [Skipped(began + one, began + last, why) for one, last, why in sorted(skipped)],
+    )
 
 
-def _split(survey: Survey, start: int, stop: int, settings: FrameSettings) -> list[Stretch]:
+def _split(survey: Survey, start: int, stop: int, settings: FrameSettings) -> list[tuple[int, int]]:
     # Stretches are not shorter than a quarter of the longest, so that no frame is in more than two segments.
     shared = min(OVERLAP, settings.segment // 8) * settings.every
     longest = settings.segment * settings.every - shared
     windows = cut_where_lost(survey.followed[start:stop].tolist(), longest)
     half = shared // 2
-    return [
-        Stretch(max(start, start + window.start - half), min(stop, start + window.stop + half) - 1)
-        for window in windows
-    ]
+    return [(max(start, start + window.start - half), min(stop, start + window.stop + half) - 1) for window in windows]

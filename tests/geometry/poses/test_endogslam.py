@@ -126,7 +126,7 @@ def test_what_is_no_npz(tmp_path, content):
         np.save(path.with_suffix(".npy"), np.eye(4))
         path.with_suffix(".npy").rename(path)
     elif content == "objects":
-        saved(path, keyframe_time_indices=np.array([{}], dtype=object))
+        saved(path, rgb_colors=np.array([{}], dtype=object))
     elif content != "missing":
         path.write_bytes(content)
     with pytest.raises(InputError, match=r"cannot read .*params\.npz" + ": Object arrays" * (content == "objects")):
