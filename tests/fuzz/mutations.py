@@ -127,11 +127,6 @@ def _json(data: bytes, path: list[Any], text: str | None, times: int = 1) -> byt
     return json.dumps(content).replace(json.dumps(mark), text * times).encode("utf-8", "surrogatepass")
 
 
-def _yaml_bomb(data: bytes) -> bytes:
-    lines = ["a0: &a0 [x, x]"] + [f"a{level}: &a{level} [*a{level - 1}, *a{level - 1}]" for level in range(1, 40)]
-    return data + "\n".join(["", *lines, ""]).encode()
-
-
 def _npz(data: bytes, index: int, how: str) -> bytes:
     made = io.BytesIO()
     if data[:6] == b"\x93NUMPY":
@@ -178,7 +173,6 @@ EDITS: dict[str, Callable[..., bytes]] = {
     "header": _header_token,
     "line": _line,
     "json": _json,
-    "yaml-bomb": _yaml_bomb,
     "npz": _npz,
     "png-size": _png_size,
     "image": _image,
@@ -245,8 +239,6 @@ def _edit(name: str, path: Path) -> st.SearchStrategy[Edit]:
     with suppress(ValueError):
         paths = st.sampled_from(_json_paths(json.loads(path.read_bytes())) or [["x"]])
         kinds += [with_text("json", path=paths)] * 4 + [op("json", path=paths, text=st.none())]
-    if suffix in (".yaml", ".yml"):
-        kinds += [op("yaml-bomb")]
     if suffix in (".npz", ".npy"):
         kinds += [op("npz", index=numbers, how=st.sampled_from([*ARRAYS, "missing", "renamed", "bomb"]))] * 3
     if suffix in (".png", ".tiff", ".tif", ".jpg"):
