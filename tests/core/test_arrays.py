@@ -61,7 +61,7 @@ def test_what_is_no_array_is_refused(tmp_path):
             )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_any_damage_is_an_input_error(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "damaged.npz"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.ply import point_properties, read_vertices, write_ply
+from coliags_plugin.core.ply import point_properties, read_triangles, read_vertices, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
 
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]
@@ -27,26 +29,42 @@ def header(form: str, count: int = 5, more: str = "") -> str:
     return f"ply\nformat {form} 1.0\ncomment a\nelement vertex {count}\n{properties}{more}end_header\n"
 
 
+FACES = "property uchar kind\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+SPLIT = [(0, 1, 2), (0, 2, 3), (1, 2, 3), (1, 3, 4)]
+
+
 @pytest.mark.parametrize("order", FORMATS)
-@pytest.mark.parametrize("faces", [False, True])
-def test_every_form(tmp_path, order, faces):
-    made = vertices("<" if order == "a" else order)
-    more = "element face 1\nproperty list uchar int vertex_indices\n" if faces else ""
-    body = made.tobytes() + faces * b"\x03" + faces * bytes(12)
+@pytest.mark.parametrize(
+    ("faces", "triangles"), [([], []), ([(0, 1, 2), (2, 3, 4)],) * 2, ([(0, 1, 2, 3), (1, 2, 3, 4)], SPLIT)]
+)
+def test_every_form(tmp_path, order, faces, triangles):
+    """With other lists, and polygons, which are split into triangles."""
+    binary = order.replace("a", "<")
+    made, path = vertices(binary), tmp_path / "p.ply"
+    body = made.tobytes()
+    for face in faces:
+        body += struct.pack("BB", 7, len(face)) + np.array(face, f"{binary}i4").tobytes()
+        body += struct.pack("B", 2 * len(face)) + bytes(8 * len(face))
     if order == "a":
-        body = (
-            "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in made).encode()
-            + faces * b"3 0 1 2\n"
-        )
-    (tmp_path / "p.ply").write_bytes(header(FORMATS[order], more=more).encode() + body)
-    found = read_vertices(tmp_path / "p.ply")
+        rows = [" ".join(repr(value.item()) for value in row) for row in made]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} {2 * len(face)}{2 * len(face) * ' 0'}" for face in faces]
+        body = "\n".join([*rows, ""]).encode()
+    whole = header(FORMATS[order], more=f"element face 2\n{FACES}" if faces else "").encode() + body
+    path.write_bytes(whole)
+    found = read_vertices(path)
     assert list(found) == [name for name, _ in FIELDS]
     for name, kind in FIELDS:
         assert found[name].dtype == np.dtype(kind)
         np.testing.assert_array_equal(found[name], made[name])
-    points = load_points(tmp_path / "p.ply")
+    points = load_points(path)
     np.testing.assert_array_equal(points.positions[:, 0], made["x"])
     np.testing.assert_array_equal(points.colors[:, 2], made["blue"])
+    if faces:
+        assert set(map(tuple, np.sort(read_triangles(path)[1], axis=1).tolist())) == set(triangles)
+        for cut in range(3, 40):
+            path.write_bytes(whole[:-cut])
+            with pytest.raises(InputError):
+                read_triangles(path)
 
 
 def test_colours_may_be_shares(tmp_path):

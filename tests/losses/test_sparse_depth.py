@@ -180,18 +180,9 @@ def sparse_scene():
     return scene
 
 
-def trainer(folder, scene, overrides=SPARSE, steps=40):
-    method = load_method("coliags", [*SMALL, f"schedule.steps={steps}", *overrides])
+def trainer(folder, scene, overrides=SPARSE):
+    method = load_method("coliags", [*SMALL, *overrides])
     return Trainer(method, scene, "wall", RunFolder(folder), 0, torch.device("cpu"))
-
-
-@pytest.mark.thorough
-def test_any_method_can_be_given_the_term(tmp_path):
-    run = trainer(tmp_path / "run", sparse_scene())
-    rows = [run.take_step() for _ in range(40)]
-    assert set(rows[0]["terms"]) == {"l1", "d-ssim", "scale-volume", "sparse_depth"}
-    errors = [row["terms"]["sparse_depth"] for row in rows]
-    assert sum(errors[-5:]) < 0.5 * sum(errors[:5])
 
 
 def test_a_scene_without_such_depth_is_refused_before_training(tmp_path):

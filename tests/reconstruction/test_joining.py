@@ -47,6 +47,7 @@ def halves(tmp_path_factory):
     return video, whole, [Hypothesis.of(part, video.brightness) for part in parts]
 
 
+@pytest.mark.thorough
 def test_models_of_the_same_wall_become_one(halves):
     video, whole, parts = halves
     with quiet_colmap(0):

@@ -124,6 +124,7 @@ def test_an_implausible_focal_length_is_refused(tube):
     assert reconstruct(list_images(tube), SfmSettings(camera=wide)).largest.registered
 
 
+@pytest.mark.thorough
 def test_features_of_a_long_video_are_those_of_its_sharpest_images(tube, tmp_path):
     for place, path in enumerate(list_images(tube)):
         image = read_rgb(path)
@@ -137,6 +138,7 @@ def test_features_of_a_long_video_are_those_of_its_sharpest_images(tube, tmp_pat
     assert share_of_path(found.largest.trajectory, TRUTH)[0] < 0.005
 
 
+@pytest.mark.thorough
 def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
     for path in list_images(tube):
         write_png(tmp_path / path.name, read_rgb(path))
@@ -163,6 +165,7 @@ def test_models_of_other_cameras_keep_their_own(tube, tmp_path):
     assert sizes == [{(160, 128)}, {(200, 160)}]
 
 
+@pytest.mark.thorough
 def test_masked_parts_have_no_features(tube):
     mask = np.ones((128, 160), bool)
     mask[64:] = False

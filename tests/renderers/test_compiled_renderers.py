@@ -8,6 +8,8 @@ little in float64; there may be few of them, and all others, and the gradients t
 """
 
 import dataclasses
+import subprocess
+import sys
 from importlib.util import find_spec
 
 import pytest
@@ -66,7 +68,9 @@ HORIZON = 10.0
 #: and a ten-thousandth of a pixel wide magnify the rounding of the pixels' positions.
 MAGNIFIED = {("surfels", "needles"): (3e-5, 1.5e-4), ("surfels", "edge-on"): (5e-5, 2e-3)}
 #: Channels of the feature maps.
-FEATURES = {"one": 1, "many": 7}
+FEATURES = {"one": 1, "many": 11}
+#: Some outputs of either primitive; numba compiles every set of outputs, which takes seconds.
+PART = ("many", "normals", "one", "depth_accumulated")
 BACKGROUND = (0.3, 0.1, 0.9)
 #: What float32 holds that is not to be expected.
 WILD = torch.tensor([0.0, -0.0, 1e-38, -1e38, 1e38, 3e38, torch.inf, torch.nan, 1e-45, 1e10, -1e-10])
@@ -219,18 +223,50 @@ def test_pixels_on_a_cutoff_are_found(depths, opacity):
     assert on_a_cutoff(gaussians, pinhole()).nonzero().tolist() == [[3, 4]]
 
 
-@by_each
+@by_each_at_length
 @of_each
-def test_features_and_the_centres_own_gradient_agree_with_the_definition(renderer, primitive):
+@pytest.mark.parametrize("wants", [("one",), pytest.param(PART, marks=pytest.mark.thorough)])
+def test_features_and_the_centres_own_gradient_agree_with_the_definition(renderer, primitive, wants):
     gaussians, camera = scene(primitive)
-    gaussians, wants = with_features(gaussians), ("many", "normals", "one", "depth_accumulated")
+    gaussians, wants = with_features(gaussians), wants if wants is PART else (*outputs_of(gaussians), *wants)
     ignored = on_a_cutoff(gaussians, camera)
     ours, gradients = drawn(renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)
     true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, wants, ignored, of_means2d=0.01)
-    for key in ("rgb", "alpha", *wants):
+    for key in {"rgb", "alpha", *wants} - {"depth_median"}:
         assert relative(ours[key][~ignored], true[key][~ignored]) <= 1e-5, key
     for key, gradient in gradients.items():
         assert relative(gradient, true_gradients[key]) <= (1e-4 if key == "pose" else 2e-5), key
+
+
+@of_each
+def test_features_are_composited_like_colours_over_black_and_change_nothing_else(primitive):
+    gaussians, camera = scene(primitive)
+    gaussians = with_features(gaussians)
+    features = {"copy": gaussians.colors, "white": torch.ones(len(gaussians), 1)}
+    copied = dataclasses.replace(gaussians, features=features)
+    output = torch_renderer.render_gaussians(copied, camera, ("copy", "normals", "white"))
+    torch.testing.assert_close(output["copy"], output.rgb)
+    torch.testing.assert_close(output["white"], output.alpha[..., None])
+    plain, more = (
+        cpu_renderer.render_gaussians(gaussians, camera, (*outputs_of(gaussians), *also)) for also in ((), ("one",))
+    )
+    assert torch.equal(plain.rgb, more.rgb) and torch.equal(plain["depth_accumulated"], more["depth_accumulated"])
+
+
+@pytest.mark.parametrize("renderer", [cpu_renderer, torch_renderer])
+def test_features_that_are_none(renderer):
+    gaussians, camera = scene("gaussians3d")
+    nothing = cast(random_gaussians(0), torch.float32)
+    nothing = dataclasses.replace(nothing, features={"albedo": torch.zeros(0, 3)})
+    assert not renderer.render_gaussians(nothing, camera, ("albedo",))["albedo"].any()
+    with pytest.raises(InputError, match=r"no renderer output 'albed'.*\n?.*'albedo'"):
+        renderer.render_gaussians(nothing, camera, ("albed",))
+    for spoiled, message in (
+        (torch.zeros(3, 2), "feature one of shape"),
+        (torch.zeros(len(gaussians), 1).double(), "float64"),
+    ):
+        with pytest.raises(InputError, match=message):
+            cpu_renderer.render_gaussians(dataclasses.replace(gaussians, features={"one": spoiled}), camera, ("one",))
 
 
 @pytest.mark.thorough  # numba compiles every set of outputs
@@ -280,7 +316,7 @@ def test_repeats_to_the_bit_with_any_number_of_threads(primitive, sort, monkeypa
 
 
 @by_each_at_length
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), size=st.floats(1e-3, 3.0), depth=st.floats(0.21, 4.0), low_pass=st.floats(0.1, 4.0))
 def test_bins_miss_no_pixel_that_a_surfel_reaches(renderer, seed, size, depth, low_pass):
     gaussians = random_gaussians(
@@ -423,10 +459,8 @@ def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
     assert all(torch.isfinite(gradients[name]).all() for name in ("opacities", "colors"))
 
 
+@pytest.mark.thorough
 def test_importing_the_component_does_not_load_numba():
-    import subprocess
-    import sys
-
     code = "import sys, coliags_plugin.renderers.cpu_renderer; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip() == "False"

@@ -180,6 +180,7 @@ def run_python(code, **environment):
     )
 
 
+@pytest.mark.thorough
 def test_all_kernels_load_where_nothing_can_be_kept(tmp_path):
     (tmp_path / "file").touch()
     code = """

@@ -187,7 +187,7 @@ def test_agrees_with_the_naive_renderer(primitive, name):
                 torch.testing.assert_close(splats.means2d[i].double(), center, rtol=1e-5, atol=1e-5)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31), tile_size=st.integers(1, 9), size=st.floats(1e-3, 3.0), depth=st.floats(0.21, 4.0))
 def test_tiles_miss_no_pixel_that_a_surfel_reaches(seed, tile_size, size, depth):
     gaussians = as_surfels(

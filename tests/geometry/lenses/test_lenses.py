@@ -62,8 +62,11 @@ def test_legacy_pinhole_is_opencvs():
     points = np.random.default_rng(0).uniform([-30, -20, 30], [30, 20, 60], (500, 3))
     reference, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, bending)
     np.testing.assert_allclose(BROWN.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-8)
-    columns, rows = undistortion_map(BROWN, BROWN.pinhole)
-    map_columns, map_rows = cv2.initUndistortRectifyMap(matrix, bending, None, matrix, (1350, 1080), cv2.CV_32FC1)
+    small = BROWN.resized(338, 270).pinhole
+    columns, rows = undistortion_map(BROWN, small)
+    map_columns, map_rows = cv2.initUndistortRectifyMap(
+        matrix, bending, None, small.opencv_matrix(), (338, 270), cv2.CV_32FC1
+    )
     np.testing.assert_allclose(columns, map_columns, rtol=0, atol=1e-3)
     np.testing.assert_allclose(rows, map_rows, rtol=0, atol=1e-3)
 
@@ -166,7 +169,7 @@ def test_negligible_terms_change_nothing():
 
 
 def test_undistortion_map_marks_what_the_lens_does_not_reach():
-    columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.pinhole, fx=60.0, fy=60.0))
+    columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.resized(135, 108).pinhole, fx=6.0, fy=6.0))
     assert columns.dtype == rows.dtype == np.float32
     assert columns[0, 0] == NOWHERE
     assert np.isfinite(columns).all()

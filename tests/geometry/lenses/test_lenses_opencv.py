@@ -86,7 +86,7 @@ def test_without_distortion_it_is_a_pinhole():
 def test_where_a_polynomial_turns_back_there_is_nothing(bends):
     closed = BrownLens(**SIZE, **VIEW, k1=bends[0], k2=bends[1])
     found = OpenCVLens(**SIZE, **VIEW, k1=bends[0], k2=bends[1])
-    pixels = grid(7)
+    pixels = grid(17)
     expected, got = closed.unproject(pixels), found.unproject(pixels)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(expected))
     # Next to the fold a pixel says little about its direction.
@@ -102,7 +102,7 @@ def test_where_a_polynomial_turns_back_there_is_nothing(bends):
 def test_a_fisheye_is_followed_up_to_its_own_turning_point():
     closed = LENSES["fisheye"]
     found = Copied(width=1350, height=1080, of=closed)
-    pixels = grid(11)
+    pixels = grid(17)
     expected, got = closed.unproject(pixels), found.unproject(pixels)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(expected))
     assert np.nanmax(np.abs(np.arctan(got[:, :2]) - np.arctan(expected[:, :2]))) < 1e-6

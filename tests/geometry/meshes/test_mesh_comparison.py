@@ -16,7 +16,7 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, angles_between, compare_meshes, sample_surface
 from tests.surface.coverage.tubes import plane as square
 
-COUNT = 100_000
+COUNT = 40_000
 
 
 def plane(z: float = 0.0, size: float = 40.0) -> TriangleMesh:

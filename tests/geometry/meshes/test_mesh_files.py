@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
-
 import numpy as np
 import pytest
 
@@ -60,22 +57,6 @@ def test_others_find_the_colours_of_a_texture(mesh, suffix, tmp_path):
     assert read_mesh(tmp_path / f"mesh.{suffix}").colors is None
 
 
-def test_glb_is_gltf_2(mesh, tmp_path):
-    write_mesh(tmp_path / "mesh.glb", mesh)
-    data = (tmp_path / "mesh.glb").read_bytes()
-    magic, version, length = struct.unpack("<4sII", data[:12])
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack("<I4s", data[12:20])
-    assert kind == b"JSON" and size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    positions = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
-    assert positions["min"] == pytest.approx(mesh.vertices.min(axis=0))
-    assert positions["count"] == 40
-    rest, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
-    assert kind == b"BIN\0" and 28 + size + rest == len(data)
-    assert document["buffers"][0]["byteLength"] <= rest
-
-
 def test_obj_polygons_and_negative_indices(tmp_path):
     path = tmp_path / "quad.obj"
     path.write_text("# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf -4//1 -3//1 -2//1 -1//1\n")
@@ -105,43 +86,3 @@ def test_damaged_files_are_refused(name, content, message, tmp_path):
         read_mesh(tmp_path / name)
     with pytest.raises(InputError, match="no file"):
         read_mesh(tmp_path / "gone.ply")
-
-
-HEADER = """ply
-format {} 1.0
-element vertex 5
-property float x
-property float y
-property float z
-element face 2
-property uchar kind
-property list uchar int vertex_indices
-property list uchar float texcoord
-end_header
-"""
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("corners", [([0, 1, 2], [2, 3, 4]), ([0, 1, 2, 3], [1, 2, 3, 4])])
-def test_ply_of_any_form_with_other_lists_and_polygons(tmp_path, form, corners):
-    positions = np.arange(15.0).reshape(5, 3)
-    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
-    if order:
-        body = positions.astype(f"{order}f4").tobytes()
-        for face in corners:
-            body += struct.pack("BB", 7, len(face)) + np.array(face, f"{order}i4").tobytes()
-            body += struct.pack("B", 2 * len(face)) + np.zeros(2 * len(face), "f4").tobytes()
-    else:
-        rows = [" ".join(map(str, row)) for row in positions]
-        rows += [f"7 {len(face)} {' '.join(map(str, face))} {2 * len(face)}{2 * len(face) * ' 0'}" for face in corners]
-        body = "\n".join([*rows, ""]).encode()
-    (tmp_path / "m.ply").write_bytes(HEADER.format(form).encode() + body)
-    mesh = read_mesh(tmp_path / "m.ply")
-    assert mesh.vertices.tolist() == positions.tolist()
-    expected = {(0, 1, 2), (2, 3, 4)} if len(corners[0]) == 3 else {(0, 1, 2), (0, 2, 3), (1, 2, 3), (1, 3, 4)}
-    assert set(map(tuple, np.sort(mesh.triangles, axis=1).tolist())) == expected
-    for cut in range(1, 40):
-        (tmp_path / "m.ply").write_bytes((HEADER.format(form).encode() + body)[:-cut])
-        if order or cut > 2:
-            with pytest.raises(InputError):
-                read_mesh(tmp_path / "m.ply")

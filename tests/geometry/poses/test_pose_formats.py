@@ -46,7 +46,7 @@ def test_what_is_written_is_read(tmp_path_factory, name, trajectory):
 
 
 @given(trajectory=trajectories(intrinsics=PINHOLE), way=st.lists(st.sampled_from(WRITABLE), min_size=2, max_size=5))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_any_way_through_the_formats_ends_where_it_began(tmp_path_factory, trajectory, way):
     folder = tmp_path_factory.mktemp("poses")
     now = trajectory

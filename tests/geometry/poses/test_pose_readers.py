@@ -29,7 +29,7 @@ def test_quaternions_are_w_first():
 
 
 @given(st.lists(st.floats(-10, 10), min_size=4, max_size=4))
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 def test_quaternions_by_the_formula(numbers):
     quat = np.array(numbers)
     if np.linalg.norm(quat) < 1e-3:
