@@ -119,22 +119,6 @@ def test_a_plane_of_surfels_is_consistent(depth, tilt):
     assert expected < 0.3
 
 
-@pytest.mark.thorough
-def test_inconsistent_surfels_are_turned_into_their_surface():
-    surfels, term = plane(0.0, count=9, spacing=0.6), make("normal-consistency")
-    half = math.radians(25) / 2
-    with torch.no_grad():  # blinds that stand at 25 degrees to the wall they cover
-        surfels.quats_wxyz.copy_(torch.tensor([math.cos(half), math.sin(half), 0, 0]).expand_as(surfels.quats_wxyz))
-    least, values = 1 - 15 * 21 / (17 * 23), []  # the border's share
-    optimizer = torch.optim.Adam([surfels.quats_wxyz], lr=0.03)
-    for _ in range(20):
-        values.append(term(render_gaussians(surfels, off_centre(), tuple(term.loss.wants)), frame()))
-        optimizer.zero_grad()
-        values[-1].backward()
-        optimizer.step()
-    assert values[-1] - least < 0.3 * (values[0] - least)
-
-
 def test_alpha_of_the_weight_has_no_gradient():
     normals = torch.zeros(17, 23, 3)
     normals[..., 2] = -1.0

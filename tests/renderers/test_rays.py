@@ -28,11 +28,13 @@ def test_even_places_are_midpoints_and_random_ones_lie_in_the_same_intervals():
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), samples=st.integers(3, 20), more=st.integers(1, 30))
-def test_refined_places_are_numpys_inverse_of_the_cumulative_weights(seed, samples, more):
+@given(
+    seed=st.integers(0, 10_000), samples=st.integers(3, 20), more=st.integers(1, 30), most=st.sampled_from([0.0, 1.0])
+)
+def test_refined_places_are_numpys_inverse_of_the_cumulative_weights(seed, samples, more, most):
     random = np.random.default_rng(seed)
     places = np.sort(random.uniform(1.0, 9.0, (2, samples)), axis=1)
-    weights = random.uniform(0.0, 1.0, (2, samples)) ** 8
+    weights = random.uniform(0.0, most, (2, samples)) ** 8  # rays without weight are refined evenly
     found = refined_places(torch.from_numpy(places), torch.from_numpy(weights), more, None).numpy()
     for row in range(2):
         edges = (places[row, 1:] + places[row, :-1]) / 2
@@ -50,13 +52,6 @@ def test_refined_places_at_random_follow_the_weights():
     torch.testing.assert_close(shares, torch.tensor([0.1, 0.6, 0.3]).double(), rtol=0, atol=0.002)
     assert torch.equal(drawn, refined_places(places, weights, 10_000, chance())[0])
     assert not torch.equal(drawn, refined_places(places, weights, 10_000, chance(1))[0])
-
-
-def test_rays_without_weight_are_refined_evenly():
-    places = torch.arange(1.0, 8.0).double()[None]
-    both = refined_places(places, torch.zeros_like(places), 10, None)[0]
-    added = torch.arange(1.75, 6.5, 0.5).double()  # between the midpoints, from 1.5 to 6.5
-    torch.testing.assert_close(both, torch.cat([places[0], added]).sort().values)
 
 
 def test_an_opaque_end_absorbs_what_is_left_where_there_is_density():

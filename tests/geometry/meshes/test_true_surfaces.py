@@ -31,20 +31,15 @@ def test_a_phantom(phantom):
         assert "training" in surface.seen_by
 
 
-def test_c3vd(tmp_path):
-    (tmp_path / "coverage_mesh.obj").write_text(VERTICES + "f 1/1 2/1 3/1\nf 1/2 3/2 4/2\n")
+@pytest.mark.parametrize(
+    "faces", ["f 1/1 2/1 3/1\nf 1/2 3/2 4/2\n", "vn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf -4/2/1 -2/2/1 -1/2/1\n"]
+)
+def test_c3vd_and_faces_of_any_form(tmp_path, faces):
+    (tmp_path / "coverage_mesh.obj").write_text(VERTICES + faces)
     surface = read_true_surface(tmp_path)
     assert surface.seen.tolist() == [True, False]
     assert "vt 1" in surface.seen_by
     assert np.array_equal(surface.mesh.triangles, SQUARE.triangles)
-
-
-def test_faces_of_any_form_are_read_alike(tmp_path):
-    (tmp_path / "a.obj").write_text(VERTICES + "f 1/1 2/1 3/1\nf 1/2 3/2 4/2\n")
-    (tmp_path / "b.obj").write_text(VERTICES + "vn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf -4/2/1 -2/2/1 -1/2/1\n")
-    first, second = (read_true_surface(tmp_path / name) for name in ("a.obj", "b.obj"))
-    assert np.array_equal(first.mesh.triangles, second.mesh.triangles)
-    assert np.array_equal(first.seen, second.seen)
 
 
 def test_a_mesh_alone_says_nothing_about_what_was_seen(tmp_path):
@@ -56,9 +51,16 @@ def test_a_mesh_alone_says_nothing_about_what_was_seen(tmp_path):
     assert read_true_surface(tmp_path / "textured.obj").seen_by != ""
 
 
-def test_a_scene_without(tmp_path):
-    assert find_true_surface(tmp_path) is None
-    with pytest.raises(InputError, match=r"no true surface.*coverage_mesh\.obj"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, r"no true surface.*coverage_mesh\.obj"), (VERTICES + "f 1/2 2/2 3/2\n", "marks no triangle")],
+)
+def test_a_scene_without(tmp_path, text, message):
+    if text is None:
+        assert find_true_surface(tmp_path) is None
+    else:
+        (tmp_path / "coverage_mesh.obj").write_text(text)
+    with pytest.raises(InputError, match=message):
         read_true_surface(tmp_path)
 
 
@@ -69,9 +71,3 @@ def test_flags_of_another_mesh_are_refused(phantom):
     np.savez(phantom / "truth" / "mesh_seen.npz", other=np.ones(2, bool))
     with pytest.raises(InputError, match="face_seen"):
         read_true_surface(phantom)
-
-
-def test_a_surface_of_which_nothing_was_seen_is_refused(tmp_path):
-    (tmp_path / "coverage_mesh.obj").write_text(VERTICES + "f 1/2 2/2 3/2\n")
-    with pytest.raises(InputError, match="marks no triangle as seen"):
-        read_true_surface(tmp_path)
