@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
 
 S = TypeVar("S", bound="Settings")
+R = TypeVar("R")
 
 #: Of options whose help says what is done without them, or which are flags.
 _NO_DEFAULT = ""
@@ -72,6 +74,12 @@ class CommandGroup:
     def run(self) -> None:
         """Execute the subcommand."""
         self.subcommand.run()
+
+
+def call(function: Callable[..., R], command: Runnable, **others: object) -> R:
+    """Call a function with the options of a command that have the names of its arguments, and with others."""
+    names = [name for name in signature(function).parameters if name not in others and hasattr(command, name)]
+    return function(**{name: getattr(command, name) for name in names}, **others)
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -61,25 +61,13 @@ class ComparisonArguments:
         from coliags_plugin.comparison.folder import ComparisonFolder
         from coliags_plugin.execution.choice import ExecutionOptions
 
-        request = make_request(
-            methods,
-            self.scenes,
-            self.data,
-            self.seeds,
-            self.protocol,
-            self.splits,
-            self.steps,
-            self.set,
-            self.reference,
-            self.primary,
-        )
+        request = arguments.call(make_request, self, methods=methods, overrides=self.set)
         folder = ComparisonFolder(self.output)
         if self.dry_run:
             planned = dry_run(request, folder)
             print_summary(str(planned), {"cells": planned.rows}, as_json=self.json)
             return
-        options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
-        done = carry_out(request, folder, options)
+        done = carry_out(request, folder, arguments.call(ExecutionOptions, self))
         table = done.table()
         facts = {
             "cells": len(done.cells),

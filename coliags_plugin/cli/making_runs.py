@@ -47,18 +47,11 @@ class TrainCommand:
         from coliags_plugin.api.training import train
         from coliags_plugin.config.assignments import parse_assignments
 
-        run = train(
-            self.method,
-            self.data,
-            self.output,
-            steps=self.steps,
-            seed=self.seed,
+        run = arguments.call(
+            train,
+            self,
             settings=parse_assignments(self.set),
-            renderer=self.renderer,
             data_format=self.format,
-            device=self.device,
-            resume=self.resume,
-            overwrite=self.overwrite,
             loggers=self.logger,
             view_port=self.port if self.view else None,
         )
@@ -119,12 +112,5 @@ class ImportCommand:
         """Import, and print the run folder."""
         from coliags_plugin.api.training import import_splats
 
-        run = import_splats(
-            self.file,
-            self.data,
-            self.output,
-            data_format=self.format,
-            device=self.device,
-            overwrite=self.overwrite,
-        )
+        run = arguments.call(import_splats, self, data_format=self.format)
         print_summary(written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)

@@ -88,18 +88,7 @@ class ReconstructCommand:
             "steps": self.steps,
         }
         settings = {key: value for key, value in given.items() if value is not None}
-        made = reconstruct(
-            self.video,
-            self.output,
-            settings={**settings, **parse_assignments(self.set)},
-            mask=self.mask,
-            device=self.device,
-            overwrite=self.overwrite,
-            executor=self.executor,
-            jobs=self.jobs,
-            threads=self.threads,
-            ray_address=self.ray_address,
-        )
+        made = arguments.call(reconstruct, self, settings={**settings, **parse_assignments(self.set)})
         told = _procedure(made) if isinstance(made, FinishedProcedure) else _reconstruction(made)
         export = coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")
         then = [export if isinstance(made, FinishedProcedure) else view_command(self.output / "run")]

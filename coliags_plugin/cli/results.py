@@ -49,18 +49,13 @@ class ReportCommand:
         from coliags_plugin.comparison.report.report import FORMATS
 
         named = tuple(name for name in self.format if name != "all") or FORMATS[:1]
-        files = report(
-            self.paths,
-            self.output,
+        files = arguments.call(
+            report,
+            self,
+            of=self.paths,
             formats=FORMATS if "all" in self.format else named,
             methods=_listed(self.methods),
             columns=_listed(self.columns),
-            reference=self.reference,
-            protocol=self.protocol,
-            frames=self.frames,
-            title=self.title,
-            note=self.note,
-            scene=self.scene,
         )
         print_summary(written=[file.resolve() for file in files], as_json=self.json)
 

@@ -59,17 +59,7 @@ class RenderCommand:
             run = run.relight(**lamp)
         if self.flatten:
             run = run.flatten()
-        folder = run.write_renders(
-            self.output,
-            self.frames,
-            video=self.video,
-            fps=self.fps,
-            channels=self.channel,
-            depth_kind=self.depth_kind,
-            depth_tiff=self.depth_tiff,
-            along=self.along,
-            overwrite=self.overwrite,
-        )
+        folder = arguments.call(run.write_renders, self, channels=self.channel)
         print_summary(written=[folder], then=[view_command(self.path, self.data)], as_json=self.json)
 
 
@@ -105,16 +95,14 @@ class CoverageCommand:
         is_run = (self.path / "config.yaml").is_file()
         if is_run:
             run = load_run(self.path, data=self.data, device=self.device)
-            measured = run.coverage(self.output, settings=settings, mesh=self.mesh, overwrite=self.overwrite)
+            measured = arguments.call(run.coverage, self, settings=settings)
         elif self.mesh is None or self.output is None:
             raise InputError(
                 f"{self.path} is not a run folder",
                 "a run folder, or a scene's folder with --mesh FILE and --output FOLDER",
             )
         else:
-            measured = measure_scene_coverage(
-                self.path, self.mesh, self.output, settings=settings, overwrite=self.overwrite
-            )
+            measured = arguments.call(measure_scene_coverage, self, data=self.path, settings=settings)
         print_summary(
             "\n".join(measured.summary),
             measured.values,
@@ -165,9 +153,7 @@ class MeshCommand:
         if self.voxel is not None:
             settings["voxel_size"] = self.voxel
         run = load_run(self.path, data=self.data, device=self.device)
-        meshed = run.mesh(
-            self.output, settings=settings, formats=self.format, truth=self.truth, overwrite=self.overwrite
-        )
+        meshed = arguments.call(run.mesh, self, settings=settings, formats=self.format)
         compared = meshed.comparison
         print_summary(
             "" if compared is None else terminal_text(comparison_blocks(compared)),

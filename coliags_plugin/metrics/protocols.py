@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Protocol
-from coliags_plugin.core.interpolation import interpolated
 from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.sampling import interpolated
 from coliags_plugin.core.scenes import Frame, SparseDepth
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]

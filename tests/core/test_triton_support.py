@@ -8,19 +8,19 @@ from types import SimpleNamespace
 
 import pytest
 
-from coliags_plugin.core import triton_support
+from coliags_plugin.core import tables
 
 
 @pytest.fixture
 def lacks(monkeypatch):
-    monkeypatch.setattr(triton_support, "find_spec", lambda name: object())
+    monkeypatch.setattr(tables, "find_spec", lambda name: object())
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.10.0"))
     monkeypatch.delenv("CC", raising=False)
-    return triton_support.what_triton_lacks.__wrapped__
+    return tables.what_triton_lacks.__wrapped__
 
 
 def test_without_triton(lacks, monkeypatch):
-    monkeypatch.setattr(triton_support, "find_spec", lambda name: None)
+    monkeypatch.setattr(tables, "find_spec", lambda name: None)
     assert "triton is not installed" in lacks()
 
 

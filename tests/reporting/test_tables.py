@@ -57,14 +57,10 @@ def test_decimals(unit, values, printed):
     assert [cell.text for cell in ranked_cells(values, unit, "lower")] == printed
 
 
-def test_spreads_have_the_decimals_of_their_values():
+def test_spreads_have_the_decimals_of_their_values_and_nothing_is_minus_zero():
     cells = ranked_cells([30.0, None], "dB", "higher", [0.126, 3.0])
     assert [cell.spread for cell in cells] == ["0.13", ""]
-
-
-def test_no_negative_zero():
-    assert number_text(-0.001, 2) == "0.00"
-    assert number_text(-0.006, 2) == "-0.01"
+    assert [number_text(value, 2) for value in (-0.001, -0.006)] == ["0.00", "-0.01"]
 
 
 def test_equal_footnotes_share_a_mark_and_hidden_columns_have_none():
@@ -84,22 +80,22 @@ def test_equal_footnotes_share_a_mark_and_hidden_columns_have_none():
     assert [note.mark for note in shown.footnotes.values()] == ["a", "b"]
 
 
-def test_counted():
-    assert [counted(1, "frame"), counted(0, "frame"), counted(1200, "scene")] == ["1 frame", "0 frames", "1,200 scenes"]
-
-
 @pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.26, "0.3 s"), (59.0, "59.0 s"), (59.97, "1 min 00 s"), (61.0, "1 min 01 s"), (7322.0, "2 h 02 min")],
+    ("text", "values", "printed"),
+    [
+        (lambda number: counted(number, "frame"), [1, 0, 1200], ["1 frame", "0 frames", "1,200 frames"]),
+        (
+            duration,
+            [0.26, 59.0, 59.97, 61.0, 7322.0],
+            ["0.3 s", "59.0 s", "1 min 00 s", "1 min 01 s", "2 h 02 min"],
+        ),
+        (file_size, [4e5, 9.9e8, 3.44e9], ["0 MB", "990 MB", "3.4 GB"]),
+        (
+            plain,
+            [None, True, 0.25, -0.0, 3, "x", [1, 2.5], list(range(9)), {"a": 1}],
+            ["", "yes", "0.25", "0", "3", "x", "1, 2.5", "0, 1, …, 8 (9)", "1 entries"],
+        ),
+    ],
 )
-def test_duration(seconds, text):
-    assert duration(seconds) == text
-
-
-def test_file_size():
-    assert [file_size(size) for size in (4e5, 9.9e8, 3.44e9)] == ["0 MB", "990 MB", "3.4 GB"]
-
-
-def test_plain():
-    values = (None, True, 0.25, -0.0, 3, "x", [1, 2.5], list(range(9)), {"a": 1})
-    assert [*map(plain, values)] == ["", "yes", "0.25", "0", "3", "x", "1, 2.5", "0, 1, …, 8 (9)", "1 entries"]
+def test_numbers_as_people_read_them(text, values, printed):
+    assert [text(value) for value in values] == printed

@@ -1,4 +1,4 @@
-"""Comparison over scenes: pairing, seeds, adjustment, and what too few scenes allow."""
+"""Comparison over scenes: pairing, seeds, families, what few scenes allow; tests against scipy and statsmodels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,19 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from coliags_plugin.results.comparisons import common_scenes, compare_with_rivals, scene_means, spread
+from coliags_plugin.results.comparisons import (
+    cohen_dz,
+    common_scenes,
+    compare_with_rivals,
+    holm,
+    rank_biserial,
+    scene_means,
+    smallest_p,
+    spread,
+    t_interval,
+    t_test_p,
+    wilcoxon_p,
+)
 
 
 def one_seed(values):
@@ -71,13 +83,6 @@ def test_p_values_are_adjusted_for_the_family():
     assert [rows[name].wilcoxon_holm for name in ("x", "y")] == pytest.approx(expected[:2].tolist())
 
 
-def test_lower_is_better_turns_the_lead():
-    values = {"ours": one_seed([1.0, 2.0]), "rival": one_seed([3.0, 3.0])}
-    (lower,), (higher,) = (compare_with_rivals(values, "ours", which) for which in (False, True))
-    assert (lower.lead, lower.better_on) == (1.5, 2)
-    assert (higher.lead, higher.better_on) == (-1.5, 0)
-
-
 def test_every_pair_is_compared_on_its_own_scenes():
     values = {
         "ours": one_seed([9.0] * 8),
@@ -111,17 +116,74 @@ def test_ties_give_no_star_below_what_is_possible():
     assert row.stars == "*"
 
 
-leads_of_scenes = st.lists(st.integers(-50, 50).map(float), min_size=6, max_size=9)
+# Tests and effect sizes
+
+probabilities = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9)
+#: Multiples of 1/8, so that ties, zeros and their negatives are exact.
+differences = st.lists(st.integers(-40, 40).map(lambda k: k / 8), min_size=2, max_size=8).map(np.array)
 
 
+@pytest.mark.parametrize("p_values", [[0.01], [0.04, 0.01, 0.01, 0.9], [0.3, 0.02, 0.0, 1.0, 0.011, 0.02]])
+def test_holm_is_that_of_statsmodels(p_values):
+    assert holm(p_values) == pytest.approx(multipletests(p_values, method="holm")[1].tolist())
+
+
+@pytest.mark.parametrize(
+    ("scenes", "p"), [(1, 1.0), (3, 0.25), (5, 0.0625), (6, 0.03125), (7, 0.015625), (8, 0.0078125)]
+)
+def test_smallest_p_is_reached_where_one_method_always_wins(scenes, p):
+    assert smallest_p(scenes) == p
+    assert wilcoxon_p(np.arange(1.0, scenes + 1)) == pytest.approx(p)
+
+
+@pytest.mark.parametrize("size", [6, 8, 10])
+def test_wilcoxon_counts_sign_changes(size):
+    """The exact p, by enumeration of all of them."""
+    sample = np.random.default_rng(size).normal(0.3, 1.0, size)
+    signs = np.array(np.meshgrid(*[[1.0, -1.0]] * size)).reshape(size, -1)
+    ranks = stats.rankdata(np.abs(sample))
+    exact = np.mean(np.abs(ranks @ signs) >= abs((np.sign(sample) * ranks).sum()) - 1e-9)
+    assert wilcoxon_p(sample) == pytest.approx(exact)
+    assert wilcoxon_p(np.append(sample, 0.0)) == pytest.approx(exact), "zeros are dropped"
+
+
+@settings(deadline=None, max_examples=25)
+@given(differences, st.sampled_from([0.125, 0.5, 3.0, 1024.0]))
+def test_swap_and_scale(sample, factor):
+    """Swapping the methods flips effects and keeps p; another unit keeps both."""
+    for test in (wilcoxon_p, t_test_p):
+        p = test(sample)
+        assert test(-sample) == (None if p is None else pytest.approx(p))
+        assert test(factor * sample) == (None if p is None else pytest.approx(p))
+    for effect in (cohen_dz, rank_biserial):
+        size = effect(sample)
+        assert effect(-sample) == (None if size is None else pytest.approx(-size))
+        assert effect(factor * sample) == (None if size is None else pytest.approx(size))
+    low, high = t_interval(sample)
+    assert t_interval(-sample) == pytest.approx((-high, -low))
+    assert t_interval(factor * sample) == pytest.approx((factor * low, factor * high))
+
+
+def test_effect_sizes_by_hand():
+    sample = np.array([1.0, 2.0, 3.0, -4.0])
+    assert cohen_dz(sample) == pytest.approx(0.5 / np.sqrt(29 / 3))
+    assert rank_biserial(sample) == pytest.approx((1 + 2 + 3 - 4) / 10)
+    assert [rank_biserial(np.array(each)) for each in ([0.0] * 3, [0.0, 1.0, 2.0])] == [0.0, 1.0]
+    for value in (0.0, 0.1, -3.7):
+        equal = np.full(7, value)
+        assert (t_test_p(equal), cohen_dz(equal)) == (None, None)
+        assert t_interval(equal) == pytest.approx((value, value))
+
+
+@pytest.mark.thorough  # statsmodels collects garbage in every call, half a second among the objects of a whole suite
 @settings(deadline=None, max_examples=20)
-@given(leads_of_scenes)
-def test_swapping_reference_and_rival(leads):
-    values = {"one": one_seed(leads), "other": one_seed([0.0] * len(leads))}
-    ((there,), (back,)) = (compare_with_rivals(values, name, True) for name in ("one", "other"))
-    assert there.lead == -back.lead
-    assert there.tests.wilcoxon == pytest.approx(back.tests.wilcoxon)
-    assert there.tests.rank_biserial == pytest.approx(-back.tests.rank_biserial)
-    assert there.tests.interval == pytest.approx((-back.tests.interval[1], -back.tests.interval[0]))
-    assert there.stars == back.stars
-    assert there.better_on + back.better_on == sum(lead != 0 for lead in leads)
+@given(probabilities, st.integers(0, 4))
+def test_holm_counts_those_of_the_family_that_are_not_there_as_one(p_values, more):
+    expected = multipletests([*p_values, *[1.0] * more], method="holm")[1][: len(p_values)]
+    assert holm(p_values, len(p_values) + more) == pytest.approx(expected.tolist())
+
+
+def test_the_t_interval_is_scipys():
+    sample = np.random.default_rng(5).gamma(2.0, size=8)
+    reference = stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)
+    assert t_interval(sample) == pytest.approx((reference.low, reference.high))

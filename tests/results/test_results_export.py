@@ -61,15 +61,11 @@ def test_two_different_results_of_one_run_are_refused(runs):
         find_results([runs])
 
 
-def test_folders_without_results_and_missing_files_are_refused(runs, tmp_path):
+def test_what_is_missing_or_damaged_is_named(runs, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no results"):
-        find_results([runs, tmp_path / "empty"])
-    with pytest.raises(InputError, match="there is no file"):
-        find_results([tmp_path / "gone"])
-
-
-def test_a_damaged_file_in_a_folder_is_named(runs):
+    for path, match in ((tmp_path / "empty", "holds no results"), (tmp_path / "gone", "there is no file")):
+        with pytest.raises(InputError, match=match):
+            find_results([runs, path])
     (runs / "cut.json").write_text((runs / "others/any name.json").read_text()[:900])
     with pytest.raises(InputError, match=r"cut\.json is cut off"):
         find_results([runs])
@@ -116,12 +112,9 @@ def test_show_prints_means_and_costs(runs, capsys):
     assert run("results", "show", runs) == 0
 
 
-def test_export_writes_csv(runs, tmp_path):
+def test_export_writes_csv_and_refuses_what_cannot_be_written(runs, tmp_path, capsys):
     assert run("results", "export", runs, "--output", tmp_path / "new/table.csv") == 0
     assert len((tmp_path / "new/table.csv").read_text().splitlines()) == 1 + 6 + 9
-
-
-def test_export_refuses_what_cannot_be_written(runs, tmp_path, capsys):
     (tmp_path / "folder.csv").mkdir()
     assert "is a folder" in refused(capsys, "results", "export", runs, "--output", tmp_path / "folder.csv")
     under_a_file = runs / "one/state.json/table.csv"

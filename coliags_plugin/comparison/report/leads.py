@@ -11,8 +11,14 @@ from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
-from coliags_plugin.results.comparisons import LEVELS, PairedTests, RivalComparison, compare_with_rivals
-from coliags_plugin.results.paired import FEWEST_SCENES, smallest_p
+from coliags_plugin.results.comparisons import (
+    FEWEST_SCENES,
+    LEVELS,
+    PairedTests,
+    RivalComparison,
+    compare_with_rivals,
+    smallest_p,
+)
 
 #: The reference where it is among the methods.
 PREFERRED = "coliags"
