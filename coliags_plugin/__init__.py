@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin._version import __version__
 
 if TYPE_CHECKING:
-    from coliags_plugin.api.comparing import ablate, compare, variant
-    from coliags_plugin.api.reconstructing import reconstruct
-    from coliags_plugin.api.reports import report
+    from coliags_plugin.api.comparing import ablate, compare, report, variant
     from coliags_plugin.api.runs import Run, load_run
-    from coliags_plugin.api.scenes import load_scene, make_phantom
+    from coliags_plugin.api.scenes import load_scene, make_phantom, reconstruct
     from coliags_plugin.api.training import import_splats, train
 
 __all__ = [
@@ -30,11 +28,9 @@ __all__ = [
 
 #: Names of the API by its modules.
 _MODULES = {
-    "comparing": ("ablate", "compare", "variant"),
-    "reconstructing": ("reconstruct",),
-    "reports": ("report",),
+    "comparing": ("ablate", "compare", "report", "variant"),
     "runs": ("Run", "load_run"),
-    "scenes": ("load_scene", "make_phantom"),
+    "scenes": ("load_scene", "make_phantom", "reconstruct"),
     "training": ("import_splats", "train"),
 }
 

@@ -1,4 +1,4 @@
-"""Reading, making and measuring of scenes in one call."""
+"""Reading, making, measuring and reconstruction of scenes, each in one call."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from coliags_plugin.config.assignments import assignments
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.pipeline.procedure.run import FinishedProcedure
+    from coliags_plugin.pipeline.stages import Record
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
 
 
@@ -83,3 +85,57 @@ def measure_scene_coverage(
     chosen, folder = validated(CoverageSettings, settings or {}, "coverage option"), Path(output)
     check_free(folder, overwrite)
     return measure_scene(open_recording(Path(data)), read_mesh(Path(mesh)), folder, chosen, overwrite)
+
+
+def reconstruct(
+    video: str | Path,
+    output: str | Path,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    mask: str | Path | None = None,
+    device: str = "auto",
+    overwrite: bool = False,
+    executor: str | None = None,
+    jobs: int | None = None,
+    threads: int | None = None,
+    ray_address: str | None = None,
+) -> Record | FinishedProcedure:
+    """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
+
+    What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
+
+    Args:
+        video: Video file, folder of one with its calibration, folder of images, or folder of a scene with poses.
+        output: Folder of the results.
+        settings: Of the stages by key path, for instance ``{"steps": 5000, "diameter": 40.0, "frames.every": 2}``.
+        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
+        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
+        overwrite: Repeat stages that were made with other settings, and what follows them.
+        executor: ``local``: in worker processes of this machine, sub-maps at the same time; ``ray``: of a Ray cluster.
+            None: in this process, one after the other, unless ``jobs`` are given.
+        jobs: Worker processes at a time; None: one per CPU, or per GPU.
+        threads: CPU threads of each; None: the CPUs divided by the jobs.
+        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
+
+    Returns:
+        The record: what each stage made, with which options, in what time. Of a video that is longer than a segment
+        (``frames.segment``): its segments, each with a record.
+
+    Raises:
+        InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.
+        InterruptedRunError: Ctrl-C in training, after the state was saved.
+    """
+    from coliags_plugin.config.assignments import settings_of
+    from coliags_plugin.engine.devices import choose_device
+    from coliags_plugin.engine.progress import progress_callback
+    from coliags_plugin.execution.choice import ExecutionOptions
+    from coliags_plugin.pipeline.reconstruct import reconstruct as run
+    from coliags_plugin.pipeline.settings import ReconstructionSettings
+
+    chosen = settings_of(ReconstructionSettings, assignments(settings))
+    by_workers = executor is not None or jobs is not None
+    execution = ExecutionOptions(jobs, threads, device, executor or "local", ray_address) if by_workers else None
+    masked = None if mask is None else Path(mask)
+    with progress_callback() as progress:
+        where = choose_device("cpu" if by_workers else device)
+        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, execution)

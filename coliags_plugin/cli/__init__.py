@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 
@@ -14,7 +14,6 @@ from coliags_plugin._version import __version__
 from coliags_plugin.cli.arguments import Runnable
 from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
 from coliags_plugin.cli.depth import DepthCommand
-from coliags_plugin.cli.hints import hint
 from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
 from coliags_plugin.cli.making_runs import EvaluateCommand, ImportCommand, TrainCommand
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, ListCommand
@@ -24,7 +23,7 @@ from coliags_plugin.cli.results import ReportCommand, ResultsCommand
 from coliags_plugin.cli.run_outputs import CoverageCommand, ExportCommand, MeshCommand, RenderCommand, ViewCommand
 from coliags_plugin.cli.scenes import DataCommand, PhantomCommand
 from coliags_plugin.core.decoder_messages import separate_stderr
-from coliags_plugin.core.errors import ReportedError
+from coliags_plugin.core.errors import ReportedError, did_you_mean
 
 Command = (
     Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
@@ -102,3 +101,30 @@ def run_command(command: Runnable) -> int:
         sys.stderr.close()
         return 1
     return 0
+
+
+def hint(argv: Sequence[str], commands: Any) -> str:
+    """The command that an unknown one resembles most, or else the option of its command; empty without one.
+
+    ``commands`` is the union of the commands.
+    """
+    if not argv:
+        return ""
+    kinds = {name.name: kind for kind, name in map(get_args, get_args(commands))}
+    if argv[0] not in kinds:
+        return did_you_mean(argv[0], kinds)
+    kind = kinds[argv[0]]
+    fields = get_type_hints(kind, include_extras=True)
+    if (inner := fields.get("subcommand")) is not None:
+        return hint(argv[1:], get_args(inner)[0])
+    known = {option for field in fields.items() for option in _options(*field)}
+    unknown = (word.partition("=")[0] for word in argv if word.startswith("--"))
+    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
+
+
+def _options(field: str, kind: Any) -> Iterator[str]:
+    """The spellings of a field of a command as an option; none of a positional argument."""
+    metadata = getattr(kind, "__metadata__", ())
+    if tyro.conf.Positional not in metadata:
+        names = [name for each in metadata if (name := getattr(each, "name", None))] or [field.replace("_", "-")]
+        yield from (f"--{prefix}{name}" for name in names for prefix in ("", "no-"))

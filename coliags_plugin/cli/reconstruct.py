@@ -71,7 +71,7 @@ class ReconstructCommand:
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
-        from coliags_plugin.api.reconstructing import reconstruct
+        from coliags_plugin.api.scenes import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.pipeline.procedure.run import FinishedProcedure
         from coliags_plugin.pipeline.stages import PAGE_FILE

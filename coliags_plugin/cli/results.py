@@ -45,7 +45,7 @@ class ReportCommand:
 
     def run(self) -> None:
         """Write the report and print the paths."""
-        from coliags_plugin.api.reports import report
+        from coliags_plugin.api.comparing import report
         from coliags_plugin.comparison.report.report import FORMATS
 
         named = tuple(name for name in self.format if name != "all") or FORMATS[:1]

@@ -181,8 +181,7 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
 
 def report(context: StageContext) -> StageOutcome:
     """Write the report of the run."""
-    from coliags_plugin.comparison.report.page import Choices
-    from coliags_plugin.comparison.report.report import write_report
+    from coliags_plugin.comparison.report.report import Choices, write_report
     from coliags_plugin.engine.run_folder import RunFolder
 
     protocol = RunFolder(context.run).method().config.protocol

@@ -112,6 +112,7 @@ def environment(assets: Path) -> Environment:
     loader = FileSystemLoader(assets)
     made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     functions = (columns_of, drawn, enumerate, sentence, style_classes, unit_text)
+    made.tests["a"] = lambda block, kind: kind in (each.__name__ for each in type(block).__mro__)
     made.globals |= {"dash": DASH, **{function.__name__: function for function in functions}}
     return made
 

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from coliags_plugin.reporting.numbers import Direction, column_decimals, number_text, plain, ranks_of, unit_text
 
@@ -104,8 +104,6 @@ class Table:
     count: str = ""  # what it is about, behind the title: for instance ``8 scenes``
     name: str = ""  # identifier, unique on a page: part of labels and file names
 
-    kind: ClassVar[str] = "table"
-
     @property
     def cells(self) -> list[list[TableCell]]:
         """One cell per row and column."""
@@ -134,8 +132,6 @@ class Paragraph:
     text: str
     hint: bool = True
 
-    kind: ClassVar[str] = "paragraph"
-
 
 @dataclass(frozen=True)
 class Bullet:
@@ -153,16 +149,12 @@ class Bullets:
     items: Sequence[Bullet]
     warning: bool = False
 
-    kind: ClassVar[str] = "bullets"
-
 
 @dataclass(frozen=True)
 class FactList:
     """Facts in a column, names to the left of values; says so where there are none."""
 
     facts: Sequence[Fact]
-
-    kind: ClassVar[str] = "facts"
 
 
 @dataclass(frozen=True)
@@ -190,8 +182,6 @@ class Image:
     caption: str
     wide: bool = False  # whether it takes the page's width, on white
 
-    kind: ClassVar[str] = "image"
-
 
 @dataclass(frozen=True)
 class Chart:
@@ -206,8 +196,6 @@ class Chart:
     markers: bool = False  # whether to draw a dot at every point
     legend: bool = False  # whether the names of the series stand below it
     group: str = ""  # name of the charts that a switch of the page shows together; empty: always shown
-
-    kind: ClassVar[str] = "chart"
 
     @property
     def has_points(self) -> bool:
@@ -234,8 +222,6 @@ class ColorBar:
     label: str  # the quantity
     name: str  # identifier, unique on a page
 
-    kind: ClassVar[str] = "bar"
-
 
 Figure = Image | Chart | ColorBar
 
@@ -248,8 +234,6 @@ class Figures:
     title: str = ""  # above them
     legend: Sequence[str] = ()  # names of the styles 0, 1, ... of charts, above them.
 
-    kind: ClassVar[str] = "figures"
-
 
 @dataclass(frozen=True)
 class Template:
@@ -257,8 +241,6 @@ class Template:
 
     file: str  # name of the file in ``reporting/assets``
     values: Mapping[str, Any] = field(default_factory=dict)  # by the names that the template uses
-
-    kind: ClassVar[str] = "template"
 
 
 @dataclass(frozen=True)
@@ -269,8 +251,6 @@ class Folded:
     blocks: Sequence[Block]
     is_open: bool = False
 
-    kind: ClassVar[str] = "folded"
-
 
 @dataclass(frozen=True)
 class Section:
@@ -280,8 +260,6 @@ class Section:
     blocks: Sequence[Block]  # sections among them have smaller headings
     screen_only: bool = False  # whether only the HTML page has it
     name: str = ""  # identifier, unique on a page; empty: none
-
-    kind: ClassVar[str] = "section"
 
 
 Block = Paragraph | Bullets | FactList | Table | Figures | Template | Folded | Section

@@ -231,7 +231,8 @@ class _Latex(_Markdown):
     def _raised(self, mark: str) -> str:
         return f"$^{{{mark}}}$"
 
-    _stars = _raised
+    def _stars(self, stars: str) -> str:
+        return self._raised(stars)
 
     def _number(self, cell: TableCell) -> str:
         text = _MINUS.sub("$-$", self._escaped(cell.text))

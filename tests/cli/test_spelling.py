@@ -12,8 +12,7 @@ import pytest
 import tyro
 
 from coliags_plugin._version import __version__
-from coliags_plugin.cli import Command
-from coliags_plugin.cli.hints import hint
+from coliags_plugin.cli import Command, hint
 from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 

@@ -1,23 +1,68 @@
-"""Reports of evaluated runs as HTML, Markdown, LaTeX, CSV and JSON."""
+"""Reports of evaluated runs as HTML, Markdown, LaTeX, CSV and JSON: their pages, made of a study."""
 
 from __future__ import annotations
 
+from base64 import b64encode
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from coliags_plugin.comparison.report.page import Choices, per_frame_csv, screen_page, text_page
+from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_blocks
+from coliags_plugin.comparison.report.comparability import cautions
+from coliags_plugin.comparison.report.costs import cost_table
+from coliags_plugin.comparison.report.leads import (
+    EXPLANATION,
+    PREFERRED,
+    choose_reference,
+    compare,
+    is_decided,
+    lead_table,
+    statistics_text,
+)
+from coliags_plugin.comparison.report.metric_tables import check_columns, means_table, metric_columns
+from coliags_plugin.comparison.report.provenance import provenance_section
 from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.study import MissingResult, Part, Study
+from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
 from coliags_plugin.reporting.json_values import page_values
-from coliags_plugin.reporting.model import Section
+from coliags_plugin.reporting.model import (
+    Block,
+    Column,
+    Fact,
+    Folded,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    Template,
+)
+from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.reporting.text_formats import latex_text, markdown_text
+from coliags_plugin.results.tables import csv_text, frame_rows
+
+_TIMES = "\N{MULTIPLICATION SIGN}"
+#: Scenes listed by name; of more, only their number is given.
+_LISTED = 12
 
 Format = Literal["html", "markdown", "latex", "csv", "json"]
 
 FORMATS: tuple[Format, ...] = get_args(Format)
 SUFFIXES: dict[Format, str] = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the reader of a report chooses."""
+
+    columns: Sequence[str] = ()  # metrics to show, in this order; empty: the default ones
+    reference: str | None = None  # what others are compared with; None: coliags, or else the best
+    title: str | None = None  # heading; None: made from methods and scenes
+    note: str | None = None  # remark under the heading
+    frames: int = 4  # held-out views to show per scene and test set, beside the worst ones
 
 
 def write_report(
@@ -53,3 +98,143 @@ def write_report(
         else:
             atomic_write(file, latex_text(text) if each == "latex" else markdown_text(text))
     return [*files.values()]
+
+
+def text_page(study: Study, choices: Choices) -> Page:
+    """The page without what only a screen shows."""
+    check_columns(study, choices.columns)
+    reference = choose_reference(study, choices.reference)
+    return Page(
+        title=choices.title if choices.title is not None else _title(study),
+        sections=[
+            _metrics(study, choices, reference),
+            _missing(study.missing),
+            Section("Costs", [cost_table(study)]),
+            _scenes(study, choices),
+        ],
+        facts=[*_facts(study), Fact("How the metrics are computed", study.protocol.description, wide=True)],
+        note=choices.note or "",
+        cautions=cautions(study),
+    )
+
+
+def screen_page(text: Page, study: Study, choices: Choices, scene: Section | None = None) -> Page:
+    """The whole page, for HTML: the text page with views, charts and provenance, and a scene to fly through."""
+    reference = choose_reference(study, choices.reference)
+    metrics, missing, costs, scenes = text.sections
+    sections = [
+        metrics,
+        missing,
+        view_section(study, reference, choices.frames),
+        *([] if scene is None else [scene]),
+        profile_section(study),
+        Section("Training", [*costs.blocks, *training_blocks(study)]),
+        scenes,
+        _frames(study),
+        provenance_section(study),
+    ]
+    return replace(text, sections=sections)
+
+
+def _title(study: Study) -> str:
+    scenes = study.scenes
+    where = scenes[0] if len(scenes) == 1 else counted(len(scenes), "scene")
+    if len(study.methods) == 1:
+        return f"{study.methods[0]} on {where}"
+    return f"{len(study.methods)} methods compared on {where}"
+
+
+def _facts(study: Study) -> list[Fact]:
+    scenes, results = study.scenes, [run.result for run in study.runs]
+    sizes = dict.fromkeys(result.scene.size for result in results)
+    versions = dict.fromkeys(str(result.software.get("package_version") or "") for result in results)
+    seeds = sorted({result.seed for result in results})
+    frames = {part.title: sum(len(part.frames(scene)) for scene in part.scenes) for part in study.parts}
+    splits = dict.fromkeys(part.split for part in study.parts)
+    facts = {
+        "Scene" if len(scenes) == 1 else "Scenes": ", ".join(scenes) if len(scenes) <= _LISTED else str(len(scenes)),
+        "Methods": ", ".join(study.methods),
+        "Seeds" if len(seeds) > 1 else "Seed": ", ".join(map(str, seeds)),
+        "Split": ", ".join(filter(None, splits)),
+        "Held-out frames": "; ".join(f"{count} {title}" for title, count in frames.items()),
+        "Image size": ", ".join(f"{width} {_TIMES} {height} px" for width, height in sizes),
+        "Protocol": f"{study.protocol.name}, version {study.protocol.version}",
+        "Evaluated with": ", ".join(f"coliags_plugin {version}" for version in versions if version),
+    }
+    return [Fact(name, value) for name, value in facts.items()]
+
+
+def _metrics(study: Study, choices: Choices, reference: str) -> Section:
+    text = "Means over the frames of each set."
+    if len(study.scenes) > 1:
+        text = "Means over the scenes of each set, of each the mean over its frames."
+    text += " ↑ higher is better, ↓ lower is better."
+    if len(study.methods) > 1:
+        text += " Best in bold, second underlined, by the printed digits; equal values share a rank."
+    blocks: list[Block] = [Paragraph(text)]
+    for part in study.parts:
+        # What holds for several parts is said once.
+        blocks += [block for block in _part_blocks(part, choices, reference) if block not in blocks]
+    return Section("Metrics", blocks)
+
+
+def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
+    columns = metric_columns(part, choices.columns)
+    compared = {column.key: compare(part, column, reference) for column in columns}
+    blocks: list[Block] = [means_table(part, columns, comparisons=compared)]
+    shown = [column for column in columns if column.shown and compared[column.key]]
+    if shown:
+        chosen = choices.reference is not None or reference == PREFERRED or is_decided(part.study, reference)
+        blocks += [Paragraph(text) for text in statistics_text(part.study, compared[shown[0].key], reference, chosen)]
+    if shown and len(part.scenes) > 1:
+        leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
+        blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))
+    return blocks
+
+
+def _scenes(study: Study, choices: Choices) -> Section:
+    tables: dict[str, list[Table]] = {scene: [] for scene in study.scenes}
+    for part in study.parts if len(tables) > 1 else ():
+        columns = metric_columns(part, choices.columns)
+        for scene in part.scenes:
+            tables[scene].append(means_table(part, columns, scene))
+    return Section("Every scene", [Folded(scene, own) for scene, own in tables.items() if own])
+
+
+def _frames(study: Study) -> Section:
+    """PSNR along every video, and all values as CSV."""
+    download = {
+        "name": "per_frame.csv",
+        "data": b64encode(per_frame_csv(study).encode()).decode("ascii"),
+        "text": "every metric of every frame, method and seed.",
+    }
+    return Section("Every frame", [Template("download.html", download), *frame_charts(study)], screen_only=True)
+
+
+def per_frame_csv(study: Study) -> str:
+    """One line per scene, test set, frame, method and seed, one column per metric; empty where there is no value."""
+    rows = (
+        [run.scene, run.result.scene.split, set_name, frame, run.method, run.result.seed, *values]
+        for run in study.runs
+        for set_name, frame, *values in frame_rows(run.result, study.metrics)
+    )
+    return csv_text(["scene", "split", "set", "frame", "method", "seed", *study.metrics], rows)
+
+
+def _missing(missing: Sequence[MissingResult]) -> Section:
+    blocks: list[Block] = [Paragraph("Means and tests leave these out.")] if missing else []
+    unfinished = Counter(one.method for one in missing if one.reason is None)
+    if unfinished:
+        each = ", ".join(f"{method} ({count})" for method, count in unfinished.items())
+        blocks.append(Paragraph(f"{counted(unfinished.total(), 'cell')} not finished: {each}."))
+    failed = [one for one in missing if one.reason is not None]
+    if failed:
+        columns = [
+            Column("method", "Method", words=True),
+            Column("scene", "Scene", words=True),
+            Column("seed", "Seed"),
+            Column("reason", "Reason", words=True),
+        ]
+        rows = [{"method": one.method, "scene": one.scene, "seed": one.seed, "reason": one.reason} for one in failed]
+        blocks.append(Table("Failed", columns, rows, count=counted(len(rows), "cell"), name="failed"))
+    return Section("Cells without a result", blocks)

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.page import Choices
-from coliags_plugin.comparison.report.report import write_report
+from coliags_plugin.comparison.report.report import Choices, write_report
 from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from coliags_plugin.comparison.report.leads import p_text
-from coliags_plugin.comparison.report.page import Choices, per_frame_csv, text_page
 from coliags_plugin.comparison.report.published import _C3VD_FRAMES
+from coliags_plugin.comparison.report.report import Choices, per_frame_csv, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.comparison.report.study import MissingResult
 from coliags_plugin.core.errors import InputError

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.comparison.report.page import Choices
-from coliags_plugin.comparison.report.report import write_report
+from coliags_plugin.comparison.report.report import Choices, write_report
 from tests.comparison.report.made import made_scenes, write_comparison, write_run
 
 pytestmark = pytest.mark.thorough

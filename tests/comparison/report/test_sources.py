@@ -7,7 +7,7 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from coliags_plugin.comparison.report.leads import compare
-from coliags_plugin.comparison.report.page import Choices, text_page
+from coliags_plugin.comparison.report.report import Choices, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Column, Paragraph

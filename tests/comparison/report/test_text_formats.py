@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from coliags_plugin.comparison.report.page import Choices, text_page
+from coliags_plugin.comparison.report.report import Choices, text_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.reporting.html_page import html_blocks
 from coliags_plugin.reporting.model import Column, Folded, Page, Section, Table, TableCell
