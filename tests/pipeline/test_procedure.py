@@ -157,7 +157,7 @@ KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0
 OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
 
 
-def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers, done, monkeypatch):
+def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers):
     executor = workers()
     made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     names = list(made.segments)
@@ -175,10 +175,15 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
     assert any("show nothing that can be followed" in each.reason for each in made.procedure.joins)
     assert Procedure.read(tmp_path / "out") == made.procedure
     assert "segment-000" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    before = list(done)
-    executor = workers()
+
+
+@pytest.mark.thorough
+def test_what_is_done_is_not_done_again_and_other_cuts_begin_anew(long_video, tmp_path, workers, done):
+    workers()
+    names = list(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS).segments)
+    before, executor = list(done), workers()
     cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    assert executor.tasks == [] and done == before, "what is done is not done again"
+    assert executor.tasks == [] and done == before
     with pytest.raises(InputError, match="Choose another --output"):
         cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
     workers()
@@ -188,7 +193,7 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
 
 @pytest.mark.thorough
 def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
-    long_video, tmp_path, workers, done, monkeypatch
+    long_video, tmp_path, workers, monkeypatch
 ):
     workers(None, KeyboardInterrupt())
     with pytest.raises(InterruptedRunError):
@@ -278,7 +283,7 @@ def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
 
 
 @pytest.mark.thorough
-def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, done, capsys):
+def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, capsys):
     argv = ["reconstruct", long_video, "--output", tmp_path / "out"]
     argv += [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
     executor = workers()
