@@ -19,7 +19,7 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source, opened_recording
 from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
 from coliags_plugin.pipeline.page import write_index
-from coliags_plugin.pipeline.procedure.run import FinishedProcedure, is_procedure, reconstruct_procedure
+from coliags_plugin.pipeline.procedure.run import FinishedProcedure, reconstruct_procedure
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -58,7 +58,7 @@ def reconstruct(
         settings = settings.model_copy(update={"sfm": sfm})
         video = frame_source(source, Span(frames.first, frames.last, frames.seek))
         log.info("%s", forecast(video, settings))
-        is_long = is_procedure(video, frames.every, frames.segment)
+        is_long = video.expected > frames.segment * frames.every
     else:
         _refuse_unused(source, settings, mask)
     context = StageContext(out, source, settings, mask, data_format, device, progress)

@@ -69,11 +69,6 @@ def write_text(path: Path, trajectory: Trajectory) -> None:
     _write(path, trajectory, text=True)
 
 
-def recognise(path: Path) -> bool:
-    """Whether a folder holds a sparse model."""
-    return model_suffix(path, _NEEDED) is not None
-
-
 def colmap_poses(camera_to_world: Float[np.ndarray, "N 4 4"]) -> list[pycolmap.Rigid3d]:
     """World-to-camera transforms of camera-to-world matrices. [N, 4, 4]"""
     import pycolmap
@@ -169,5 +164,5 @@ def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intri
 
 
 _KEEPS = frozenset({"names", "intrinsics"})
-FORMAT = Format("colmap", read, write, recognise, keeps=_KEEPS, folder=True)
+FORMAT = Format("colmap", read, write, lambda path: model_suffix(path, _NEEDED) is not None, keeps=_KEEPS, folder=True)
 TEXT_FORMAT = Format("colmap-text", read, write_text, None, keeps=_KEEPS, folder=True)

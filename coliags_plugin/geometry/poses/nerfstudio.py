@@ -78,11 +78,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
     write_json(path, content)
 
 
-def recognise(path: Path) -> bool:
-    """Whether a file begins like a JSON object."""
-    return head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
-
-
 def _matrix(value: Any, place: str) -> np.ndarray:
     """Finite matrix from nested lists of four or three rows. [4, 4]"""
     try:
@@ -137,4 +132,10 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
     return found.pop(), ""
 
 
-FORMAT = Format("nerfstudio", read, write, recognise, keeps=frozenset({"names", "intrinsics"}))
+FORMAT = Format(
+    "nerfstudio",
+    read,
+    write,
+    lambda path: head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"),  # a JSON object
+    keeps=frozenset({"names", "intrinsics"}),
+)

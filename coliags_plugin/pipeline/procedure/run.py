@@ -41,11 +41,6 @@ class FinishedProcedure:
     segments: dict[str, Record]  # by name
 
 
-def is_procedure(source: FrameSource, every: int, segment: int) -> bool:
-    """Whether a video is too long for one segment, by what its header says."""
-    return source.expected > segment * every
-
-
 def reconstruct_procedure(
     context: StageContext, execution: ExecutionOptions, overwrite: bool = False
 ) -> FinishedProcedure:
