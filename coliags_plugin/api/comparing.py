@@ -66,7 +66,7 @@ def compare(
     from coliags_plugin.comparison.compare import carry_out, make_request
     from coliags_plugin.comparison.folder import ComparisonFolder
     from coliags_plugin.comparison.named_files import Variant
-    from coliags_plugin.execution.choice import ExecutionOptions
+    from coliags_plugin.execution.executors import ExecutionOptions
 
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     scenes = [scenes] if isinstance(scenes, (str, Path)) else scenes

@@ -59,7 +59,7 @@ class ComparisonArguments:
         """Compare and print a summary; exit with status 1 if a cell failed."""
         from coliags_plugin.comparison.compare import carry_out, dry_run, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
-        from coliags_plugin.execution.choice import ExecutionOptions
+        from coliags_plugin.execution.executors import ExecutionOptions
 
         request = arguments.call(make_request, self, methods=methods, overrides=self.set)
         folder = ComparisonFolder(self.output)

@@ -12,8 +12,7 @@ from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.core.errors import InterruptedRunError
-from coliags_plugin.execution.choice import ExecutionOptions
-from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.executors import ExecutionOptions, Executor
 from coliags_plugin.execution.queue import Job, JobQueue, Phase
 from coliags_plugin.results.reading import read_result
 

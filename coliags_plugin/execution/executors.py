@@ -1,4 +1,4 @@
-"""Executors: where worker processes run."""
+"""Executors: where worker processes run, and their choice from options."""
 
 from __future__ import annotations
 
@@ -8,15 +8,32 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO
+from typing import Literal, get_args
 
-from coliags_plugin.execution.tasks import Task, TaskOutcome, read_outcome
+from coliags_plugin.core.errors import check_name, check_number
+from coliags_plugin.engine.devices import find_device
+from coliags_plugin.execution.tasks import Task, TaskOutcome
+
+ExecutorName = Literal["local", "ray"]
 
 #: For workers to save and end once they were asked to, seconds; then they are killed.
 STOPPING = 45.0
 _PAUSE = 0.1
+
+
+@dataclass(frozen=True)
+class ExecutionOptions:
+    """Where and how tasks are run."""
+
+    jobs: int | None = None  # tasks at a time; None: one per CPU, or per GPU
+    threads: int | None = None  # CPU threads of each; None: the CPUs divided by the tasks at a time
+    device: str = "auto"
+    executor: str = "local"
+    ray_address: str | None = None  # HOST:PORT of the head; None: RAY_ADDRESS, or the cluster of this machine
+    retries: int = 2  # how often a task whose process died is tried again
+    save_seconds: float = 60.0  # largest time between two checkpoints of training
 
 
 class Executor(ABC):
@@ -46,6 +63,38 @@ class Executor(ABC):
         """Have all tasks save their state and end."""
 
 
+def make_executor(options: ExecutionOptions) -> Executor:
+    """The executor that options name."""
+    check_number("jobs", options.jobs)
+    check_number("threads", options.threads)
+    check_number("retries", options.retries, least=0)
+    check_name("executor", options.executor, get_args(ExecutorName))
+    if options.executor == "ray":
+        from coliags_plugin.execution.ray_executor import RayExecutor
+
+        return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
+    cpus, gpus = available_cpus(), _gpus(options.device)
+    jobs = options.jobs or len(gpus) or cpus
+    return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
+
+
+def available_cpus() -> int:
+    """CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _gpus(device: str) -> list[str]:
+    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``: all, or the one that ``device`` numbers."""
+    import torch
+
+    chosen = find_device(device)
+    if chosen.type != "cuda":
+        return []
+    visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
+    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
+    return [found[chosen.index]] if ":" in device else found
+
+
 class LocalExecutor(Executor):
     """Processes on this machine, spread over the GPUs with these identifiers, as in ``CUDA_VISIBLE_DEVICES``."""
 
@@ -66,21 +115,18 @@ class LocalExecutor(Executor):
     def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """See :class:`Executor`."""
         until = time.monotonic() + seconds
-        while True:
-            ended = {slot: worker for slot, worker in self._workers.items() if worker.ended}
-            if ended or time.monotonic() >= until:
+        while not (ended := [slot for slot, worker in self._workers.items() if worker.ended]):
+            if time.monotonic() >= until:
                 break
             time.sleep(_PAUSE)
-        for slot in ended:
-            del self._workers[slot]
-        return [(worker.task, worker.outcome()) for worker in ended.values()]
+        return [(worker.task, worker.outcome()) for worker in map(self._workers.pop, ended)]
 
     def stop(self) -> None:
         """See :class:`Executor`."""
-        for worker in self._workers.values():
-            worker.ask_to_stop()
         until = time.monotonic() + STOPPING
         try:
+            for worker in self._workers.values():
+                worker.ask_to_stop()
             for worker in self._workers.values():
                 worker.wait_or_kill(until - time.monotonic())
         except KeyboardInterrupt:
@@ -107,6 +153,8 @@ class LocalWorker:
                 stdout=subprocess.PIPE,
                 stderr=messages,
                 env=environment,
+                encoding="utf-8",
+                errors="replace",
                 start_new_session=True,  # Ctrl-C reaches this process alone, which then asks its workers to stop
             )
 
@@ -117,31 +165,19 @@ class LocalWorker:
 
     def outcome(self) -> TaskOutcome:
         """How it ended; waits until it has."""
-        printed = _pipe(self._process.stdout).read()
-        returncode = self._process.wait()
-        self._close()
-        return read_outcome(returncode, printed.decode(errors="replace"))
+        printed, _ = self._process.communicate()
+        return TaskOutcome.read(self._process.returncode, printed)
 
     def ask_to_stop(self) -> None:
         """Have it save its state and end."""
         with suppress(BrokenPipeError):
-            _pipe(self._process.stdin).close()
+            if self._process.stdin is not None:
+                self._process.stdin.close()
 
     def wait_or_kill(self, seconds: float) -> None:
         """Wait until it has ended, or kill it."""
-        try:
-            self._process.wait(max(0.0, seconds))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._close()
-
-    def _close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            _pipe(pipe).close()
-
-
-def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
-    if pipe is None:
-        raise ValueError("the process has no such pipe")
-    return pipe
+        with self._process:
+            try:
+                self._process.wait(max(0.0, seconds))
+            except subprocess.TimeoutExpired:
+                self._process.kill()

@@ -32,6 +32,8 @@ _VANISHING = 60.0
 #: For a connection to the cluster's address, seconds.
 _CONNECT = 10.0
 _PAUSE = 0.1
+#: What a node lacks: what was seen, what was expected, and what to do.
+_Fault = tuple[str, str, str]
 #: Ray's errors of tasks that ended without a word, whose own texts are long.
 _DEATHS = {
     "NodeDiedError": "the node died",
@@ -73,17 +75,16 @@ class RayExecutor(Executor):
 
     def check(self, folder: Path, inputs: Sequence[Path]) -> None:
         """Have every node read and write in the folder, and see the inputs."""
-        token = uuid.uuid4().hex
-        folder, inputs = folder.resolve(), [path.resolve() for path in inputs]
-        file = folder / f".storage-{token}"
-        atomic_write(file, token)
+        file = folder.resolve() / f".storage-{uuid.uuid4().hex}"
+        atomic_write(file, "")
         try:
             for node in self._nodes():
-                report = self._ask(node, file, inputs)
-                if report is not None:
-                    _check_node(node, report, file, token)
+                fault = self._ask(node, file, [path.resolve() for path in inputs])
+                if fault is not None:
+                    seen, expected, do = fault
+                    raise InputError(f"node {node['NodeManagerAddress']} {seen}", expected, do)
         finally:
-            for path in folder.glob(f".storage-{token}*"):
+            for path in folder.resolve().glob(f"{file.name}*"):
                 path.unlink(missing_ok=True)
 
     def start(self, task: Task) -> None:
@@ -130,26 +131,26 @@ class RayExecutor(Executor):
     def _nodes(self) -> list[Mapping[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
-    def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> Mapping[str, Any] | None:
-        """What a node sees of a file and of inputs; None where it is gone meanwhile."""
+    def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> _Fault | None:
+        """What a node lacks; None where it lacks nothing, or is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-        inspect = self._ray.remote(_inspect_node).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
-        question = inspect.remote(str(file), [str(path) for path in inputs])
+        look = self._ray.remote(_fault_of_node).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
+        question = look.remote(__version__, str(file), [str(path) for path in inputs])
         try:
-            report: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
+            fault: _Fault | None = self._ray.get(question, timeout=_ANSWER)
         except self._ray.exceptions.RayError as error:
             lost = (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)
             if isinstance(error, lost) and self._is_gone(node):
                 log.warning("node %s is gone", node["NodeManagerAddress"])
                 return None
-            raise InputError(
-                f"node {node['NodeManagerAddress']} cannot run tasks: {_last_line(error)}",
+            return (
+                f"cannot run tasks: {_last_line(error)}",
                 f"coliags_plugin {__version__} on every node",
                 "Install it there in the Python that runs `ray start`",
-            ) from error
-        return report
+            )
+        return fault
 
     def _is_gone(self, node: Mapping[str, Any]) -> bool:
         """Whether a node that runs no tasks is dead, as Ray finds out after a while."""
@@ -170,42 +171,28 @@ class RayExecutor(Executor):
             return TaskOutcome("died", reason or f"{type(error).__name__}: {_last_line(error)}")
 
 
-def _check_node(node: Mapping[str, Any], report: Mapping[str, Any], file: Path, token: str) -> None:
-    """Raise InputError where a node does not see what it should."""
-    name = f"node {node['NodeManagerAddress']}"
-    if report["version"] != __version__:
-        raise InputError(
-            f"{name} has coliags_plugin {report['version']}", f"{__version__}, as here", "Install it there"
-        )
-    answer = file.with_name(f"{file.name}-{node['NodeID']}")
-    read = answer.read_text(encoding="utf-8") if answer.is_file() else None
-    if report["token"] != token or read != token:
-        raise InputError(
-            f"{name} does not see {file.parent}: {report['error'] or 'it is another folder there'}",
+def _fault_of_node(version: str, file: str, inputs: Sequence[str]) -> _Fault | None:
+    """On a node: whether it has this version, can write beside a file that the driver wrote, and sees the inputs."""
+    if version != __version__:
+        return f"has coliags_plugin {__version__}", f"{version}, as here", "Install it there"
+    path = Path(file)
+    try:
+        path.rename(path.with_name(f"{path.name}-seen"))
+        path.with_name(f"{path.name}-seen").rename(path)
+    except OSError as problem:
+        return (
+            f"does not see {path.parent}, or cannot write there: {problem.strerror or problem}",
             "an --output on storage that all machines share, under the same path",
             "Choose a folder on a network file system",
         )
-    if report["missing"]:
-        raise InputError(
-            f"{name} does not see {', '.join(report['missing'])}",
+    missing = [each for each in inputs if not Path(each).exists()]
+    if missing:
+        return (
+            f"does not see {', '.join(missing)}",
             "inputs on storage that all machines share, under the same paths",
             "Copy them there, or give a path that all machines share",
         )
-
-
-def _inspect_node(file: str, inputs: Sequence[str]) -> dict[str, Any]:
-    """On a node: read a token, write it into a file beside it, and look for inputs."""
-    import ray
-
-    path, node = Path(file), ray.get_runtime_context().get_node_id()
-    token, error = None, ""
-    try:
-        token = path.read_text(encoding="utf-8")
-        path.with_name(f"{path.name}-{node}").write_text(token, encoding="utf-8")
-    except OSError as problem:
-        error = problem.strerror or str(problem)
-    missing = [path for path in inputs if not Path(path).exists()]
-    return {"version": __version__, "token": token, "error": error, "missing": missing}
+    return None
 
 
 def _work(task: Task) -> dict[str, Any]:

@@ -15,11 +15,9 @@ from typing import ClassVar
 
 from coliags_plugin.core.errors import InterruptedRunError, NotWritableError
 from coliags_plugin.core.locks import locked
-from coliags_plugin.execution.choice import ExecutionOptions
-from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.executors import ExecutionOptions, Executor
 from coliags_plugin.execution.queue import Job, JobQueue
-from coliags_plugin.execution.tasks import Task, TaskOutcome
-from coliags_plugin.execution.worker import attempt, run_worker
+from coliags_plugin.execution.tasks import Task, TaskOutcome, attempt, run_worker
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.page import write_index

@@ -16,7 +16,7 @@ from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.worker import CellTask, work
-from coliags_plugin.execution.choice import ExecutionOptions
+from coliags_plugin.execution.executors import ExecutionOptions
 from coliags_plugin.execution.tasks import TaskOutcome
 from tests.task_list import TaskList
 

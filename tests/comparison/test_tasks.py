@@ -14,7 +14,7 @@ import pytest
 from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.execution.executors import LocalExecutor
-from coliags_plugin.execution.tasks import TaskOutcome, outcome_line, read_outcome
+from coliags_plugin.execution.tasks import TaskOutcome
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_the_environment_names_threads_package_and_variables(task):
     "outcome", [TaskOutcome("done"), TaskOutcome("failed", 'no "depth"\nat all'), TaskOutcome("stopped", "x")]
 )
 def test_an_outcome_is_read_from_the_last_line(outcome):
-    assert read_outcome(1, f"noise\n{outcome_line(outcome)}\n") == outcome
+    assert TaskOutcome.read(1, f"noise\n{outcome.line()}\n") == outcome
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_an_outcome_is_read_from_the_last_line(outcome):
     ],
 )
 def test_a_process_that_says_nothing_has_died(returncode, printed, reason):
-    assert read_outcome(returncode, printed) == TaskOutcome("died", reason)
+    assert TaskOutcome.read(returncode, printed) == TaskOutcome("died", reason)
 
 
 def test_a_scene_that_is_gone_is_the_reason(task):
