@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
+from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import ComparisonCell, Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
@@ -96,41 +96,42 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
     executor = make_executor(options)
     cells = _plan_cells(request, folder)
     with folder.held():
-        finished = folder.finished()
-        missing = {cell.scene.name: cell.scene for cell in cells if finished.of(cell) is None}
+        missing = {cell.scene.name: cell.scene for cell in cells if folder.done(cell) is None}
         if any(not scene.is_there for scene in missing.values()):
             with progress_callback() as progress:
                 make_phantoms(list(missing.values()), progress)
             cells = make_cells(request, folder.recorded_fingerprint)
-        log.info("%s", _states(cells, folder, finished).title)
-        scenes = {cell.scene.path for cell in cells if finished.of(cell) is None}
+        log.info("%s", _states(cells, folder).title)
+        scenes = {cell.scene.path for cell in cells if folder.done(cell) is None}
         if scenes:
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
-        failures = CellRuns(folder, executor, options, cells, finished).run()
-        results = [result for cell in cells if (result := finished.of(cell)) is not None]
+        failures = CellRuns(folder, executor, options, cells).run()
+        results = [result for cell in cells if (result := folder.done(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
 
 
 def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:
     """What :func:`carry_out` would do with each cell; writes nothing."""
-    return _states(_plan_cells(request, folder), folder, folder.finished())
+    cells = _plan_cells(request, folder)
+    folder.read_results()
+    return _states(cells, folder)
 
 
-def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder, finished: FinishedCells) -> DisplayTable:
+def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> DisplayTable:
     """Every cell with its state: done, resume, new, same (as an earlier cell), or scene to make."""
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
     for cell in cells:
         key, step, changed = "" if cell.keys is None else cell.keys.result, 0, ""
-        if finished.of(cell) is not None:
+        if folder.done(cell) is not None:
             state = "done"
         elif key in keys:
             state = "same"
         elif not cell.scene.is_there:
             state = "scene to make"
         else:
-            step, changed = folder.run(cell).step, finished.changes(cell)
+            step, changed = folder.run(cell).step, folder.changes(cell)
             state = "resume" if step else "new"
         keys |= {key} if key else set()
         steps = f"{step} of {cell.steps}" if step else str(cell.steps)

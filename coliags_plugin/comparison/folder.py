@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
@@ -45,6 +45,8 @@ class ComparisonFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
+        self._by_path: dict[Path, Result] = {}  # as of read_results, and added since
+        self._by_key: dict[str, Result] = {}
 
     def run(self, cell: ComparisonCell) -> RunFolder:
         """Run folder of a cell."""
@@ -64,9 +66,10 @@ class ComparisonFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other comparisons out of the folder, which is created where it is missing."""
+        """Keep other comparisons out of the folder, which is created where it is missing, and read its results."""
         self.check()
         with locked(self.path / ".lock", self.path):
+            self.read_results()
             yield
 
     def check(self) -> None:
@@ -95,7 +98,7 @@ class ComparisonFolder:
             return
         if before.steps != request.steps:
             earlier = "each method's own steps" if before.steps is None else f"--steps {before.steps}"
-            now = "each method's own" if request.steps is None else request.steps
+            now = request.steps or "each method's own"
             raise InputError(f"{self.path} compares runs of {earlier}, not {now}", "the same, or another --output")
         values = [list(parse_assignments(each).items()) for each in (before.overrides, request.overrides)]
         if values[0] != values[1]:  # 1e-3 is 0.001
@@ -165,23 +168,58 @@ class ComparisonFolder:
             return None
         return entry.fingerprint if entry.phantom == scene.phantom_record else None
 
-    def finished(self) -> FinishedCells:
-        """The results that are there; files that are half-written or damaged are reported and left as they are.
+    def read_results(self) -> None:
+        """Read the results that are there; half-written and damaged files are reported and left as they are.
 
         Raises:
             NewerResultError: A file is from a newer version.
         """
-        results = {}
-        for path in sorted((self.path / RESULTS).rglob("*.json")):
-            if path.name.startswith("."):
-                continue
+        self._by_path.clear()
+        for path in sorted((self.path / RESULTS).rglob("[!.]*.json")):
             try:
-                results[path] = read_result(path)
+                self._by_path[path] = read_result(path)
             except NewerResultError:
                 raise
             except InputError as error:
                 log.warning("not counted as done: %s", error)
-        return FinishedCells(self, results)
+        self._by_key = {result.key: result for result in self._by_path.values()}
+
+    def done(self, cell: ComparisonCell) -> Result | None:
+        """The result of a cell; under another name where another method is the same; None where it is not done."""
+        if cell.keys is None:
+            return None
+        own = self._by_path.get(self.result(cell))
+        return own if own is not None and own.key == cell.keys.result else self._by_key.get(cell.keys.result)
+
+    def changes(self, cell: ComparisonCell) -> str:
+        """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
+        if cell.keys is None:
+            return ""
+        place, seed = self.result(cell).parent, f"s{cell.seed}-"
+        former = [each for path, each in self._by_path.items() if path.parent == place and path.name.startswith(seed)]
+        former = [each for each in former if each.protocol.name == cell.protocol]
+        if not former:
+            return ""
+        changed = {
+            "code": all(each.software.get("code") != code_key() for each in former),
+            "method": all(training_config(each.config) != training_config(cell.config.model_dump()) for each in former),
+            "data": all(each.scene.fingerprint != cell.keys.fingerprint for each in former),
+        }
+        return ", ".join(name for name, differs in changed.items() if differs) or "protocol, or how it was run"
+
+    def add(self, cell: ComparisonCell, result: Result) -> None:
+        """Count a cell as done, and write its results file where that is not there.
+
+        The result may be that of a cell whose method is the same under another name.
+        """
+        path, name = self.result(cell), cell.variant.name
+        if result.method != name:
+            provenance = {**result.provenance, "same_as": result.method}
+            result = result.model_copy(update={"method": name, "provenance": provenance})
+        if self._by_path.get(path) != result:
+            write_result(path, result)
+        self._by_path[path] = self._by_key[result.key] = result
+        self.failure(cell).unlink(missing_ok=True)
 
     def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> FailureRecord:
         """Record why a cell failed; a full disk loses the record, not the reason."""
@@ -194,56 +232,3 @@ class ComparisonFolder:
         except InputError as error:
             log.warning("%s", error)
         return failure
-
-
-class FinishedCells:
-    """The results of a folder, by path, for cells to be looked up by their keys."""
-
-    def __init__(self, folder: ComparisonFolder, results: Mapping[Path, Result]) -> None:
-        self._folder = folder
-        self._by_path = dict(results)
-        self._by_key = {result.key: result for result in results.values()}
-
-    def __len__(self) -> int:
-        """Number of results in the folder."""
-        return len(self._by_path)
-
-    def of(self, cell: ComparisonCell) -> Result | None:
-        """The result of a cell; under another name where another method is the same; None where it is not done."""
-        if cell.keys is None:
-            return None
-        own = self._by_path.get(self._folder.result(cell))
-        if own is not None and own.key == cell.keys.result:
-            return own
-        return self._by_key.get(cell.keys.result)
-
-    def changes(self, cell: ComparisonCell) -> str:
-        """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
-        if cell.keys is None:
-            return ""
-        place = self._folder.result(cell).parent
-        seed = f"s{cell.seed}-"
-        former = [one for path, one in self._by_path.items() if path.parent == place and path.name.startswith(seed)]
-        former = [one for one in former if one.protocol.name == cell.protocol]
-        if not former:
-            return ""
-        changed = {
-            "code": all(one.software.get("code") != code_key() for one in former),
-            "method": all(training_config(one.config) != training_config(cell.config.model_dump()) for one in former),
-            "data": all(one.scene.fingerprint != cell.keys.fingerprint for one in former),
-        }
-        return ", ".join(name for name, differs in changed.items() if differs) or "protocol, or how it was run"
-
-    def add(self, cell: ComparisonCell, result: Result) -> None:
-        """Count a cell as done, and write its results file where that is not there.
-
-        The result may be that of a cell whose method is the same under another name.
-        """
-        path, name = self._folder.result(cell), cell.variant.name
-        if result.method != name:
-            provenance = {**result.provenance, "same_as": result.method}
-            result = result.model_copy(update={"method": name, "provenance": provenance})
-        if self._by_path.get(path) != result:
-            write_result(path, result)
-        self._by_path[path] = self._by_key[result.key] = result
-        self._folder.failure(cell).unlink(missing_ok=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config import registry
@@ -45,25 +46,33 @@ def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> t
         raise InputError("\n".join(errors_with_origins(error, tree, noun))) from error
 
 
+def _valid(check: Callable[[Any], object]) -> AfterValidator:
+    """Of a value that a function takes, which raises InputError where it is not valid; None is."""
+
+    def validated(value: Any) -> Any:
+        try:
+            _ = value is None or check(value)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return value
+
+    return AfterValidator(validated)
+
+
+_DataFormat = Annotated[str | None, _valid(registry.datamanagers.get)]
+
+
 class BenchmarkScene(Settings):
     """One scene of a benchmark: a folder of a dataset, or a phantom that is made when it is missing."""
 
     folder: str | tuple[str, ...] = Field(
         (), description="Folder in that of the benchmark's data, or names of which one is there; default: its name."
     )
-    phantom: dict[str, Any] | None = Field(None, description="Settings of the phantom to make (docs/phantom.md 6).")
-    format: str | None = Field(None, description="Data manager; default: the benchmark's.")
+    phantom: Annotated[dict[str, Any] | None, _valid(phantom_settings)] = Field(
+        None, description="Settings of the phantom to make (docs/phantom.md 6)."
+    )
+    format: _DataFormat = Field(None, description="Data manager; default: the benchmark's.")
     options: dict[str, Any] = Field(default_factory=dict, description="Options of the data manager.")
-
-    @field_validator("phantom")
-    @classmethod
-    def _valid_phantom(cls, options: dict[str, Any] | None) -> dict[str, Any] | None:
-        if options is not None:
-            try:
-                phantom_settings(options)
-            except InputError as error:
-                raise ValueError(str(error)) from error
-        return options
 
     def folders(self, name: str) -> tuple[str, ...]:
         """Names that the scene's folder may have, the first being the usual one."""
@@ -79,7 +88,7 @@ class BenchmarkSettings(Settings):
     """Content of a benchmark's file."""
 
     description: str  # one line
-    format: str | None = None  # data manager of all scenes; null: recognised from the files
+    format: _DataFormat = None  # data manager of all scenes; null: recognised from the files
     split: str | None = None  # of all scenes; null: the data manager's
     options: dict[str, Any] = Field(default_factory=dict)  # options of the data manager, for all scenes
     scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # by name
@@ -93,16 +102,6 @@ class BenchmarkSettings(Settings):
             if not _NAME.fullmatch(name):
                 raise ValueError(f"scene name '{name}': expected letters, digits, dots, hyphens and underscores")
         return {name: {} if entry is None else entry for name, entry in scenes.items()}
-
-    @field_validator("format")
-    @classmethod
-    def _known_format(cls, name: str | None) -> str | None:
-        if name is not None:
-            try:
-                registry.datamanagers.get(name)
-            except InputError as error:
-                raise ValueError(str(error)) from error
-        return name
 
 
 @dataclass(frozen=True)

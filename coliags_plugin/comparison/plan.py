@@ -11,7 +11,6 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from coliags_plugin.comparison.named_files import Variant
-from coliags_plugin.comparison.plan_file import file_name
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
@@ -91,7 +90,7 @@ class ComparisonCell:
         return self._path(self.known_keys.result)
 
     def _path(self, key: str) -> PurePosixPath:
-        return PurePosixPath(self.scene_label, file_name(self.variant.name), f"s{self.seed}-{key[:_SHORT]}")
+        return PurePosixPath(self.scene_label, self.variant.name.replace("/", "-"), f"s{self.seed}-{key[:_SHORT]}")
 
 
 @dataclass(frozen=True)
@@ -116,39 +115,36 @@ class Request:
 
 def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[ComparisonCell]:
     """All cells, those of one seed together, and within it those of one scene."""
-    protocol = registry.protocols.get(request.protocol)
-    fingerprints = _Fingerprints(recorded or (lambda scene: None))
+    version = registry.protocols.get(request.protocol).version
+    known: dict[tuple[str, str, str], str] = {}  # fingerprints, each computed once for each way of reading a scene
+
+    def fingerprint(scene: SceneSource, component: Component) -> str | None:
+        if not scene.is_there:
+            return None if recorded is None else recorded(scene)
+        key = (str(scene.path), component.name, component.settings.model_dump_json())
+        if key not in known:
+            known[key] = data_manager(component, scene.path).fingerprint(scene.path)
+        return known[key]
+
     cells: list[ComparisonCell] = []
     with _warnings_only():
         for scene, split, variant in product(request.scenes, request.splits or (None,), request.variants):
-            cells += _seeds(request, scene, split, variant, fingerprints, protocol.version)
+            chosen = () if split is None else (f"datamanager.split={split}",)
+            overrides = (*scene.overrides, *chosen, *variant.overrides, *request.changes)
+            config = _config(scene, variant.method, overrides)
+            own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
+            label = scene.name if used in (None, own) else f"{scene.name}-{used}"
+            data, plain = fingerprint(scene, config.datamanager), config.model_dump()
+            for seed in request.seeds:
+                keys = None
+                if data is not None:
+                    keys = CellKeys(
+                        data,
+                        training_key(plain, data, seed, code_key()),
+                        result_key(plain, data, seed, code_key(), request.protocol, version),
+                    )
+                cells.append(ComparisonCell(variant, scene, label, seed, request.protocol, overrides, config, keys))
     return sorted(cells, key=lambda cell: request.seeds.index(cell.seed))
-
-
-def _seeds(
-    request: Request,
-    scene: SceneSource,
-    split: str | None,
-    variant: Variant,
-    fingerprints: _Fingerprints,
-    protocol_version: int,
-) -> Iterator[ComparisonCell]:
-    chosen = () if split is None else (f"datamanager.split={split}",)
-    overrides = (*scene.overrides, *chosen, *variant.overrides, *request.changes)
-    config = _config(scene, variant.method, overrides)
-    own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
-    label = scene.name if used in (None, own) else f"{scene.name}-{used}"
-    fingerprint = fingerprints.of(scene, config.datamanager)
-    plain = config.model_dump()
-    for seed in request.seeds:
-        keys = None
-        if fingerprint is not None:
-            keys = CellKeys(
-                fingerprint,
-                training_key(plain, fingerprint, seed, code_key()),
-                result_key(plain, fingerprint, seed, code_key(), request.protocol, protocol_version),
-            )
-        yield ComparisonCell(variant, scene, label, seed, request.protocol, overrides, config, keys)
 
 
 def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> MethodConfig:
@@ -165,22 +161,6 @@ def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> Method
 def _split(config: MethodConfig) -> str | None:
     """The split that a config's data manager makes; None where it knows none."""
     return getattr(config.datamanager.settings, "split", None)
-
-
-class _Fingerprints:
-    """Fingerprints of scenes, each computed once for each way of reading it."""
-
-    def __init__(self, recorded: RecordedFingerprint) -> None:
-        self._recorded = recorded
-        self._known: dict[tuple[str, str, str], str] = {}
-
-    def of(self, scene: SceneSource, component: Component) -> str | None:
-        if not scene.is_there:
-            return self._recorded(scene)
-        key = (str(scene.path), component.name, component.settings.model_dump_json())
-        if key not in self._known:
-            self._known[key] = data_manager(component, scene.path).fingerprint(scene.path)
-        return self._known[key]
 
 
 @contextmanager

@@ -98,8 +98,3 @@ def read_plan(folder: Path) -> ComparisonPlan | None:
     except ValidationError as error:
         key, message, _ = first_error(error)
         raise InputError(f"{file}: {key}: {message}", _EXPECTED) from error
-
-
-def file_name(variant: str) -> str:
-    """A variant's name as part of a path: ``ablations/depth`` is ``ablations-depth``."""
-    return variant.replace("/", "-")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
+from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.plan import ComparisonCell
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.worker import CellTask
@@ -31,17 +31,14 @@ class CellRuns:
         executor: Executor,
         options: ExecutionOptions,
         cells: Sequence[ComparisonCell],
-        finished: FinishedCells,
     ) -> None:
         self.folder, self.executor, self.options = folder, executor, options
-        self.finished, self.failures = finished, list[FailureRecord]()
-        self._count = len(cells)
+        self.failures, self._count = list[FailureRecord](), len(cells)
         self._ended: dict[Phase, int] = {"done": 0, "failed": 0}
         equal: dict[str, list[ComparisonCell]] = {}
         for cell in cells:
-            result = finished.of(cell)
-            if result is not None:
-                finished.add(cell, result)
+            if (result := folder.done(cell)) is not None:
+                folder.add(cell, result)
                 self._ended["done"] += 1
             else:
                 equal.setdefault(cell.known_keys.result, []).append(cell)
@@ -50,7 +47,7 @@ class CellRuns:
         self._queue = JobQueue(executor, options.retries, jobs, total, total - sum(job.size for job in jobs))
 
     def run(self) -> list[FailureRecord]:
-        """Complete all cells, and add their results to the finished ones; returns the failures.
+        """Complete all cells, and add their results to the folder; returns the failures.
 
         Raises:
             InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
@@ -119,7 +116,7 @@ class CellJob(Job):
         """See :class:`Job`."""
         result = read_result(self._runs.folder.result(self._cell))
         for cell in self._equal:
-            self._runs.finished.add(cell, result)
+            self._runs.folder.add(cell, result)
             self._runs.end(cell, "done")
         return ()
 

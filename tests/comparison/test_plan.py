@@ -10,7 +10,6 @@ from coliags_plugin.comparison.compare import make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
-from coliags_plugin.comparison.plan_file import file_name
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager
@@ -69,7 +68,6 @@ def test_places_are_made_of_scene_method_seed_and_key(wall):
     (cell,) = cells(wall, ["ablations/depth"])
     assert str(cell.run_path) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
     assert str(cell.result_path) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"
-    assert file_name("ablations/depth") == "ablations-depth"
 
 
 def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
