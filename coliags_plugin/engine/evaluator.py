@@ -62,7 +62,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     sets = {name: frames for name, frames in scene.test_sets.items() if frames}
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name, against_truth=truth is not None)
-    evaluated = {name: EvaluatedSet(scene.length_unit) for name in sets}
+    evaluated = {name: EvaluatedSet(scene.length_unit, scorer) for name in sets}
     meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
@@ -70,9 +70,10 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 placed = frame.to(trained.device)
                 output = meter.render(partial(scorer.render, trained.model, placed))
                 comparison = scorer.protocol.compare(output, placed)
-                evaluated[set_name].add(placed, comparison, scorer, output.alpha)
+                evaluated[set_name].add(placed, comparison, output.alpha)
                 if refine_poses:
-                    evaluated[set_name].add_refined(placed, refined_scores(trained.model, placed, scorer))
+                    for suffix, scores in refined_scores(trained.model, placed, scorer).items():
+                        evaluated[set_name].add_scores(frame.name, scores, suffix)
                 _write_images(scratch, set_name, frame, comparison)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)

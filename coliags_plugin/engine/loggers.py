@@ -1,9 +1,10 @@
-"""Loggers of the extra ``loggers``: TensorBoard, and Weights & Biases."""
+"""What follows a training run: loggers of the extra ``loggers``, and all followers, none of which can end it."""
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,38 @@ from uuid import uuid4
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.yaml_tree import dump
-from coliags_plugin.contracts import Logger, scalars
+from coliags_plugin.contracts import Follower, Logger, scalars
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject
+
+log = logging.getLogger(__name__)
+
+
+class Followers(Follower):
+    """Tells several followers the same; one that fails is left out from then on, with a warning."""
+
+    def __init__(self, followers: Sequence[Follower]) -> None:
+        self._followers = list(followers)
+
+    def logged(self, row: JsonObject) -> None:
+        """See :class:`Follower`."""
+        self._tell(lambda follower: follower.logged(row))
+
+    def stepped(self, step: int) -> None:
+        """See :class:`Follower`."""
+        self._tell(lambda follower: follower.stepped(step))
+
+    def close(self) -> None:
+        """See :class:`Follower`."""
+        self._tell(lambda follower: follower.close())
+
+    def _tell(self, call: Callable[[Follower], None]) -> None:
+        for follower in tuple(self._followers):
+            try:
+                call(follower)
+            except Exception as error:  # whatever its library raises
+                self._followers.remove(follower)
+                log.warning("training goes on without %s: %s", type(follower).__name__, error)
 
 
 class TensorBoardLogger(Logger):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import product
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import Comparison
+from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import OPAQUE_ALPHA
 from coliags_plugin.core.scenes import Frame, Scene
@@ -42,25 +42,35 @@ SEEN_METRICS = ("psnr", "psnr_gain_fitted", "ssim", "depth_mse", "depth_median_e
 _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "fingerprint", "held_out_used")
 
 
+def further_metrics(scorer: Scorer) -> dict[str, Metric]:
+    """Metrics that only some frames have, by name and in order.
+
+    Those are the protocol's optional ones, those over seen pixels, and those from refined poses.
+    """
+    known = scorer.metrics | scorer.optional_metrics
+    named = {name + SEEN_SUFFIX: name for name in SEEN_METRICS}
+    named |= {name + suffix: name for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS)}
+    return scorer.optional_metrics | {name: known[base] for name, base in named.items() if base in known}
+
+
 class EvaluatedSet:
     """Scores, error profiles and hashes of one test set of a scene, whose unit of length is printed as ``unit``."""
 
-    def __init__(self, unit: str) -> None:
+    def __init__(self, unit: str, scorer: Scorer) -> None:
+        self._scorer = scorer
         self._rows: dict[str, dict[str, float]] = {}
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
         self._profiles = ErrorProfiles(unit)
-        self._optional: tuple[str, ...] = ()
         self._pixels = self._transparent = 0
 
-    def add(self, frame: Frame, comparison: Comparison, scorer: Scorer, alpha: Float[Tensor, "H W"]) -> None:
+    def add(self, frame: Frame, comparison: Comparison, alpha: Float[Tensor, "H W"]) -> None:
         """Score a frame under its protocol and take it up, with its rendered alpha."""
         self._pixels += int(frame.valid.sum())
         self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
-        self._add_scores(frame.name, scorer.score(comparison))
-        self._optional = tuple(scorer.optional_metrics)
+        self.add_scores(frame.name, self._scorer.score(comparison))
         if frame.seen is not None:
-            self._add_scores(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
+            self.add_scores(frame.name, self._scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
         _hash(self._predictions, frame.name, rgb=comparison.rgb, depth=comparison.depth)
         _hash(
             self._truth,
@@ -73,42 +83,23 @@ class EvaluatedSet:
         )
         self._profiles.add(comparison, frame)
 
-    def add_refined(self, frame: Frame, scores: Mapping[str, Scores]) -> None:
-        """Take up the scores of a frame from its refined pose, by the suffixes of their names."""
-        for suffix, scored in scores.items():
-            self._add_scores(frame.name, scored, suffix)
-
-    def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
+    def add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
+        """Take up scores of a frame, under names with a suffix."""
         row = self._rows.setdefault(frame, {})
         row.update({name + suffix: value for name, value in scores.values.items()})
         for name, reason in scores.reasons.items():
             self._reasons.setdefault(name + suffix, reason)
 
     @property
-    def seen_metrics(self) -> list[str]:
-        """Names of the metrics over seen pixels that some frame has."""
-        return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in self._scored]
-
-    @property
-    def refined_metrics(self) -> list[str]:
-        """Names of the metrics from refined poses that some frame has."""
-        names = (name + suffix for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS))
-        return [name for name in names if name in self._scored]
-
-    @property
-    def optional_metrics(self) -> list[str]:
-        """Names of the protocol's optional metrics that some frame has."""
-        return [name for name in self._optional if name in self._scored]
-
-    @property
-    def _scored(self) -> set[str]:
+    def scored(self) -> set[str]:
+        """Names of the metrics that some frame has."""
         return {name for row in self._rows.values() for name in row}
 
-    def record(self, metrics: Iterable[str]) -> SetRecord:
-        """The set's record; the protocol's ``metrics`` are listed even where no frame has one."""
-        rows = self._rows.values()
-        lacking = set(self._optional) - set(self.optional_metrics)
-        names = [*metrics, *self.optional_metrics, *self.seen_metrics, *self.refined_metrics]
+    def record(self) -> SetRecord:
+        """The set's record; the protocol's metrics are listed even where no frame has one."""
+        rows, scored = self._rows.values(), self.scored
+        names = [*self._scorer.metrics, *(name for name in further_metrics(self._scorer) if name in scored)]
+        lacking = self._scorer.optional_metrics.keys() - scored
         return SetRecord(
             frames=tuple(self._rows),
             values={name: tuple(row.get(name) for row in rows) for name in names},
@@ -140,11 +131,13 @@ def run_result(
     protocol, provenance = scorer.protocol, trained.provenance
     config = plain_config(trained.config.model_dump())
     data = trained.scene if truth is None else truth.scene
-    sets = {name: part.record(scorer.metrics) for name, part in evaluated.items()}
+    sets = {name: part.record() for name, part in evaluated.items()}
+    scored = {name for part in evaluated.values() for name in part.scored}
+    metrics = scorer.metrics | {name: each for name, each in further_metrics(scorer).items() if name in scored}
     deviations = _deviations(trained.step, config["schedule"]["steps"], provenance)
     if truth is not None:
         deviations["truth"] = data.provenance.get("fingerprint")
-    if any(part.refined_metrics for part in evaluated.values()):
+    if any(name.endswith(REFINED_SUFFIXES) for name in scored):
         deviations["refined"] = list(REFINED_SUFFIXES)
     return Result(
         key=result_key(
@@ -157,11 +150,17 @@ def run_result(
             deviations,
         ),
         method=trained.method,
-        scene=scene_record(data),
+        scene=_scene_record(data),
         protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
         seed=trained.seed,
         steps=trained.step,
-        metrics=_metrics(scorer, evaluated, data.length_unit),
+        metrics={
+            name: MetricRecord(
+                unit=metric.unit.replace("mm", data.length_unit),
+                direction="higher" if metric.higher_is_better else "lower",
+            )
+            for name, metric in metrics.items()
+        },
         sets=sets,
         metrics_sha256=metrics_sha256(sets),
         cost=_cost(trained, meter),
@@ -183,7 +182,7 @@ def _described(truth: Truth, own: Scene) -> JsonObject:
     return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
 
 
-def scene_record(scene: Scene) -> SceneRecord:
+def _scene_record(scene: Scene) -> SceneRecord:
     """The record of a scene that has a test frame."""
     split = scene.provenance.get("split", "")
     camera = next(frame for frames in scene.test_sets.values() for frame in frames).camera
@@ -194,26 +193,6 @@ def scene_record(scene: Scene) -> SceneRecord:
         train=tuple(frame.name for frame in scene.train),
         size=(camera.width, camera.height),
     )
-
-
-def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -> dict[str, MetricRecord]:
-    seen = {name for part in evaluated.values() for name in part.seen_metrics}
-    optional = {name for part in evaluated.values() for name in part.optional_metrics}
-    metrics = scorer.metrics | {name: metric for name, metric in scorer.optional_metrics.items() if name in optional}
-    records = {
-        name: MetricRecord(
-            unit=metric.unit.replace("mm", unit), direction="higher" if metric.higher_is_better else "lower"
-        )
-        for name, metric in metrics.items()
-    }
-    refined = {name for part in evaluated.values() for name in part.refined_metrics}
-    over_seen = {name + SEEN_SUFFIX: records[name] for name in SEEN_METRICS if name + SEEN_SUFFIX in seen}
-    from_refined = {
-        name + suffix: records[name]
-        for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS)
-        if name + suffix in refined
-    }
-    return records | over_seen | from_refined
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

@@ -26,7 +26,7 @@ from coliags_plugin.core.transfers import sent
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
-from coliags_plugin.engine.following import Followers
+from coliags_plugin.engine.loggers import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
