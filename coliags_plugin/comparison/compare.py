@@ -20,7 +20,8 @@ from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, check_name, check_number, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.execution.executors import ExecutionOptions, make_executor
+from coliags_plugin.execution.executors import ExecutionOptions
+from coliags_plugin.execution.queue import make_executor
 from coliags_plugin.reporting.model import Column, Value
 from coliags_plugin.reporting.text_formats import DisplayTable
 from coliags_plugin.results.record import SEEN_SUFFIX, Result

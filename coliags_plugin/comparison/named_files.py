@@ -60,6 +60,7 @@ def _valid(check: Callable[[Any], object]) -> AfterValidator:
 
 
 _DataFormat = Annotated[str | None, _valid(registry.datamanagers.get)]
+_Phantom = Annotated[dict[str, Any] | None, _valid(phantom_settings)]
 
 
 class BenchmarkScene(Settings):
@@ -68,9 +69,7 @@ class BenchmarkScene(Settings):
     folder: str | tuple[str, ...] = Field(
         (), description="Folder in that of the benchmark's data, or names of which one is there; default: its name."
     )
-    phantom: Annotated[dict[str, Any] | None, _valid(phantom_settings)] = Field(
-        None, description="Settings of the phantom to make (docs/phantom.md 6)."
-    )
+    phantom: _Phantom = Field(None, description="Settings of the phantom to make (docs/phantom.md 6).")
     format: _DataFormat = Field(None, description="Data manager; default: the benchmark's.")
     options: dict[str, Any] = Field(default_factory=dict, description="Options of the data manager.")
 

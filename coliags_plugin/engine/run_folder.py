@@ -280,19 +280,12 @@ class RunFolder:
         """Numbers of the training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
         import numpy as np
 
-        numbers = [_numbers(row) for row in self.log_rows()]
+        from coliags_plugin.contracts import scalars
+
+        steps = [(row["step"], scalars(row)) for row in self.log_rows()]
+        numbers = [{"step": step} | {name.replace("/", "."): each for name, each in row.items()} for step, row in steps]
         names = dict.fromkeys(name for row in numbers for name in row)
         return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
-
-
-def _numbers(row: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    numbers: dict[str, float] = {}
-    for name, value in row.items():
-        if isinstance(value, Mapping):
-            numbers |= _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            numbers[prefix + name] = float(value)
-    return numbers
 
 
 def _last_lines(file: Path) -> list[str]:

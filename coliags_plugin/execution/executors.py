@@ -1,4 +1,4 @@
-"""Executors: where worker processes run, and their choice from options."""
+"""Executors: where worker processes run."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
 
-from coliags_plugin.core.errors import check_name, check_number
-from coliags_plugin.engine.devices import find_device
 from coliags_plugin.execution.tasks import Task, TaskOutcome
-
-ExecutorName = Literal["local", "ray"]
 
 #: For workers to save and end once they were asked to, seconds; then they are killed.
 STOPPING = 45.0
@@ -61,38 +56,6 @@ class Executor(ABC):
     @abstractmethod
     def stop(self) -> None:
         """Have all tasks save their state and end."""
-
-
-def make_executor(options: ExecutionOptions) -> Executor:
-    """The executor that options name."""
-    check_number("jobs", options.jobs)
-    check_number("threads", options.threads)
-    check_number("retries", options.retries, least=0)
-    check_name("executor", options.executor, get_args(ExecutorName))
-    if options.executor == "ray":
-        from coliags_plugin.execution.ray_executor import RayExecutor
-
-        return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
-    cpus, gpus = available_cpus(), _gpus(options.device)
-    jobs = options.jobs or len(gpus) or cpus
-    return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
-
-
-def available_cpus() -> int:
-    """CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _gpus(device: str) -> list[str]:
-    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``: all, or the one that ``device`` numbers."""
-    import torch
-
-    chosen = find_device(device)
-    if chosen.type != "cuda":
-        return []
-    visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
-    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
-    return [found[chosen.index]] if ":" in device else found
 
 
 class LocalExecutor(Executor):

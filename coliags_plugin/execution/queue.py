@@ -1,28 +1,62 @@
-"""A queue of jobs, each a task of a worker process: retries, failures, and a clean stop."""
+"""A queue of jobs, each a task of a worker process: choice of the executor, retries, failures, and a clean stop."""
 
 from __future__ import annotations
 
 import logging
+import os
 import signal
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, get_args
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, check_name, check_number
+from coliags_plugin.engine.devices import find_device
 from coliags_plugin.engine.progress import ProgressReport, log_console
-from coliags_plugin.execution.executors import Executor
+from coliags_plugin.execution.executors import ExecutionOptions, Executor, LocalExecutor
+from coliags_plugin.execution.ray_executor import RayExecutor
 from coliags_plugin.execution.tasks import Ending, Task, TaskOutcome
 
 log = logging.getLogger(__name__)
 
+ExecutorName = Literal["local", "ray"]
 Phase = Literal["waiting", "running", "done", "failed"]
 
 #: Between two reports of progress, seconds.
 POLL_INTERVAL_S = 1.0
 #: Between lines of progress besides those of the jobs, where there is neither a terminal nor a notebook, seconds.
 _PLAIN_LINE_EVERY_S = 60.0
+
+
+def make_executor(options: ExecutionOptions) -> Executor:
+    """The executor that options name."""
+    check_number("jobs", options.jobs)
+    check_number("threads", options.threads)
+    check_number("retries", options.retries, least=0)
+    check_name("executor", options.executor, get_args(ExecutorName))
+    if options.executor == "ray":
+        return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
+    cpus, gpus = available_cpus(), _gpus(options.device)
+    jobs = options.jobs or len(gpus) or cpus
+    return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
+
+
+def available_cpus() -> int:
+    """CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _gpus(device: str) -> list[str]:
+    """Identifiers of the GPUs to use, as in ``CUDA_VISIBLE_DEVICES``: all, or the one that ``device`` numbers."""
+    import torch
+
+    chosen = find_device(device)
+    if chosen.type != "cuda":
+        return []
+    visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
+    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
+    return [found[chosen.index]] if ":" in device else found
 
 
 class Job(ABC):

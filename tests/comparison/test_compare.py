@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import re
 import shutil
 
@@ -176,6 +177,24 @@ def test_a_damaged_checkpoint_is_set_aside(wall, tmp_path, monkeypatch):
     done = compare_inline(["coliags"], [wall], part, steps=6, overrides=overrides)
     assert not done.failures and lives and hashes(part) == hashes(whole)
     assert next(part.glob("runs/wall/coliags/s0-*/checkpoints/damaged-step-000004-*"))
+
+
+def test_every_cell_that_begins_and_ends_is_told(bare, tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        compare_inline(["coliags", "scaffold-gs"], [bare], tmp_path / "new")
+    told = [record.message for record in caplog.records if record.message.startswith("[")]
+    assert told[:1] + told[2:] == [
+        "[0/2] bare coliags seed 0: running",
+        "[1/2] bare scaffold-gs seed 0: running",
+        "[2/2] bare scaffold-gs seed 0: done",
+    ]
+    assert told[1].startswith("[1/2] bare coliags seed 0: failed: ")
+
+
+def test_progress_ends_with_the_last_cell_not_with_its_last_step(wall, tmp_path, capsys):
+    compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("compare")]
+    assert len(lines) == 1 and lines[0].startswith("compare 6/6, took") and lines[0].endswith("2 done")
 
 
 # What fails

@@ -45,3 +45,11 @@ def test_a_run_of_another_version_is_refused_by_name(tmp_path, written):
     for read in (folder.provenance, folder.identity):
         with pytest.raises(InputError, match=r"run of coliags_plugin 0\.1\.0.*Train again, or use the version"):
             read()
+
+
+def test_the_step_of_a_run_is_read_from_the_end_of_its_log(tmp_path):
+    run = RunFolder(tmp_path)
+    assert run.logged_step == 0
+    rows = [{"step": step, "psnr": 20.0, "seconds": 1.0 * step} for step in range(1, 1000)]
+    run.log_file.write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 1000, "ps')
+    assert run.logged_step == 999

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
-from coliags_plugin.execution.executors import ExecutionOptions, Executor, make_executor
-from coliags_plugin.execution.queue import Job
+from coliags_plugin.execution.executors import ExecutionOptions, Executor
+from coliags_plugin.execution.queue import Job, make_executor
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.chain import identity_of
 from coliags_plugin.pipeline.context import StageContext

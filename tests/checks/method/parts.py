@@ -210,11 +210,6 @@ class CrashesWhenMade(Balls):
         return 1 / 0
 
 
-class CrashesInALibrary(Balls):
-    def gaussians(self, camera):
-        return torch.cat([self.means, torch.zeros(2, 2)])
-
-
 class HasAnUngroupedParameter(Balls):
     def __init__(self, settings, count):
         super().__init__(settings, count)
@@ -226,19 +221,37 @@ class SharesAParameter(Balls):
         return {"means": [self.means], "logits": [self.logits, self.means]}
 
 
-class TurnsNaN(Colour):
-    def __call__(self, step):
-        return super().__call__(step) * (torch.nan if step.step == 5 else 1.0)
+def loss(change):
+    """The loss with its value, at a step, changed by a function."""
+
+    class Changed(Colour):
+        def __call__(self, step):
+            return change(super().__call__(step), step)
+
+    return Changed
 
 
-class Maximised(Colour):
-    def __call__(self, step):
-        return -super().__call__(step)
+TurnsNaN = loss(lambda value, step: value * (torch.nan if step.step == 5 else 1.0))
+Maximised = loss(lambda value, step: -value)
+DiffersFromRunToRun = loss(lambda value, step: value * random.uniform(0.9, 1.1))
+TakesGlobalRandomNumbers = loss(lambda value, step: value * (0.9 + 0.2 * torch.rand(())))
+AssumesDepth = loss(lambda value, step: value + 0.0 * step.target.depth.nanmean())
+CountsMaskedPixels = loss(lambda value, step: (step.output.rgb - step.target.rgb).abs().mean())
 
 
-class HasADetachedGroup(Balls):
-    def gaussians(self, camera):
-        return replace(super().gaussians(camera), means=self.means.detach())
+def balls(change):
+    """The field with its Gaussians changed by a function."""
+
+    class Changed(Balls):
+        def gaussians(self, camera):
+            return change(super().gaussians(camera))
+
+    return Changed
+
+
+HasADetachedGroup = balls(lambda made: replace(made, means=made.means.detach()))
+RendersWithChance = balls(lambda made: replace(made, means=made.means + 0.01 * torch.randn(3)))
+CrashesInALibrary = balls(lambda made: torch.cat([made.means, torch.zeros(2, 2)]))
 
 
 class NaNFeature(Balls):
@@ -269,35 +282,34 @@ FlatNormals = spoiling("normals", lambda values: values[..., 0])
 AlphaAboveOne = spoiling(None, lambda output: replace(output, alpha=1.5 * output.alpha))
 
 
-class FixedSize(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        return super().render(field, replace(camera, width=40, height=32), wants, pixels)
-
-
 class CrashesForFreeCameras(Plain):
     def adjust_camera(self, camera, view):
         _ = view.name
         return camera
 
 
-class RendersWithChance(Balls):
-    def gaussians(self, camera):
-        return replace(super().gaussians(camera), means=self.means + 0.01 * torch.randn(3))
+#: Of all outputs.
+NAMES = {name: name for name in CpuRenderer.outputs}
 
 
-class IgnoresUnknownOutputs(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        return super().render(field, camera, [name for name in wants if name in self.outputs], pixels)
+def drawing(draw):
+    """A renderer that is asked for something else: a function is given its method and the arguments."""
+
+    class Drawing(CpuRenderer):
+        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+            return draw(super().render, field, camera, wants, pixels)
+
+    return Drawing
 
 
-class CrashesForUnknownOutputs(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        return super().render(field, camera, [{name: name for name in self.outputs}[name] for name in wants], pixels)
-
-
-class IgnoresPixels(CpuRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        return super().render(field, camera, wants)
+FixedSize = drawing(lambda draw, field, camera, *rest: draw(field, replace(camera, width=40, height=32), *rest))
+IgnoresUnknownOutputs = drawing(
+    lambda draw, field, camera, wants, pixels: draw(field, camera, [name for name in wants if name != "no_such_output"])
+)
+CrashesForUnknownOutputs = drawing(
+    lambda draw, field, camera, wants, pixels: draw(field, camera, [NAMES[name] for name in wants])
+)
+IgnoresPixels = drawing(lambda draw, field, camera, wants, pixels: draw(field, camera, wants))
 
 
 class SwapsPixels(VolumeRenderer):
@@ -317,16 +329,6 @@ class ForgetsABuffer(Balls):
     def gaussians(self, camera):
         made = super().gaussians(camera)
         return replace(made, colors=(made.colors + self.glow).clamp_max(1.0))
-
-
-class DiffersFromRunToRun(Colour):
-    def __call__(self, step):
-        return super().__call__(step) * random.uniform(0.9, 1.1)
-
-
-class TakesGlobalRandomNumbers(Colour):
-    def __call__(self, step):
-        return super().__call__(step) * (0.9 + 0.2 * torch.rand(()))
 
 
 class ForgetsItsPlace(FrameSampler):
@@ -407,16 +409,6 @@ class HasNoExpectedDepth(CpuRenderer):
         if "depth_expected" in wants:
             raise InputError("depth_expected", "another output")
         return super().render(field, camera, wants, pixels)
-
-
-class AssumesDepth(Colour):
-    def __call__(self, step):
-        return super().__call__(step) + 0.0 * step.target.depth.nanmean()
-
-
-class CountsMaskedPixels(Colour):
-    def __call__(self, step):
-        return (step.output.rgb - step.target.rgb).abs().mean()
 
 
 class CrashesAlone(Sampler):
