@@ -61,15 +61,11 @@ class CellRuns:
             ) from error
         return self.failures
 
-    def end(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:
-        """Count a cell that is done or has failed."""
-        self._ended[phase] += 1
-        self.tell(cell, phase, reason)
-
     def tell(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:
-        """Log a cell's phase."""
-        ended = sum(self._ended.values())
-        log.info("[%d/%d] %s: %s%s", ended, self._count, cell.title, phase, reason)
+        """Count a cell that is done or has failed, and log its phase."""
+        if phase in self._ended:
+            self._ended[phase] += 1
+        log.info("[%d/%d] %s: %s%s", sum(self._ended.values()), self._count, cell.title, phase, reason)
 
     def _told(self) -> str:
         running = len(self._queue.running)
@@ -117,12 +113,12 @@ class CellJob(Job):
         result = read_result(self._runs.folder.result(self._cell))
         for cell in self._equal:
             self._runs.folder.add(cell, result)
-            self._runs.end(cell, "done")
+            self._runs.tell(cell, "done")
         return ()
 
     def fail(self, reason: str, attempts: int) -> Sequence[Job]:
         """See :class:`Job`."""
         for cell in self._equal:
             self._runs.failures.append(self._runs.folder.fail(cell, reason, attempts))
-            self._runs.end(cell, "failed", f": {reason}")
+            self._runs.tell(cell, "failed", f": {reason}")
         return ()
