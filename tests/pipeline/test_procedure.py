@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import coliags_plugin as cp
-from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.core.files import not_writable
 from coliags_plugin.core.images import read_rgb

@@ -506,7 +506,7 @@ class _Lengths:
         """Lengths of parameters and buffers, and of counters."""
         field = self._trainer.model.field
         groups = {name: group[0] for name, group in field.parameter_groups().items() if len(group) == 1}
-        parts = {f"parameter group '{name}'": value for name, value in groups.items()}
+        parts: dict[str, Tensor] = {f"parameter group '{name}'": value for name, value in groups.items()}
         parts |= {f"buffer '{name}'": value for name, value in field.named_buffers(recurse=False)}
         counters = self._trainer.strategy.state_dict()
         return tuple(  # type: ignore[return-value]
