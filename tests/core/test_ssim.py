@@ -101,17 +101,6 @@ def test_ignored_pixels_influence_nothing(share, seed):
     assert not a.grad[~mask].any()
 
 
-@few
-@given(share=st.floats(0.05, 1.0), seed=st.integers(0, 99))
-def test_equal_images_score_one_and_the_score_is_symmetric(share, seed):
-    a, b = images(21, 40, seed)
-    mask = torch.rand(21, 40, generator=torch.Generator().manual_seed(seed)) < share
-    mask[3, 3] = True
-    assert ssim(a, a, mask).item() == pytest.approx(1.0, abs=1e-12)
-    assert ssim(a, b, mask).item() == pytest.approx(ssim(b, a, mask).item(), abs=1e-13)
-    assert ssim(a, b, mask).item() <= 1.0
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_full_mask_is_no_mask_to_the_bit(dtype):
     a, b = images(47, 66, dtype=dtype)
@@ -127,16 +116,6 @@ def test_a_hole_leaves_distant_windows_untouched():
     changed = (ssim_map(a, b, mask) != ssim_map(a, b)).any(-1)
     assert changed[15:26, 15:26].all()
     assert changed.sum() == 11 * 11
-
-
-def test_a_hole_does_not_flatter_its_surroundings():
-    """Blacking out both images instead would put a shared edge into the windows and raise the score."""
-    a, b = images(61, 61)
-    mask = torch.rand(61, 61, generator=torch.Generator().manual_seed(5)) < 0.9
-    plain, masked = ssim(a, b), ssim(a, b, mask)
-    blacked = ssim_map(a * mask[..., None], b * mask[..., None])[mask].mean()
-    assert abs(masked - plain) < 0.01
-    assert blacked - plain > 0.02
 
 
 @pytest.mark.parametrize("size", [(1, 6), (3, 50), (33, 64), (65, 97)])

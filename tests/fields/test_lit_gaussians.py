@@ -89,15 +89,11 @@ def test_colours_are_the_closed_form_under_the_camera_s_lamp_and_another():
     assert not torch.allclose(lit.colors, seen.colors, atol=0.05)
 
 
-def test_moving_the_lamp_is_continuous_and_leaves_the_field_itself_alone():
+def test_another_lamp_leaves_the_field_itself_alone():
     field, camera = varied(), camera_at(0, 0, 0)
-    before = field.gaussians(camera).colors
-    nearby = field.with_lamp(Lamp(offset=(1e-4, 0.0, 0.0))).gaussians(camera).colors
-    torch.testing.assert_close(nearby, before, rtol=1e-3, atol=1e-4)
-    assert torch.equal(field.gaussians(camera).colors, before)
-    brighter = field.with_lamp(Lamp(intensity=2.0))
+    before, brighter = field.gaussians(camera).colors, field.with_lamp(Lamp(intensity=2.0))
     torch.testing.assert_close(brighter.gaussians(camera).colors, before * 2 ** (1 / GAMMA), rtol=1e-5, atol=0)
-    assert brighter.albedos is field.albedos
+    assert torch.equal(field.gaussians(camera).colors, before) and brighter.albedos is field.albedos
 
 
 def test_a_lamp_that_shines_away_lights_nothing():

@@ -138,17 +138,6 @@ def test_distortion_is_the_mean_of_its_output():
     assert make("distortion")(output, frame()).item() == pytest.approx(distortion.mean().item(), rel=1e-6)
 
 
-def test_distortion_draws_the_surfels_of_a_ray_together():
-    means = torch.tensor([[0, 0, 4.0], [0, 0, 5.0]], dtype=torch.float64)
-    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(2, 4)
-    gaussians = Gaussians(
-        means.requires_grad_(), quats, torch.full((2, 2), 30.0).double(), torch.full((2,), 0.5).double(),
-        torch.ones(2, 3).double(), torch.arange(2), torch.arange(2),
-    )  # fmt: skip
-    make("distortion")(render_gaussians(gaussians, off_centre(), ("distortion",)), frame()).backward()
-    assert means.grad[0, 2] < 0 < means.grad[1, 2]
-
-
 def test_single_pixels_are_refused():
     output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
     with pytest.raises(InputError, match="whole images"):

@@ -14,23 +14,17 @@ from coliags_plugin.renderers.choice import choose_renderer
 CPU = torch.device("cpu")
 
 
-def test_auto_chooses_cpu_on_the_cpu_and_says_why():
-    chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", CPU)
-    assert chosen.name == "cpu"
-    assert "auto chose cpu" in chosen.reason
-
-
-def test_auto_falls_back_to_torch_and_says_why(monkeypatch):
-    renderer = registry.renderers.get("cpu")
-    monkeypatch.setattr(renderer, "availability", classmethod(lambda cls: Availability(False, "numba is at lunch")))
-    chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", CPU)
-    assert chosen.name == "torch"
-    assert "cpu cannot run here: numba is at lunch" in chosen.reason
-
-
-def test_auto_passes_its_options_on():
+def test_auto_chooses_cpu_on_the_cpu_falls_back_to_torch_and_says_why(monkeypatch):
     renderer = make_component("renderers", {"name": "auto", "background": (0.5, 0.0, 0.0)})
-    assert choose_renderer(renderer, "gaussians3d", CPU).renderer.settings.background == (0.5, 0.0, 0.0)
+    chosen = choose_renderer(renderer, "gaussians3d", CPU)
+    assert chosen.name == "cpu" and "auto chose cpu" in chosen.reason
+    assert chosen.renderer.settings.background == (0.5, 0.0, 0.0)
+    unavailable = classmethod(lambda cls: Availability(False, "numba is at lunch"))
+    monkeypatch.setattr(registry.renderers.get("cpu"), "availability", unavailable)
+    chosen = choose_renderer(renderer, "gaussians3d", CPU)
+    assert chosen.name == "torch" and "cpu cannot run here: numba is at lunch" in chosen.reason
+    with pytest.raises(InputError, match="numba is at lunch"):
+        choose_renderer(make_component("renderers", "cpu"), "gaussians3d", CPU)
 
 
 @pytest.mark.parametrize(
@@ -44,10 +38,3 @@ def test_auto_passes_its_options_on():
 def test_an_impossible_pair_names_both_sides(renderer, message):
     with pytest.raises(InputError, match=message):
         choose_renderer(make_component("renderers", renderer), "radiance", CPU)
-
-
-def test_an_unavailable_renderer_says_why(monkeypatch):
-    renderer = registry.renderers.get("torch")
-    monkeypatch.setattr(renderer, "availability", classmethod(lambda cls: Availability(False, "the moon is full")))
-    with pytest.raises(InputError, match="the moon is full"):
-        choose_renderer(make_component("renderers", "torch"), "gaussians3d", CPU)

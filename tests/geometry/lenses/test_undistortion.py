@@ -53,29 +53,20 @@ def test_nearest_is_within_half_a_source_pixel_and_keeps_16_bits(name):
     assert np.abs(np.stack([column, row], -1) + 0.5 - exact).max() <= 0.5 + 1e-4
 
 
-def test_shrinking_by_a_whole_number_is_the_mean_of_blocks():
+def test_shrinking_by_a_whole_number_is_the_mean_of_blocks_and_the_same_size_changes_nothing():
     lens = STRAIGHT.resized(240, 192)
     image = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
-    undistortion = Undistortion(lens, lens.resized(60, 48).pinhole)
+    nominal = lens.resized(60, 48).pinhole
+    undistortion = Undistortion(lens, nominal)
     assert undistortion.supersampling == 4
     blocks = image.reshape(48, 4, 60, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(undistortion.image(image), blocks, atol=0.51)
-
-
-def test_a_lens_that_is_none_takes_no_more_samples_than_half_the_focal_length():
-    lens = STRAIGHT.resized(240, 192)
-    nominal = lens.resized(60, 48).pinhole
-    halved = Undistortion(lens, replace(nominal, fx=0.5 * nominal.fx, fy=0.5 * nominal.fy))
-    assert halved.supersampling == 8
-    assert Undistortion(lens, replace(nominal, fx=1.0, fy=1.0)).supersampling == 8
-
-
-def test_same_size_without_distortion_changes_nothing():
-    lens = STRAIGHT.resized(240, 192)
-    image = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
-    undistortion = Undistortion(lens, lens.pinhole)
-    np.testing.assert_array_equal(undistortion.image(image), image)
-    np.testing.assert_array_equal(undistortion.nearest(image[..., 0], 0), image[..., 0])
+    same = Undistortion(lens, lens.pinhole)
+    np.testing.assert_array_equal(same.image(image), image)
+    np.testing.assert_array_equal(same.nearest(image[..., 0], 0), image[..., 0])
+    # No more samples than of half the focal length.
+    for fx, fy in ((0.5 * nominal.fx, 0.5 * nominal.fy), (1.0, nominal.fy)):
+        assert Undistortion(lens, replace(nominal, fx=fx, fy=fy)).supersampling == 8
 
 
 def test_fine_stripes_turn_grey_instead_of_aliasing():

@@ -19,17 +19,13 @@ def test_areas_normals_and_centers(two_triangles):
     assert two_triangles.areas == pytest.approx([3.0, 4.0])
     assert two_triangles.normals == pytest.approx(np.array([[0, 0, 1], [0, 1, 0]]))
     assert two_triangles.centers == pytest.approx(np.array([[2 / 3, 1, 0], [2 / 3, 0, 4 / 3]]))
+    flat = TriangleMesh(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]), np.array([[0, 1, 2]]))
+    assert flat.areas == pytest.approx([0.0]) and flat.normals == pytest.approx(np.zeros((1, 3)))
 
 
 def test_the_border_is_the_edges_of_one_triangle(two_triangles):
     assert sorted(map(tuple, two_triangles.border)) == [(0, 3), (1, 2), (2, 0), (3, 1)]
     assert two_triangles.on_border.tolist() == [True, True, True, True, False]
-
-
-def test_a_triangle_without_area_has_a_zero_normal():
-    flat = TriangleMesh(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]), np.array([[0, 1, 2]]))
-    assert flat.areas == pytest.approx([0.0])
-    assert flat.normals == pytest.approx(np.zeros((1, 3)))
 
 
 def test_a_part_keeps_places_and_colours_of_its_triangles_only(two_triangles):
