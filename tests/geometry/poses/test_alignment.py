@@ -255,6 +255,10 @@ def pairs(matches):
 
 
 TWINS = ["left/a.png", "right/a.png", "left/b.png"]
+TIMED = (
+    winding(4, timestamps=np.array([0.0, 0.1, 0.2, 0.3])),
+    winding(5, timestamps=np.array([0.305, 0.099, 0.11, 0.211, 9.0])),
+)
 
 
 @pytest.mark.parametrize(
@@ -265,6 +269,7 @@ TWINS = ["left/a.png", "right/a.png", "left/b.png"]
         (named(["i/a.png", "i/b.png", "i/c"]), named(["c.jpg", "b.jpg", "a"]), "name", [(0, 2), (1, 1), (2, 0)], None),
         (named(TWINS), named(["a.jpg", "b.jpg", "c.jpg"]), "index", None, ("by name: 'a' names several frames",)),
         (named(TWINS), named(TWINS), "name", None, None),
+        (*TIMED, "time", [(1, 1), (2, 3), (3, 0)], None),
         (winding(5), winding(5, timestamps=np.arange(5.0)), "index", [(k, k) for k in range(5)], ()),
         (*[winding(5, timestamps=np.zeros(5))] * 2, "index", None, ("by time: timestamps are repeated",)),
     ],
@@ -274,15 +279,6 @@ def test_by_name_then_time_then_index(first, second, by, expected, skipped):
     assert matches.by == by
     assert expected is None or pairs(matches) == expected
     assert skipped is None or matches.skipped == skipped
-
-
-def test_by_time_each_frame_once_and_the_nearest_first():
-    first = winding(4, timestamps=np.array([0.0, 0.1, 0.2, 0.3]))
-    second = winding(5, timestamps=np.array([0.305, 0.099, 0.11, 0.211, 9.0]))
-    matches = associate(first, second)
-    assert (matches.by, pairs(matches)) == ("time", [(1, 1), (2, 3), (3, 0)])
-    with pytest.raises(InputError, match=r"by time: 2 within 0.006 s"):
-        associate(first, second, tolerance=0.006)
 
 
 @given(seed=SEEDS)
@@ -315,6 +311,7 @@ def test_endogslams_training_frames():
         (named("abc"), named("wxyz"), (), r"by name: no name in common; by index: 3 and 4 poses"),
         (named("abc"), winding(3), ("name",), "by name: not both have names"),
         (winding(2), winding(2), (), "by index: 2 frames match"),
+        (*TIMED, ("time", 0.006), r"by time: 2 within 0.006 s"),
     ],
 )
 def test_what_cannot_be_matched_says_what_was_tried(first, second, how, message):
