@@ -21,7 +21,6 @@ from coliags_plugin.reconstruction.structure.adjustment import (
     Rays,
     adjust,
     held_out_error,
-    median_of_points,
     widest_between,
 )
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
@@ -290,12 +289,6 @@ def test_a_wall_that_moves_is_split_into_stretches_of_which_each_can_give_depth(
     assert sfm._far_apart(centers, 5, 50.0) == []
     ends = [0, *sfm._far_apart(centers, 6, 12.0), 80]
     assert all(np.ptp(centers[first:last, 0]) >= 12.0 for first, last in pairwise(ends))
-
-
-def test_medians_of_points():
-    values = np.array([3.0, np.nan, 1.0, 2.0, np.nan, 5.0, 4.0])
-    points = np.array([0, 0, 0, 0, 2, 3, 3])
-    np.testing.assert_array_equal(median_of_points(values, points, 4), [2.0, 0.0, 0.0, 4.0])
 
 
 def test_the_angle_between_two_rays():

@@ -317,7 +317,7 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act(primitive):
     assert torch.autograd.gradcheck(loss, [getattr(gaussians, k).clone().requires_grad_() for k in names])
 
 
-@pytest.mark.parametrize("name", ["random", "in front of one another"])
+@pytest.mark.parametrize("name", ["random", "in front of one another", "tiny"])
 def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
     gaussians, camera = scene(name)
     cotangents = cotangents_of(gaussians, camera)
@@ -340,14 +340,6 @@ def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
     step = 1e-6
     difference = (loss(torch.tensor(step).double()) - loss(torch.tensor(-step).double())) / (2 * step)
     torch.testing.assert_close(splats.means2d.grad[most, 0], difference, rtol=1e-4, atol=1e-6)
-
-
-def test_the_filter_s_gradient_reaches_the_means_but_not_means2d():
-    gaussians = cast(make_surfels([0.01, 0.02, 4.0], 1e-4, 0.8), grad=True)
-    output = render_gaussians(gaussians, pinhole())
-    (output.alpha * torch.arange(9.0)).sum().backward()
-    assert gaussians.means.grad[0, 0] != 0
-    assert not output.splats.means2d.grad.any() and not gaussians.scales.grad.any()
 
 
 # --- closed forms -----------------------------------------------------------------------------------------------------
