@@ -9,7 +9,6 @@ from coliags_plugin.api.training import import_splats
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.contracts import knows_lamp
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
@@ -149,7 +148,7 @@ def test_is_shown_in_a_browser(method, trained, tmp_path):
         with Viewer(loaded, port=0, threaded=False) as viewer:
             for kind in ("colour", "depth"):
                 assert viewer.picture(loaded.scene.train[1].camera, kind).any()
-            if knows_lamp(loaded.model.field):
+            if loaded.model.field.knows_lamp:
                 assert viewer.picture(loaded.scene.train[1].camera, "colour", "flattened").any()
         if method in OF_GAUSSIANS:
             assert command("view", trained(method), "--output", tmp_path / "page.html", "--device", "cuda") == 0

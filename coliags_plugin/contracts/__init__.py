@@ -9,13 +9,10 @@ from coliags_plugin.contracts.fields import (
     GeometryHead,
     Head,
     HeadNetworks,
-    LampAware,
     LitField,
     RadianceField,
     RadianceLevel,
     RadianceSamples,
-    gaussians_under,
-    knows_lamp,
 )
 from coliags_plugin.contracts.following import Follower, Logger, scalars
 from coliags_plugin.contracts.losses import Loss, LossSettings
@@ -36,7 +33,6 @@ __all__ = [
     "GeometryHead",
     "Head",
     "HeadNetworks",
-    "LampAware",
     "LitField",
     "Logger",
     "Loss",
@@ -54,8 +50,6 @@ __all__ = [
     "TrainedModel",
     "TrainingStep",
     "ViewModule",
-    "gaussians_under",
-    "knows_lamp",
     "log_linear",
     "scalars",
     "steps_text",

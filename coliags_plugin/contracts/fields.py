@@ -65,6 +65,11 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
         return frozenset()
 
     @property
+    def knows_lamp(self) -> bool:
+        """Whether colours depend on where the lamp is, which can be held; default: not."""
+        return False
+
+    @property
     def normals_and_references(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
         """Normals of the Gaussians and those that they should have, for losses; default: None, without such.
 
@@ -91,41 +96,22 @@ class GaussianField(Field[SettingsT]):
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
 
+    def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
+        """:meth:`gaussians` with the lamp held, if there is a light, not moving with the camera; default: the same."""
+        return self.gaussians(camera)
+
     def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
         """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
         return self.gaussians(camera)
 
 
-class LampAware(ABC):
-    """Mixin of Gaussian fields whose colours may depend on where the lamp is."""
+class LitField(GaussianField[SettingsT]):
+    """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether colours depend on where the lamp is, so that :meth:`gaussians_in_light` changes them."""
+        """Always."""
         return True
-
-    @abstractmethod
-    def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
-        """:meth:`GaussianField.gaussians` with the lamp held instead of moving with the camera."""
-
-
-def gaussians_under(field: GaussianField, camera: Camera, light: HeldLight | None) -> Gaussians:
-    """The Gaussians that a camera sees, lit by a held light where their colours depend on the lamp.
-
-    Without a held light, the lamp moves with the camera.
-    """
-    if light is None or not isinstance(field, LampAware):
-        return field.gaussians(camera)
-    return field.gaussians_in_light(camera, light)
-
-
-def knows_lamp(field: Field) -> bool:
-    """Whether the colours of a field depend on where a lamp is that can be held."""
-    return isinstance(field, LampAware) and field.knows_lamp
-
-
-class LitField(GaussianField[SettingsT], LampAware):
-    """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
 
     @abstractmethod
     def with_lamp(self, lamp: Lamp) -> Self:

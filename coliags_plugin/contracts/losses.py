@@ -15,42 +15,6 @@ from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.contracts.training import TrainedModel, TrainingStep
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
-#: Settings of a loss.
-LossSettingsT = TypeVar("LossSettingsT", bound="LossSettings", default="LossSettings")
-
-
-class Loss(ABC, Generic[LossSettingsT]):
-    """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
-
-    Settings: ClassVar[type[LossSettings]]
-    #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
-    needs: ClassVar[frozenset[str]] = frozenset()
-    #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
-    whole_image: ClassVar[bool] = False
-    #: Whether it draws the rendered depth to ``Target.depth`` as to the truth, by confidence weighted at most.
-    trusts_depth: ClassVar[bool] = False
-    #: Whether it reads ``output.splats``, which only splatting renderers deliver.
-    needs_splats: ClassVar[bool] = False
-
-    def __init__(self, settings: LossSettingsT) -> None:
-        self.settings = settings
-
-    @property
-    def wants(self) -> frozenset[str]:
-        """Outputs beyond rgb and alpha that the renderer must deliver."""
-        return frozenset()
-
-    def check(self, model: TrainedModel) -> None:
-        """Check, before training, that the model has what the term reads.
-
-        Raises:
-            InputError: It lacks something.
-        """
-
-    @abstractmethod
-    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term; pixels whose ``step.target.mask`` is False are ignored."""
-
 
 class LossSettings(Settings):
     """Weight of a loss term over the run, and the steps at which it is active.
@@ -84,3 +48,40 @@ class LossSettings(Settings):
         if self.final_weight is None:
             return self.weight
         return max(self.min_weight, log_linear(self.weight, self.final_weight, step / steps))
+
+
+#: Settings of a loss.
+LossSettingsT = TypeVar("LossSettingsT", bound=LossSettings, default=LossSettings)
+
+
+class Loss(ABC, Generic[LossSettingsT]):
+    """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+    #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
+    needs: ClassVar[frozenset[str]] = frozenset()
+    #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
+    whole_image: ClassVar[bool] = False
+    #: Whether it draws the rendered depth to ``Target.depth`` as to the truth, by confidence weighted at most.
+    trusts_depth: ClassVar[bool] = False
+    #: Whether it reads ``output.splats``, which only splatting renderers deliver.
+    needs_splats: ClassVar[bool] = False
+
+    def __init__(self, settings: LossSettingsT) -> None:
+        self.settings = settings
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """Outputs beyond rgb and alpha that the renderer must deliver."""
+        return frozenset()
+
+    def check(self, model: TrainedModel) -> None:
+        """Check, before training, that the model has what the term reads.
+
+        Raises:
+            InputError: It lacks something.
+        """
+
+    @abstractmethod
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term; pixels whose ``step.target.mask`` is False are ignored."""

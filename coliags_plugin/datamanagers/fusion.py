@@ -82,13 +82,8 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return world.astype(np.float32), frame.image.numpy().reshape(-1, 3)[pixels]
 
 
-def read_points(path: Path, count: int, generator: np.random.Generator) -> PointCloud:
-    """At most ``count`` points of a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``)."""
-    return subsampled(load_points(path), count, generator, path)
-
-
 def load_points(path: Path) -> PointCloud:
-    """All points of a PLY or NPZ file."""
+    """All points of a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``)."""
     if not path.is_file():
         raise InputError(f"no file {path}", "a PLY or NPZ file of points in the world of the poses", "Check the path")
     if path.suffix.lower() == ".npz":

@@ -6,6 +6,7 @@ import logging
 import shlex
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,12 +20,11 @@ from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
+from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name
+from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name, with_valid_seen_masks
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.datamanagers.units import FACTORS, Unit, read_unit
@@ -167,19 +167,18 @@ class RecordedDataManager(DataManager):
     ) -> tuple[PointCloud, dict[str, Any]]:
         settings = self.settings
         generator = np.random.default_rng(settings.seed)
-        if settings.initial_points == "file":
-            file = path / settings.points_file
-            points = read_points(file, settings.points_count, generator)
-            return points, self._described_points(file, points, path)
         if settings.initial_points == "none":
             return PointCloud(torch.zeros(0, 3)), {"source": "none", "count": 0}
         has_depth = any(shot.depth is not None for shot in recording.shots)
-        own = recording.own_points
-        if has_depth and (settings.initial_points == "depth" or own is None):
+        own, source = recording.own_points, recording.points_source
+        if settings.initial_points == "file":
+            source = path / settings.points_file
+            own = partial(load_points, source)
+        elif has_depth and (settings.initial_points == "depth" or own is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
             return points, self._described_points("depth of the training frames", points, path)
-        if own is None or recording.points_source is None:
-            missing = POINTS_FILE if recording.points_source is None else recording.points_source.name
+        if own is None or source is None:
+            missing = POINTS_FILE if source is None else source.name
             from_file = "--set datamanager.initial_points=file --set datamanager.points_file=FILE"
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
@@ -187,8 +186,8 @@ class RecordedDataManager(DataManager):
                 f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or {from_file}",
             )
-        points = subsampled(own(), settings.points_count, generator, recording.points_source)
-        return points, self._described_points(recording.points_source, points, path)
+        points = subsampled(own(), settings.points_count, generator, source)
+        return points, self._described_points(source, points, path)
 
     def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> dict[str, Any]:
         name = portable_name(source, scene) if isinstance(source, Path) else source

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from coliags_plugin.config.registry import fields
-from coliags_plugin.contracts import GaussianField, LitField, gaussians_under
+from coliags_plugin.contracts import GaussianField, LitField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
@@ -72,7 +72,7 @@ def render_held(model: Model, camera: Camera, light: HeldLight | None, wants: Se
     """Render a view of a model under a held light, or else the camera's own lamp, without view modules."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     scaled = None if light is None else light.scaled(model.scale)
-    return model.in_scene_units(renderer.draw(gaussians_under(field, camera, scaled), camera, wants))
+    return model.in_scene_units(renderer.draw(field.gaussians_in_light(camera, scaled), camera, wants))
 
 
 def gaussians_of(model: Model) -> GaussianField:

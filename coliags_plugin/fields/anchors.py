@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
-from coliags_plugin.contracts import GaussianField, HeadNetworks, LampAware
+from coliags_plugin.contracts import GaussianField, HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
@@ -48,7 +48,7 @@ class AnchorFieldSettings(Settings):
     voxel_pixels: float = Option(default=2.0, gt=0)
 
 
-class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
+class AnchorField(GaussianField[AnchorFieldSettings]):
     """Anchors with features; two heads decode each visible one into its children (paper, II-A2 and II-C).
 
     Differs from the released ColIAGS code where that is defective (docs/methods.md 6): voxels are of a size that
@@ -182,8 +182,8 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         """Decode the visible anchors (docs/methods.md 3.5)."""
         return self._decoded(camera, None)
 
-    def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
-        """The same with distance and angle of the anchors to the lamp those of a held light."""
+    def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
+        """The same with distance and angle of the anchors to the lamp those of a held light, if there is one."""
         return self._decoded(camera, light)
 
     def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:

@@ -58,7 +58,6 @@ class DiffuseFactorLoss(Loss):
     (docs/rivals/pr-endo.md).
     """
 
-    Settings: ClassVar[type[LossSettings]] = LossSettings
     needs_splats: ClassVar[bool] = True
 
     def check(self, model: TrainedModel) -> None:
@@ -81,7 +80,6 @@ class ScaleVolumeLoss(Loss):
     In scene units cubed (mm^3; squared for surfels), so its weight depends on the unit of length (docs/methods.md 4.4).
     """
 
-    Settings: ClassVar[type[LossSettings]] = LossSettings
     needs_splats: ClassVar[bool] = True
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:

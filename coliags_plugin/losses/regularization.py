@@ -23,8 +23,6 @@ class OpacityLoss(Loss):
     Without it, a dark lumen is matched as well by nothing in front of the black background (docs/methods.md 4.6).
     """
 
-    Settings: ClassVar[type[LossSettings]] = LossSettings
-
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, from 0 (opaque) to 1; 0 where no pixel is valid."""
         return masked_mean(1.0 - step.output.alpha, step.target.mask)
@@ -68,8 +66,6 @@ class DistortionLoss(Loss):
     Depths enter as m = far / (far - near) (1 - near / z) in [0, 1], so the weight depends on the renderer's
     ``near_plane`` and on the unit of length (docs/rivals/2dgs.md).
     """
-
-    Settings: ClassVar[type[LossSettings]] = LossSettings
 
     @property
     def wants(self) -> frozenset[str]:

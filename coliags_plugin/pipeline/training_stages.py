@@ -158,12 +158,11 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
     Returns what the colours of depth mean.
     """
     from coliags_plugin.comparison.report.views import evenly
-    from coliags_plugin.contracts import knows_lamp
     from coliags_plugin.engine.held_light import flatten
     from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
     from coliags_plugin.outputs.image_files import eight_bit, write_png
 
-    flat = flatten(trained) if knows_lamp(trained.model.field) else None
+    flat = flatten(trained) if trained.model.field.knows_lamp else None
     depth, video, scale = "depth_expected", trained.scene.video, ""
     if depth in trained.model.outputs:
         limits = sampled_depth_limits(trained, video, depth)

@@ -87,18 +87,7 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
     ) -> RenderOutput:
-        """Render one view.
-
-        Args:
-            field: A field of a primitive that this renderer serves.
-            camera: Camera of the view.
-            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS` or of the Gaussians' features; rgb and
-                alpha are always included.
-            pixels: Must be None: a splatting renderer draws whole images.
-
-        Raises:
-            InputError: ``pixels`` is given, an output is unknown, or the field is not for this renderer.
-        """
+        """See :class:`Renderer`; refuses ``pixels``, as whole images are drawn."""
         self._check(field, pixels)
         return self.draw(field.gaussians(camera), camera, wants)
 

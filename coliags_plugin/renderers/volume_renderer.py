@@ -100,18 +100,10 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
     ) -> RenderOutput:
-        """Render one view, or some of its pixels.
+        """See :class:`Renderer`.
 
-        Args:
-            field: A radiance field.
-            camera: Camera of the view.
-            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals and distortion excepted, with
-                ``_coarse`` behind for those of the first pass, or ``ray_lengths``, the length of a pixel's ray per
-                z-depth; rgb and alpha are always included. Depths are z-depths.
-            pixels: Columns and rows of the only pixels to render. [P, 2]
-
-        Raises:
-            InputError: The field is of another primitive or has no bounds, or an output is not delivered.
+        Outputs of the first pass have ``_coarse`` behind their names; ``ray_lengths`` is the length of a pixel's ray
+        per z-depth. Depths are z-depths; there are no normals and no distortion.
         """
         return self._render(field, camera, wants, pixels, None)
 

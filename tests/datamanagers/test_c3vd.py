@@ -125,11 +125,6 @@ def test_other_files_of_the_release_are_left_alone(tmp_path, layout, name):
     assert len(video(load(folder, name))) == 3
 
 
-def test_both_reading_orders_of_the_poses_are_known(walls):
-    for kind, order in (("c3vd-raw", "column-major"), ("c3vd-raw-old", "row-major")):
-        assert load(walls(kind)).provenance["pose_convention"]["order"] == order
-
-
 # C3VDv2's lens
 
 #: As its file has it: pixel centres at integers.

@@ -121,20 +121,16 @@ def test_the_latest_cloud_of_the_release_is_taken(release):
 # Poses
 
 
-@pytest.mark.parametrize("count", [5, 16, 17])
-def test_poses_of_training_frames_go_to_training_frames(tmp_path, count):
+@pytest.mark.parametrize(("count", "every"), [(5, False), (16, False), (17, False), (11, True)])
+def test_poses_go_to_the_frames_that_were_tracked(tmp_path, count, every):
     folder = write_wall(tmp_path / "wall", "endogslam", count)
-    estimate(folder, training(count), drift)
+    tracked = np.arange(count) if every else training(count)
+    estimate(folder, tracked, drift)
     scene = load(folder, split="all-train")
-    np.testing.assert_allclose(matrices(scene)[training(count)], drift(from_first(count)[training(count)]), atol=1e-4)
+    np.testing.assert_allclose(matrices(scene)[tracked], drift(from_first(count)[tracked]), atol=1e-4)
     facts = scene.provenance["slam"]
-    assert facts["frames"] == count - count // 8
-    assert facts["images"] == ("every" if count < 8 else "all but 7, 15, 23, ...")
-
-
-def test_poses_of_all_frames_go_to_all_frames(mine):
-    estimate(mine, np.arange(11), drift)
-    np.testing.assert_allclose(matrices(load(mine)), drift(from_first(11)), atol=1e-4)
+    assert facts["frames"] == len(tracked)
+    assert facts["images"] == ("every" if len(tracked) == count else "all but 7, 15, 23, ...")
 
 
 def test_test_frames_take_true_poses_brought_into_the_mapped_world(mine):

@@ -393,18 +393,12 @@ def test_binary_goes_before_text_and_images_may_be_elsewhere(mine, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_files_cut_anywhere_or_with_rubbish_are_refused(mine, tmp_path, name):
-    path = mine / f"sparse/0/{name}.bin"
-    data = path.read_bytes()
-    for damaged in (*(data[:size] for size in (0, 7, 8, 9, len(data) // 3, len(data) - 1)), data + b"\0"):
-        path.write_bytes(damaged)
-        with pytest.raises(InputError, match=rf"{name}\.bin \({len(damaged)} bytes\) is damaged or cut short"):
-            opened(mine)
-    write_colmap(tmp_path / "text", names=NAMES[:2], text=True)
-    with (tmp_path / f"text/sparse/0/{name}.txt").open("a") as file:
+def test_lines_of_rubbish_are_refused(tmp_path, name):
+    write_colmap(tmp_path, names=NAMES[:2], text=True)
+    with (tmp_path / f"sparse/0/{name}.txt").open("a") as file:
         file.write("1 hello world\n")
     with pytest.raises(InputError, match=r"sparse/0"):
-        opened(tmp_path / "text")
+        opened(tmp_path)
 
 
 def test_cameras_that_are_none(mine, tmp_path):

@@ -7,7 +7,6 @@ import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -83,14 +82,6 @@ def test_not_keeping_reads_anew_and_only_what_is_asked_for(folder, reads):
         getattr(frame, part)
     assert frame.mask is None
     assert reads == 2 * ["0003_depth.png"] + 2 * ["0003_color.png"]
-
-
-def test_not_keeping_sees_what_changed_and_keeping_does_not(copied):
-    folder = copied("c3vd")
-    kept, fresh = (frame_of(folder, 2, keep) for keep in (True, False))
-    before = kept.image.clone()
-    cv2.imwrite(str(folder / "images/0002_color.png"), np.full((HEIGHT, WIDTH, 3), 7, np.uint8))
-    assert torch.equal(kept.image, before) and (fresh.image == 7).all()
 
 
 def test_frames_of_a_lens_share_its_mask(walls):

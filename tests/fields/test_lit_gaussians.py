@@ -14,8 +14,7 @@ from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
-from coliags_plugin.fields.diffuse_network import _ROWS, DiffuseNetwork
-from coliags_plugin.fields.lit_gaussians import GAMMA, PINK, THICKNESS
+from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, DiffuseNetwork
 from coliags_plugin.lighting.lamps import Lamp
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field

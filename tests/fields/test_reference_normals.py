@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.point_normals import point_normals, wall_normals
-from coliags_plugin.fields.reference_normals import ReferenceNormals
+from coliags_plugin.fields.explicit_field import ReferenceNormals
 from tests.fields.made import make_field
 
 

@@ -15,8 +15,7 @@ from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.fields.mlp import cosine_embedding
-from coliags_plugin.fields.normalisation import surface_distances
-from coliags_plugin.fields.reim_nerf import RadianceMLP, ReimNerf, ReimNerfFieldSettings
+from coliags_plugin.fields.reim_nerf import RadianceMLP, ReimNerf, ReimNerfFieldSettings, surface_distances
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.scenes import camera_at, wall_scene
 

@@ -17,10 +17,17 @@ from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots, poses_of_images
+from coliags_plugin.datamanagers.recording import (
+    ROTATION,
+    Recording,
+    Shot,
+    find_seen_masks,
+    fingerprint,
+    make_shots,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, octagon_mask
 
 LAYOUTS = (

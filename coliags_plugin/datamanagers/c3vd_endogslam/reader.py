@@ -23,10 +23,17 @@ from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthS
 from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots, poses_of_images
+from coliags_plugin.datamanagers.recording import (
+    ROTATION,
+    Recording,
+    Shot,
+    find_seen_masks,
+    fingerprint,
+    make_shots,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses

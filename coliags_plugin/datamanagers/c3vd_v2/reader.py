@@ -14,9 +14,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.c3vd.reader import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
+from coliags_plugin.datamanagers.recording import ROTATION
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.seen_masks import ROTATION
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 

@@ -26,10 +26,9 @@ from coliags_plugin.datamanagers.reading.files import (
     warn_of_unposed,
 )
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import FACTORS
 from coliags_plugin.geometry.lenses.models import Array, PinholeLens
 from coliags_plugin.geometry.lenses.tabulated import MappedLens
@@ -104,18 +103,13 @@ class SparseModel:
     """
 
     folder: Path
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # of cameras, images and points
     images: Sequence[RegisteredImage]
     camera_to_world: Float[np.ndarray, "N 4 4"]
     cameras: Mapping[int, ColmapLens]
     positions: Float[np.ndarray, "P 3"]
     colors: UInt8[np.ndarray, "P 3"]
     track_lengths: Int[np.ndarray, "P"]
-
-    @property
-    def cameras_file(self) -> Path:
-        """The file that holds the image sizes."""
-        return self.files[0]
 
 
 def find_models(scene: Path) -> list[Path]:
@@ -260,7 +254,7 @@ class ColmapDataManager(RecordedDataManager):
             number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
             for number, lens in model.cameras.items()
         }
-        rectification_of = rectifications(lenses, model.cameras_file, self.working_size, settings.focal_scale)
+        rectification_of = rectifications(lenses, model.files[0], self.working_size, settings.focal_scale)
         names = short_names([image.name for image in model.images])
         others = unposed_images(paths, (*masks, *depths))
         atlas = read_atlas(path)
@@ -305,12 +299,17 @@ class ColmapDataManager(RecordedDataManager):
             "sparse_depths": used,
             "masks": sum(mask is not None for mask in masks),
         }
+
+        def own_points() -> PointCloud:
+            positions = (model.positions * settings.scale).astype(np.float32)
+            return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
+
         return Recording(
             kind=f"COLMAP model {model.folder}, {len(model.positions)} points, cameras {', '.join(kinds)}",
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, [*paths, *masks, *depths], model.files),
-            own_points=(lambda: self._points(model)) if len(model.positions) else None,
+            own_points=own_points if len(model.positions) else None,
             points_source=model.files[-1],
             made_from={"points": [index for index, image in enumerate(model.images) if len(image.points)]},
         )
@@ -364,10 +363,6 @@ class ColmapDataManager(RecordedDataManager):
             return None, misplaced
         pixels, depth = (torch.from_numpy(values[rows].astype(np.float32)) for values in (pixels, local[:, 2]))
         return SparseDepth(pixels, depth), misplaced
-
-    def _points(self, model: SparseModel) -> PointCloud:
-        positions = (model.positions * self.settings.scale).astype(np.float32)
-        return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
 
 
 def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:

@@ -25,10 +25,9 @@ from coliags_plugin.datamanagers.reading.files import (
 )
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid

@@ -25,10 +25,9 @@ from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
@@ -117,7 +116,12 @@ class RGBDDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return _recognised(path) if _has_calibration(path) == cls.is_calibrated else None
+        calibrated = not any((path / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(path))
+        images = next((name for name in IMAGE_FOLDERS if (path / name).is_dir()), None)
+        trajectory = next((file for file in _trajectories(path) if tum.recognise(file)), None)
+        if images is None or trajectory is None or calibrated != cls.is_calibrated:
+            return None
+        return f"the TUM trajectory {trajectory.name} beside {images}/"
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -195,7 +199,7 @@ class RGBDDataManager(RecordedDataManager):
     def _by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
             return self.settings.association == "time"
-        timed = [_is_time(path.stem) for path in images]
+        timed = [_TIME.fullmatch(path.stem) is not None for path in images]
         if any(timed) and not all(timed):
             raise InputError(
                 f"{images[timed.index(False)]} is not named by a timestamp, but {images[timed.index(True)].name} is",
@@ -309,15 +313,6 @@ class EndoMapperDataManager(RGBDDataManager):
     is_calibrated = True
 
 
-def _recognised(folder: Path) -> str | None:
-    """The files that identify this layout; None if the folder has another one."""
-    images = next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), None)
-    trajectory = next((path for path in _trajectories(folder) if tum.recognise(path)), None)
-    if images is None or trajectory is None:
-        return None
-    return f"the TUM trajectory {trajectory.name} beside {images}/"
-
-
 def _find_images(folder: Path) -> list[Path]:
     """The colour images, unordered; there must be one folder of them."""
     require_folder(folder, EXPECTED)
@@ -353,11 +348,6 @@ def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path
             "Restore the missing ones, or move the folder away",
         )
     return {image.stem: files[image.stem] for image in images}
-
-
-def _has_calibration(folder: Path) -> bool:
-    """Whether the camera of a folder is that of a calibration file."""
-    return not any((folder / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(folder))
 
 
 def _find_trajectory(folder: Path, named: str | None) -> Path:
@@ -463,11 +453,6 @@ def _read_cameras_txt(path: Path, image: Path) -> _CameraFile:
     if isinstance(camera, str):
         raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
     return _CameraFile(path, PinholeLens.of(camera))
-
-
-def _is_time(name: str) -> bool:
-    """Whether a file stem is a timestamp in seconds; unlike a frame number it has a decimal point."""
-    return _TIME.fullmatch(name) is not None
 
 
 def _times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:

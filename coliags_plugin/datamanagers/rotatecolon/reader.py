@@ -27,10 +27,9 @@ from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.files import inventory, numbered, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import ROTATION, Recording, Shot, find_seen_masks, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 

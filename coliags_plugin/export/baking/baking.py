@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from coliags_plugin.contracts import gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
@@ -208,7 +207,7 @@ def _averaged(
         for index, frame in enumerate(views):
             camera = adjusted_camera(trained, frame)
             with torch.no_grad():
-                gaussians = gaussians_under(field, camera, light)
+                gaussians = field.gaussians_in_light(camera, light)
             weights = blending_weights(renderer, gaussians, camera)
             if averages is None:
                 sizes = field.element_count, field.slots_per_element, gaussians.scales.shape[1]

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.contracts import Comparison, GaussianField, knows_lamp
+from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
@@ -75,7 +75,7 @@ def export_run(
                 )
     field = _gaussian_field(trained)
     baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-    held = baked_in if knows_lamp(field) else None
+    held = baked_in if field.knows_lamp else None
     cloud, facts = bake(trained, baked_in, seconds)
     baking = {"light": light_facts(light, field, baked_in), **facts} if facts else None
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
@@ -84,7 +84,7 @@ def export_run(
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
     """Name and parameters of a light as JSON values; None where a field's colours do not depend on a lamp."""
-    return {"name": name, **(light.described if light else {})} if knows_lamp(field) else None
+    return {"name": name, **(light.described if light else {})} if field.knows_lamp else None
 
 
 def _record_file(output: Path) -> Path:

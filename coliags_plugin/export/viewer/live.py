@@ -18,7 +18,7 @@ import torch
 from jaxtyping import UInt8
 from typing_extensions import Self
 
-from coliags_plugin.contracts import Follower, GaussianField, knows_lamp
+from coliags_plugin.contracts import Follower, GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.rotations import rotation_matrices
@@ -228,7 +228,7 @@ class Session:
         kinds = [kind for kind, output in OUTPUTS.items() if output == "rgb" or output in trained.model.outputs]
         self.kind = gui.add_dropdown("Show", [*kinds, *self._meshes])
         self.kind.on_update(lambda _: self.redraw())
-        lights = ("follows the camera", "flattened") if knows_lamp(trained.model.field) else ("recorded",)
+        lights = ("follows the camera", "flattened") if trained.model.field.knows_lamp else ("recorded",)
         self.light = gui.add_dropdown("Light", lights, visible=len(lights) > 1)
         self.light.on_update(lambda _: self.redraw())
         # A radiance field takes long for each pixel.

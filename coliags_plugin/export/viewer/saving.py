@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import GaussianField, knows_lamp
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
@@ -118,16 +118,16 @@ def _page_of_gaussians(
     empty = len(page.html(meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
-    kind = AttenuatedGaussians if held is None and knows_lamp(field) else ExplicitGaussians
+    kind = AttenuatedGaussians if held is None and field.knows_lamp else ExplicitGaussians
     splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
     first = best_frame(field_of_cloud(splats), trained, held)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
     while empty + (size := len(json.dumps(layer.packed))) > largest:
         splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / size))
         layer, drawn = Layer.of_cloud("Gaussians", splats)
-    cost = export_cost(trained, drawn, held if knows_lamp(field) else None)
+    cost = export_cost(trained, drawn, held if field.knows_lamp else None)
     told = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
-    if knows_lamp(field):
+    if field.knows_lamp:
         told.append(f"{light} light")
     text = "; ".join([*told, *cost_lines(cost)])
     facts = {"gaussians": len(splats), "baking": {"light": light_facts(light, field, held), **baking}, "cost": cost}

@@ -13,7 +13,6 @@ import torch
 
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
-from coliags_plugin.contracts import gaussians_under, knows_lamp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light
@@ -212,10 +211,10 @@ def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
     explicit = method in ("pr-endo", "3dgs")
     trained = runs(method, settings=OTHERS if explicit else ANCHORS).load()
     field, camera = trained.model.field, trained.scene.train[2].camera
-    assert knows_lamp(field) == (method not in ("scaffold-gs", "3dgs"))
+    assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
     with torch.no_grad():
-        near, far = (gaussians_under(field, camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
-    assert torch.equal(near, far) != knows_lamp(field)
+        near, far = (field.gaussians_in_light(camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
+    assert torch.equal(near, far) != field.knows_lamp
 
 
 def test_flattened_light_is_even_over_a_wall(runs):
