@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import check_name
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
@@ -158,8 +158,7 @@ def report(
     ]
     wanted: Sequence[Format] = (formats,) if isinstance(formats, str) else formats
     for each in wanted:
-        if each not in SUFFIXES:
-            raise InputError(f"no format '{each}'", f"one of {', '.join(SUFFIXES)}", did_you_mean(each, SUFFIXES))
+        check_name("format", each, SUFFIXES)
     file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
     section = _scene_section(scene) if scene is not None and "html" in wanted else None
     choices = Choices(columns, reference, title, note, frames)

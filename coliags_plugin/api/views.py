@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
@@ -83,10 +83,7 @@ class RenderedView:
 
 def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence[str]) -> RenderedView:
     """Render a view of a run; see :meth:`coliags_plugin.api.runs.Run.render`."""
-    if depth not in DEPTH_KINDS:
-        raise InputError(
-            f"no kind of depth '{depth}'", f"one of {', '.join(DEPTH_KINDS)}", did_you_mean(depth, DEPTH_KINDS)
-        )
+    check_name("kind of depth", depth, DEPTH_KINDS)
     wants = ("rgb", "alpha", depth, *outputs)
     trained.model.check_outputs(wants, "this view")
     frame, camera = (None, of) if isinstance(of, Camera) else _frame(trained.scene, of)

@@ -76,7 +76,7 @@ class CommandGroup:
         self.subcommand.run()
 
 
-def call(function: Callable[..., R], command: Runnable, **others: object) -> R:
+def call(function: Callable[..., R], command: object, **others: object) -> R:
     """Call a function with the options of a command that have the names of its arguments, and with others."""
     names = [name for name in signature(function).parameters if name not in others and hasattr(command, name)]
     return function(**{name: getattr(command, name) for name in names}, **others)

@@ -31,7 +31,7 @@ class ListCommand:
         from coliags_plugin.comparison.named_files import ABLATIONS, shipped
         from coliags_plugin.config.method_files import descriptions, method_files
         from coliags_plugin.config.registry import REGISTRIES
-        from coliags_plugin.core.errors import InputError, did_you_mean
+        from coliags_plugin.core.errors import check_name
 
         def sources(kind: str) -> dict[str, str]:
             named = {name: REGISTRIES[kind].source(name) for name in REGISTRIES[kind]}
@@ -43,8 +43,7 @@ class ListCommand:
             "ablations": lambda: descriptions(shipped(ABLATIONS)),
             **{kind: partial(sources, kind) for kind in REGISTRIES},
         }
-        if self.kind not in ("all", *texts):
-            raise InputError(f"no kind '{self.kind}'", f"one of {', '.join(texts)}", did_you_mean(self.kind, texts))
+        check_name("kind", self.kind, ("all", *texts))
         kinds = list(texts) if self.kind == "all" else [self.kind]
         listed = {kind: texts[kind]() for kind in kinds}
         head, indent = ("{}:", "  ") if self.kind == "all" else ("", "")

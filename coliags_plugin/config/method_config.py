@@ -30,7 +30,7 @@ from coliags_plugin.config.yaml_tree import (
     dump_inline,
     errors_with_origins,
     merge,
-    parse_assignment,
+    override_all,
     read_tree,
 )
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -169,10 +169,7 @@ def method_name(method: str) -> str:
 
 def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     """Merged config tree of a method with overrides applied, before validation, each value with its origin."""
-    tree = _resolve(_find(method, Path.cwd()), ())
-    for assignment in overrides:
-        tree = merge(tree, parse_assignment(assignment))
-    return tree
+    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
 
 
 def _find(method: str, folder: Path) -> Path:

@@ -17,7 +17,7 @@ from pathlib import Path
 from runpy import run_path
 from typing import Any, TypeGuard
 
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name
 
 PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
 
@@ -77,10 +77,7 @@ class Registry:
     def get(self, name: str) -> Any:
         """The component of a name, imported on first use."""
         self._discover()
-        if name not in self._targets:
-            raise InputError(
-                f"no {self.noun} '{name}'", f"one of {', '.join(self.names())}", did_you_mean(name, self._targets)
-            )
+        check_name(self.noun, name, self.names())
         target = self._targets[name]
         if isinstance(target, str):
             target = self._targets[name] = self._imported(name, target)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
 
@@ -75,7 +75,7 @@ def check_number(option: str, number: int | None, least: int = 1) -> None:
         raise InputError(f"--{option} {number}", f"at least {least}")
 
 
-def check_name(noun: str, name: str, known: Sequence[str]) -> None:
+def check_name(noun: str, name: str, known: Collection[str]) -> None:
     """Refuse a name that is none of those known."""
     if name not in known:
         raise InputError(f"no {noun} '{name}'", f"one of {', '.join(known)}", did_you_mean(name, known))

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.image_files import as_array
-from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,6 +29,10 @@ UNKNOWN_GREY = 128
 #: Grey levels of the hatching over error pixels without ground truth.
 HATCH_GREYS = (150, 108)
 
+#: Colour of text and lines.
+INK = (32, 32, 32)
+#: OpenCV's, with ASCII characters only.
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 _HATCH_PERIOD = 8
 _HATCH_WIDTH = 2
 
@@ -215,3 +218,16 @@ def _shortened(label: str, width: int, scale: float) -> str:
     while text and text_width(text, scale) > width:
         text = text[:-4] + "..." if len(text) > 4 else ""
     return text
+
+
+def text_width(text: str, scale: float = 0.45) -> int:
+    """Width of a text, px."""
+    return int(cv2.getTextSize(text, _FONT, scale, 1)[0][0])
+
+
+def draw_text(
+    image: UInt8[np.ndarray, "H W 3"], text: str, origin: tuple[int, int], scale: float = 0.45, align: float = 0.0
+) -> None:
+    """Draw a text whose start (``align`` 0), middle (0.5) or end (1) is at the origin, on the line of its baseline."""
+    start = (round(origin[0] - align * text_width(text, scale)), origin[1])
+    cv2.putText(image, text, start, _FONT, scale, INK, 1, cv2.LINE_AA)

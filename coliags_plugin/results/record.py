@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import check_name
 from coliags_plugin.reporting.model import Column, Value, value_text
 from coliags_plugin.reporting.numbers import Direction
 from coliags_plugin.reporting.text_formats import DisplayTable
@@ -182,13 +182,8 @@ class Result(_Part):
             InputError: There is no such metric or test set.
         """
         chosen = self.main_set if set_name is None else set_name
-        for kind, name, known in (("metric", metric, self.metrics), ("test set", chosen, self.sets)):
-            if name not in known:
-                raise InputError(
-                    f"no {kind} '{name}' in a result of protocol {self.protocol.name}",
-                    f"one of {', '.join(known)}",
-                    did_you_mean(name, known),
-                )
+        check_name("metric", metric, self.metrics)
+        check_name("test set", chosen, self.sets)
         return self.sets[chosen].mean(metric)
 
     @property

@@ -11,7 +11,7 @@ from pathlib import Path
 from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, ComparisonPlan, read_plan
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.results.hashing import training_config
 from coliags_plugin.results.reading import RESULT_FILE, read_result
@@ -61,9 +61,7 @@ def _only(
     """Results and failures of some methods, in their order."""
     known = list(dict.fromkeys([run.method for run in runs] + [one.method for one in missing]))
     for name in methods:
-        if name not in known:
-            those = ", ".join(known)
-            raise InputError(f"no method '{name}' among the results", f"one of {those}", did_you_mean(name, known))
+        check_name("method", name, known)
     kept = [run for name in dict.fromkeys(methods) for run in runs if name == run.method]
     return kept, [one for one in missing if one.method in methods]
 

@@ -16,8 +16,8 @@ from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.colmap.writer import write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
 

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.colormaps import side_by_side, stacked
-from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
+from coliags_plugin.outputs.colormaps import INK, draw_text, side_by_side, stacked, text_width
 from coliags_plugin.surface.coverage.centreline import STEP
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage
 from coliags_plugin.surface.coverage.views import CoverageView

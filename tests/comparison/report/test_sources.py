@@ -61,7 +61,7 @@ def test_some_methods_alone_in_the_order_asked_for(tmp_path):
     study = read_study([folder], methods=["3dgs", "coliags"])
     assert study.methods == ["3dgs", "coliags"]
     assert [failure.method for failure in study.missing] == ["3dgs"]
-    refuses([folder], "no method '3dg' .* Did you mean '3dgs'", methods=["3dg"])
+    refuses([folder], "no method '3dg'.* Did you mean '3dgs'", methods=["3dg"])
 
 
 def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
