@@ -70,7 +70,7 @@ class SubmapResults:
     @property
     def figures(self) -> dict[str, Any]:
         """The numbers of all its stages; of a damaged record, those that are numbers."""
-        found = {
+        found: dict[str, Any] = {
             name: value
             for stage in self.stages.values()
             for name, value in stage.figures.items()

@@ -40,4 +40,9 @@ def write(path: Path, trajectory: Trajectory) -> None:
     atomic_write(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
 
 
-FORMAT = Format("tum", read, write, lambda path: count_first_numbers(path) == 8, keeps=frozenset({"timestamps"}))
+def recognise(path: Path) -> bool:
+    """Whether a file's first line, comments apart, holds eight numbers."""
+    return count_first_numbers(path) == 8
+
+
+FORMAT = Format("tum", read, write, recognise, keeps=frozenset({"timestamps"}))
