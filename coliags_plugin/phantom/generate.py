@@ -166,8 +166,7 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     report("colon", 2, 4)
     tracer = Tracer(surface)
     lamps = CameraLight.all_of(settings)
-    vignetting = value_or_default(settings.vignetting, settings.light_preset.vignetting)
-    world = World(surface, mucosa, tracer, lamps, vignetting)
+    world = World(surface, mucosa, tracer, lamps, settings.light_preset.vignetting)
     motion = wall_motion(anatomy, surface, settings)
     poses = camera_path(anatomy.centre_line, settings, tracer, motion)
     views = turn_away(poses, settings, layout.is_test) if layout.has_rotation else []
@@ -341,7 +340,7 @@ def _write_truth(
         "law": "pixel = noise + shoulder(gain * cos(theta)^vignetting * (albedo * (E n.l + E_indirect) + gloss E))"
         "^(1/gamma), E = beam(psi) (unit_distance_mm / d)^2, psi and d at the lamp",
         **({"lamp": lamps[0]} if len(lamps) == 1 else {"lamps": lamps}),
-        "vignetting": settings.vignetting,
+        "vignetting": phantom.world.vignetting,
         "interreflection": settings.interreflection,
         "gamma": settings.gamma,
         "shoulder_knee": KNEE,

@@ -21,6 +21,8 @@ from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0
+#: Normal reflectance of the mucus film: an index of refraction of 1.40.
+F0 = 0.028
 
 
 @dataclass(frozen=True)
@@ -41,17 +43,17 @@ class CameraLight:
     def all_of(cls, settings: PhantomSettings) -> tuple[CameraLight, ...]:
         """Lamps from settings; they are tilted downwards in the image, and their shares sum to 1."""
         preset = settings.light_preset
-        tilt = np.radians(value_or_default(settings.tilt, preset.tilt))
+        tilt = np.radians(preset.tilt)
         offsets = settings.lamps or (value_or_default(settings.light_offset, preset.light_offset),)
         shares = settings.lamp_shares or (1.0,) * len(offsets)
         one = cls(
             offset=offsets[0],
             axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
-            spread_law=value_or_default(settings.spread_law, preset.spread_law),
-            spread=value_or_default(settings.spread, preset.spread),
+            spread_law=preset.spread_law,
+            spread=preset.spread,
             specular=settings.specular,
             roughness=settings.roughness,
-            f0=settings.f0,
+            f0=F0,
             diffuse_roughness=settings.diffuse_roughness,
         )
         return tuple(
@@ -132,7 +134,7 @@ class CameraLight:
         return np.asarray(self.specular * fresnel * lobe * 0.5 * light / np.maximum(masking, 1e-6))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters as plain values, for the truth folder; without those that earlier versions did not have."""
-        later = {"diffuse_roughness": 0.0, "share": 1.0}
-        record = {name: value for name, value in asdict(self).items() if value != later.get(name)}
+        """Parameters as plain values, for the truth folder; without those of a Lambertian wall and of one lamp."""
+        plain = {"diffuse_roughness": 0.0, "share": 1.0}
+        record = {name: value for name, value in asdict(self).items() if value != plain.get(name)}
         return {**record, "unit_distance_mm": UNIT_DISTANCE}

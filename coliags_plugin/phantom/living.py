@@ -15,8 +15,10 @@ from coliags_plugin.phantom.colon import DOME, LENGTH, Anatomy, ColonSurface, su
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
 
-#: Length of the bend by breathing along the colon, mm: one period.
-_BEND = 160.0
+#: Length of the bend by breathing along the colon, mm: one period; and the time of one breath, s.
+_BEND, BREATH = 160.0, 4.0
+#: Length of the peristaltic wave along the centre line, mm, and its speed towards the shallow end, mm/s.
+WAVE_LENGTH, WAVE_SPEED = 60.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,9 @@ def peristalsis(
     arc: Float[np.ndarray, "R"], times: Float[np.ndarray, "T"], settings: PhantomSettings, phase: float
 ) -> Float[np.ndarray, "T R"]:
     """Change of the radius, mm: a sine that travels towards the shallow end and fades out towards the closed end."""
-    travelled = arc[None] + settings.wave_speed * times[:, None]
+    travelled = arc[None] + WAVE_SPEED * times[:, None]
     fade = smoothstep((LENGTH - DOME - arc) / 20.0)
-    return np.asarray(settings.wave * fade * np.sin(2.0 * np.pi * travelled / settings.wave_length + phase))
+    return np.asarray(settings.wave * fade * np.sin(2.0 * np.pi * travelled / WAVE_LENGTH + phase))
 
 
 def breathing(
@@ -79,5 +81,5 @@ def breathing(
     """Displacement of the centre line, world, mm: it bends and straightens across a fixed direction."""
     direction = np.cos(phases[0]) * axes[:, 0] + np.sin(phases[0]) * axes[:, 1]
     along = np.sin(2.0 * np.pi * arc / _BEND + phases[1])
-    swing = settings.breathing * np.sin(2.0 * np.pi * times / settings.breathing_period + phases[2])
+    swing = settings.breathing * np.sin(2.0 * np.pi * times / BREATH + phases[2])
     return np.asarray(swing[:, None, None] * along[None, :, None] * direction)

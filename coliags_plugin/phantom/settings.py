@@ -10,10 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import (
     AfterValidator,
     Field,
-    SerializerFunctionWrapHandler,
     ValidationError,
     field_validator,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -24,41 +22,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
 from coliags_plugin.lighting.beams import SpreadLaw
 
-#: Settings that are recorded only where they differ from their defaults, which earlier versions had.
-_LATER = (
-    "preset",
-    "frame_rate",
-    "turns",
-    "contacts",
-    "wave",
-    "wave_length",
-    "wave_speed",
-    "breathing",
-    "breathing_period",
-    "shutter",
-    "softness",
-    "fluid",
-    "bubbles",
-    "tool",
-    "washes",
-    "fold_spacing",
-    "texture",
-)
-#: The same, also with a preset, which sets none of them.
-_LATER_IN_PRESETS = (
-    "lamps",
-    "lamp_shares",
-    "diffuse_roughness",
-    "s_curve",
-    "color_matrix",
-    "metering",
-    "gain_steps",
-    "sharpening",
-    "sharpening_radius",
-    "compression",
-    "pose_noise",
-    "depth_noise",
-)
 #: A colour matrix that changes nothing.
 SAME_COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -80,13 +43,13 @@ _Offset = Annotated[_Triple, AfterValidator(_near_lens)]
 
 @dataclass(frozen=True)
 class Preset:
-    """Defaults of settings left at None (see :class:`PhantomSettings`), and motion parameters."""
+    """Lamp and lens, defaults of settings left at None (see :class:`PhantomSettings`), and motion parameters."""
 
     light_offset: tuple[float, float, float]
     spread_law: SpreadLaw
-    spread: float
-    vignetting: float
-    tilt: float
+    spread: float  # how narrow the beam is
+    vignetting: float  # exponent of the lens's cos theta fall-off
+    tilt: float  # lamp axis against optical axis, downwards, degrees; measured 0.64 on one endoscope
     gain: GainMode
     white_balance_drift: float
     turn: tuple[float, float, float]  # largest yaw, pitch and roll of the wobble, degrees
@@ -212,16 +175,6 @@ class PhantomSettings(Settings):
     lamp_shares: tuple[float, ...] = Field(
         (), description="Relative light of each of the lamps, 0 to 1 after division by their sum; none: equal."
     )
-    spread_law: SpreadLaw | None = Field(
-        None, description="exponential: exp(-spread (1 - cos psi)), Modrzejewski 2020. cosine: cos^spread psi."
-    )
-    spread: float | None = Field(None, ge=0.0, le=4.0, description="How narrow the lamp's beam is; range 0 to 4.")
-    vignetting: float | None = Field(
-        None, ge=0.0, le=4.0, description="Exponent of the lens's cos theta fall-off; 0 is none; range 0 to 4."
-    )
-    tilt: float | None = Field(
-        None, ge=0.0, le=10.0, description="Lamp axis against optical axis, degrees; measured 0.64 on one endoscope."
-    )
     interreflection: float = Field(
         1.0, ge=0.0, le=1.0, description="Scale of indirect light; 1 is the solved radiosity, 0 none."
     )
@@ -235,7 +188,6 @@ class PhantomSettings(Settings):
     roughness: float = Field(
         0.3, ge=0.15, le=0.7, description="GGX roughness of the mucus film, whose alpha is its square."
     )
-    f0: float = Field(0.028, ge=0.0, le=0.08, description="Normal reflectance of the film; .028 is an index of 1.40.")
     albedo: tuple[float, float, float] = Field(
         (0.78, 0.29, 0.22),
         description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (docs/phantom.md 1).",
@@ -310,17 +262,9 @@ class PhantomSettings(Settings):
     wave: float = Field(
         0.0, ge=0.0, le=4.0, description="Amplitude of the peristaltic wave of the wall's radius, mm; 0 is none."
     )
-    wave_length: float = Field(60.0, ge=20.0, le=300.0, description="Length of the wave along the centre line, mm.")
-    wave_speed: float = Field(
-        10.0,
-        ge=0.0,
-        le=100.0,
-        description="Speed of the wave towards the shallow end, mm/s; period: length/speed.",
-    )
     breathing: float = Field(
         0.0, ge=0.0, le=4.0, description="Amplitude with which breathing bends the centre line, mm; 0 is none."
     )
-    breathing_period: float = Field(4.0, ge=1.0, le=30.0, description="Time of one breath, s.")
     shutter: float = Field(
         0.0, ge=0.0, le=1.0, description="Share of the frame interval that is exposed: motion blur; 0 is none."
     )
@@ -329,7 +273,6 @@ class PhantomSettings(Settings):
     )
     fluid: float = Field(0.0, ge=0.0, le=8.0, description="Depth of a pool of fluid, mm; 0 is none.")
     bubbles: int = Field(0, ge=0, le=1000, description="Number of bubbles that drift along the wall, in clusters.")
-    tool: bool = Field(False, description="Whether a tool moves in and out of the working channel.")
     washes: int = Field(0, ge=0, le=20, description="How often a wash leaves drops on the lens for 1.2 s.")
     fold_spacing: float = Field(25.0, ge=8.0, le=40.0, description="Mean distance of folds along the colon, mm.")
     texture: float = Field(1.0, ge=0.0, le=1.0, description="Contrast of the mucosa's colours and fine relief.")
@@ -385,16 +328,6 @@ class PhantomSettings(Settings):
             raise ValueError(f"{len(self.lamp_shares)} lamp_shares of {len(self.lamps)} lamps; must be one of each")
         return self
 
-    @model_serializer(mode="wrap")
-    def _records_of_earlier_versions(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record: dict[str, Any] = serialize(self)
-        fields = type(self).model_fields
-        later = _LATER_IN_PRESETS if self.preset else (*_LATER, *_LATER_IN_PRESETS)
-        left_out = {key for key in later if getattr(self, key) == fields[key].default}
-        # Before there was a choice, views had the exposure of their frame, although that is no longer the default.
-        left_out.update(("rotation_exposure",) if not self.rotation_views or self.rotation_exposure == "frame" else ())
-        return {key: record[key] for key in record if key not in left_out}
-
     @property
     def moves(self) -> bool:
         """Whether the wall moves."""
@@ -403,7 +336,7 @@ class PhantomSettings(Settings):
     @property
     def covers(self) -> bool:
         """Whether anything but the wall is in view."""
-        return bool(self.fluid or self.bubbles or self.tool or self.washes)
+        return bool(self.fluid or self.bubbles or self.washes)
 
     @property
     def light_preset(self) -> Preset:
@@ -412,7 +345,7 @@ class PhantomSettings(Settings):
 
     def resolved(self) -> PhantomSettings:
         """Settings with None replaced by the preset's values; sizes are left to the layout."""
-        names = ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift")
+        names = ("light_offset", "gain", "white_balance_drift")
         return self.model_copy(
             update={name: value_or_default(getattr(self, name), getattr(self.light_preset, name)) for name in names}
         )

@@ -1,16 +1,16 @@
-"""Ray casting against the colon's mesh, by open3d, and what of the wall cameras see."""
+"""Ray casting against the colon's mesh, and what of the wall cameras see."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.phantom.colon import ColonSurface
 
 
 @dataclass(frozen=True)
@@ -36,44 +36,31 @@ def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 
-class Triangles(Protocol):
-    """A triangle mesh."""
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh with normals."""
 
-    @property
-    def vertices(self) -> Float[np.ndarray, "V 3"]:
-        """Positions, mm."""
-
-    @property
-    def triangles(self) -> Int[np.ndarray, "F 3"]:
-        """Vertex indices."""
+    vertices: Float[np.ndarray, "V 3"]  # mm
+    normals: Float[np.ndarray, "V 3"]  # unit
+    triangles: Int[np.ndarray, "F 3"]
 
 
 class Tracer:
-    """Ray-casting scene of a mesh."""
+    """Ray-casting scene of a mesh: the wall, or a body over it."""
 
-    def __init__(self, surface: Triangles) -> None:
-        self._open3d = import_open3d("traces a phantom's rays")
-        self._surface = surface
-        self._scene = self._open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._open3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
-            self._open3d.core.Tensor(np.ascontiguousarray(surface.triangles, np.uint32)),
-        )
+    def __init__(self, surface: ColonSurface | Mesh) -> None:
+        self._triangles = surface.triangles
+        self._rays = TriangleMesh(surface.vertices, surface.triangles).rays
 
     def cast(self, camera_to_world: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Hits:
         """First hits of rays from a camera; directions in its axes, z = 1, so that a hit's parameter is its z-depth."""
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3] = camera_to_world[:3, 3]
-        rays[:, 3:] = rotated(directions, camera_to_world[:3, :3])
-        answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
-        z_depth = answer["t_hit"].numpy()
-        found = np.isfinite(z_depth)
-        triangle = np.where(found, answer["primitive_ids"].numpy(), 0).astype(np.int64)
-        return Hits(found, z_depth, triangle, answer["primitive_uvs"].numpy())
+        turned = rotated(directions, camera_to_world[:3, :3])
+        triangle, z_depth, barycentric = self._rays.first_hits(camera_to_world[:3, 3], turned)
+        return Hits(triangle >= 0, z_depth, np.maximum(triangle, 0), barycentric)
 
     def interpolate(self, values: Float[np.ndarray, "V K"], hits: Hits) -> Float[np.ndarray, "N K"]:
         """Interpolate vertex values at hits."""
-        corners = self._surface.triangles[hits.triangle]
+        corners = self._triangles[hits.triangle]
         second, third = hits.barycentric[:, :1], hits.barycentric[:, 1:]
         return np.asarray(
             values[corners[:, 0]] * (1.0 - second - third)
@@ -88,16 +75,11 @@ class Tracer:
 
         The last thousandth of the ray is ignored, as the point is on the wall itself.
         """
-        rays = np.empty((len(points), 6), np.float32)
-        rays[:, :3] = viewpoints
-        rays[:, 3:] = points - viewpoints
-        blocked = self._scene.test_occlusions(self._open3d.core.Tensor(rays), tnear=0.0, tfar=0.999)
-        return ~np.asarray(blocked.numpy(), dtype=bool)
+        return ~self._rays.blocked(viewpoints, points - viewpoints)
 
     def clearance(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
         """Distance to the nearest wall, mm."""
-        query = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
-        return np.asarray(self._scene.compute_distance(query).numpy())
+        return self._rays.distance(points)
 
 
 def seen_from(

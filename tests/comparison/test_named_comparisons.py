@@ -203,7 +203,11 @@ def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written):
     file.write_text(json.dumps({"settings": scene.phantom_record}))
     assert find_scenes([name], tmp_path / "made")[0].is_there
     file.write_text(json.dumps({"settings": {**scene.phantom_record, "wave": 2.0}}))
-    with pytest.raises(InputError, match=r"wave 2\.0 instead of None"):
+    with pytest.raises(InputError, match=r"wave 2\.0 instead of 0\.0"):
+        find_scenes([name], tmp_path / "made")
+    earlier = {key: value for key, value in scene.phantom_record.items() if key != "wave"}
+    file.write_text(json.dumps({"settings": earlier}))
+    with pytest.raises(InputError, match=r"of another version.*Remove it, so that it is made again"):
         find_scenes([name], tmp_path / "made")
     file.write_text(json.dumps({"settings": {**scene.phantom_record, "seed": 4}}))
     with pytest.raises(InputError, match="another phantom than the benchmark's: seed 4 instead of 3"):

@@ -70,7 +70,7 @@ def test_layout_is_coliags_own(phantom):
     assert (rotated / "camera.json").read_text() == (phantom / "camera.json").read_text()
     assert sorted(path.name for path in (phantom / "truth/seen").iterdir()) == [f"{i:04d}_seen.png" for i in (0, 8, 16)]
     record = json.loads((phantom / "phantom.json").read_text())
-    assert record["settings"]["spread"] == 0.75 and record["settings"]["width"] == 48
+    assert record["settings"]["gain"] == "auto" and record["settings"]["width"] == 48
 
 
 def test_the_image_is_exposed_and_red(phantom):

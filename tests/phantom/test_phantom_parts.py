@@ -391,7 +391,6 @@ def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
         ({"pose_noise": (0.1, -1.0)}, "pose_noise: .*outside 0 to 5"),
         ({"compression": 0}, "compression"),
         ({"albedo": (1.2, 0.3, 0.2)}, "albedo"),
-        ({"spread": float("nan")}, "spread"),
         ({"seed": -1}, "seed"),
         ({"layout": "c3vd_raw"}, "phantom setting layout: .*unknown layout; known are c3vd, .*colmap"),
         ({"polypes": 3}, "polyps"),
@@ -404,11 +403,10 @@ def test_bad_settings_are_named(options, named):
 
 def test_presets_fill_what_is_left_open():
     strong = PhantomSettings(light="strong").resolved()
-    assert (strong.gain, strong.spread_law, strong.spread, strong.vignetting) == ("fixed", "cosine", 1.5, 2.5)
-    assert strong.light_offset == (0.0, 0.0, 0.0)
+    assert (strong.gain, strong.light_offset, strong.white_balance_drift) == ("fixed", (0.0, 0.0, 0.0), 0.0)
     assert phantom_settings({"lamps": [[3.0, 0.0, 0.0]]}).lamps == ((3.0, 0.0, 0.0),)
-    mild = phantom_settings({"gain": "fixed", "layout": "nerfstudio", "vignetting": 0.0}).resolved()
-    assert (mild.gain, mild.vignetting, mild.light_offset) == ("fixed", 0.0, (0.0, 0.0, -3.6))
+    mild = phantom_settings({"gain": "fixed", "layout": "nerfstudio", "white_balance_drift": 0.0}).resolved()
+    assert (mild.gain, mild.white_balance_drift, mild.light_offset) == ("fixed", 0.0, (0.0, 0.0, -3.6))
 
 
 #: A repeated name is an error of the reader.

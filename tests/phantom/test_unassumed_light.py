@@ -39,9 +39,9 @@ def idle(stage: str, done: int, total: int) -> None:
 
 def irradiance(offsets, point, shares=()) -> float:
     """Irradiance at a point square to the light, of lamps without a beam."""
-    settings = PhantomSettings(lamps=offsets, lamp_shares=shares, spread=0.0)
+    lights = CameraLight.all_of(PhantomSettings(lamps=offsets, lamp_shares=shares))
     points = np.array([point], float)
-    return float(sum(light.irradiance(points, np.eye(4))[0][0] for light in CameraLight.all_of(settings)))
+    return float(sum(replace(light, spread=0.0).irradiance(points, np.eye(4))[0][0] for light in lights))
 
 
 # --- lamps -----------------------------------------------------------------------------------------------------------
@@ -299,16 +299,6 @@ def test_a_turned_view_is_exposed_for_what_it_sees():
     assert np.abs(np.log(metered.rotation_gains / framed.rotation_gains)).max() > 0.02
 
 
-def test_a_record_without_the_new_settings_is_of_an_earlier_version():
-    earlier = PhantomSettings(rotation_exposure="frame").model_dump()
-    assert not {"lamps", "metering", "compression", "pose_noise", "rotation_exposure"} & earlier.keys()
-    assert PhantomSettings().model_dump()["rotation_exposure"] == "metered"
-    assert "rotation_exposure" not in PhantomSettings(rotation_views=0).model_dump()
-    assert "lamps" not in PhantomSettings(preset="in-vivo").model_dump()
-    chosen = PhantomSettings(preset="in-vivo", lamps=GUIDES, compression=70, color_matrix=MATRIX)
-    assert PhantomSettings(**chosen.model_dump()) == chosen
-
-
 # --- benchmarks ------------------------------------------------------------------------------------------------------
 
 #: Drawn at random, and not to be looked at.
@@ -351,9 +341,3 @@ def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
             assert chosen.model_copy(update=errors) == scenes[key.replace("exact", "tracked")]
         else:
             assert {name: getattr(chosen, name) for name in errors} == errors
-
-
-def test_the_earlier_benchmark_is_as_it_was():
-    for scene in load_benchmark("phantoms-8").settings.scenes.values():
-        record = scene.phantom_settings.model_dump()
-        assert not UNASSUMED - {"gamma"} & record.keys() and "rotation_exposure" not in record

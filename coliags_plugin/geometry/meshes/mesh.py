@@ -29,10 +29,17 @@ class RayScene:
         self, origins: Origins, directions: Float[np.ndarray, "N 3"]
     ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
         """Triangle that each ray hits first, -1 without a hit, and how many lengths of the ray it is away. [N], [N]"""
+        triangle, parameter, _ = self.first_hits(origins, directions)
+        return triangle, parameter
+
+    def first_hits(
+        self, origins: Origins, directions: Float[np.ndarray, "N 3"]
+    ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+        """Hits as of :meth:`cast`, and the weights of the second and third corner there. [N], [N], [N, 2]"""
         answer = self._scene.cast_rays(self._rays(origins, directions))
         parameter = answer["t_hit"].numpy()
         triangle = answer["primitive_ids"].numpy().astype(np.int64)  # unsigned; its largest value without a hit
-        return np.where(np.isfinite(parameter), triangle, -1), parameter
+        return np.where(np.isfinite(parameter), triangle, -1), parameter, answer["primitive_uvs"].numpy()
 
     def blocked(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
         """Whether something lies on each ray before its end, the last thousandth of it left out. [N]"""
@@ -45,6 +52,11 @@ class RayScene:
         closest = self._scene.compute_closest_points(self._open3d.core.Tensor(points))
         distances = np.linalg.norm(closest["points"].numpy().astype(np.float64) - points, axis=1)
         return distances, closest["primitive_ids"].numpy().astype(np.int64)
+
+    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N"]:
+        """Distance to the nearest point of any triangle in float32, faster than :meth:`nearest`. [N]"""
+        points = np.ascontiguousarray(points, np.float32)
+        return np.asarray(self._scene.compute_distance(self._open3d.core.Tensor(points)).numpy())
 
     def _rays(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Any:
         rays = np.empty((len(directions), 6), np.float32)
