@@ -64,6 +64,7 @@ class SeenWall:
     level: UInt8[np.ndarray, "F"]  # the values of :class:`Level`
     names: list[str]  # of the frames
     settings: CoverageSettings  # what counts as seen
+    metric: bool  # whether lengths are mm; else their unit is unknown
 
     @property
     def inside(self) -> Bool[np.ndarray, "F"]:
@@ -79,7 +80,6 @@ class SeenWall:
 class PartialCoverage(SeenWall):
     """What a recording shows of the reconstructed wall alone, where no section of a lumen can be measured."""
 
-    metric: bool  # whether lengths are mm; else their unit is unknown
     reason: str  # why there is no section
 
 
@@ -125,9 +125,7 @@ def measure_coverage(
     except NoLumenError as error:
         reason = error.seen
     nothing, names = np.zeros(len(mesh), bool), [view.name for view in views]
-    return PartialCoverage(
-        mesh, nothing, face_views, classify(face_views, settings), names, settings, metric=metric, reason=reason
-    )
+    return PartialCoverage(mesh, nothing, face_views, classify(face_views, settings), names, settings, metric, reason)
 
 
 def _along_lumen(
@@ -153,7 +151,7 @@ def _along_lumen(
         for triangles in large_regions(missed, pairs, whole.areas, settings.region_area)
     ]
     names = [view.name for view in views]
-    return WallCoverage(whole, guessed, seen, level, names, settings, line, arc, clock, section, grid, regions)
+    return WallCoverage(whole, guessed, seen, level, names, settings, True, line, arc, clock, section, grid, regions)
 
 
 def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:

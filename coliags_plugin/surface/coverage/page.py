@@ -30,54 +30,45 @@ from coliags_plugin.surface.coverage.visibility import Level
 
 #: Said wherever a clinician could read the results.
 RESEARCH_USE = "Research use only: not a medical device, and not for decisions about a patient."
-#: Length of a segment in the table of segments, mm.
-_SEGMENT = 20.0
 #: Regions with a picture; widest picture, px; and how strongly the region covers the image.
 _PICTURED, _WIDTH, _OPACITY = 12, 480, 0.55
 
 
 def coverage_page(
-    coverage: WallCoverage,
+    coverage: WallCoverage | PartialCoverage,
     picture: UInt8[np.ndarray, "H W 3"],
     views: Sequence[CoverageView],
     name: str,
 ) -> Page:
-    """The page of a measurement, with its map and frames it was measured from, named after the scene or run."""
-    map_note = (
-        "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from top "
-        "to bottom, as seen by a viewer who looks deeper into the lumen. Wall that turns away from the lumen, as the "
-        "sides of folds, is narrower here than it is; areas in the tables are those of the surface. Numbers mark "
-        "missed regions, lines the ends of the section."
-    )
-    method_note = (
-        f"{_levels_note(coverage.settings)} The section reaches from the first to the last place along the lumen where "
-        "half of the wall (over 10 mm) was seen; beyond it, nothing is called missed. Where no wall was reconstructed, "
-        "its place is guessed from the wall around it."
-    )
-    unrolled = Image(EncodedImage.png(picture), "unrolled map", wide=True)
-    sections = [
-        Section("Map", [Paragraph(map_note), Figures([unrolled]), _level_table(coverage)]),
-        Section("Missed regions", list(_missed_regions(coverage, views))),
-        Section("Along the lumen", [_segment_table(coverage)]),
-        Section("How it is measured", [Paragraph(method_note), record("Settings", coverage.settings.model_dump())]),
-    ]
+    """The page of a measurement, with its picture and frames it was measured from, named after the scene or run."""
+    method = _levels_note(coverage.settings)
+    if isinstance(coverage, PartialCoverage):
+        note = (
+            f"There is no map along the lumen, no length and no missed region: {coverage.reason}. What was seen of the "
+            "reconstructed wall is a result all the same; what was not reconstructed is not counted."
+        )
+        shown = Image(EncodedImage.png(picture), "reconstructed wall", wide=True)
+        sections = [Section("Seen wall", [Paragraph(note, hint=False), Figures([shown]), _level_table(coverage)])]
+    else:
+        note = (
+            "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from "
+            "top to bottom, as seen by a viewer who looks deeper into the lumen. Wall that turns away from the lumen, "
+            "as the sides of folds, is narrower here than it is; areas in the tables are those of the surface. Numbers "
+            "mark missed regions, lines the ends of the section."
+        )
+        shown = Image(EncodedImage.png(picture), "unrolled map", wide=True)
+        sections = [
+            Section("Map", [Paragraph(note), Figures([shown]), _level_table(coverage)]),
+            Section("Missed regions", list(_missed_regions(coverage, views))),
+        ]
+        method += (
+            " The section reaches from the first to the last place along the lumen where half of the wall (over 10 mm) "
+            "was seen; beyond it, nothing is called missed. Where no wall was reconstructed, its place is guessed from "
+            "the wall around it."
+        )
+    settings = record("Settings", coverage.settings.model_dump())
+    sections.append(Section("How it is measured", [Paragraph(method), settings]))
     return Page(f"{name}: coverage", sections, _facts(coverage), note=RESEARCH_USE)
-
-
-def partial_page(coverage: PartialCoverage, picture: UInt8[np.ndarray, "H W 3"], name: str) -> Page:
-    """The page of a measurement without a section, with a picture of the wall."""
-    note = (
-        f"There is no map along the lumen, no length and no missed region: {coverage.reason}. What was seen of the "
-        "reconstructed wall is a result all the same; what was not reconstructed is not counted."
-    )
-    shown = Image(EncodedImage.png(picture), "reconstructed wall", wide=True)
-    sections = [
-        Section("Seen wall", [Paragraph(note, hint=False), Figures([shown]), _level_table(coverage, coverage.metric)]),
-        Section("How it is measured", [Paragraph(_levels_note(coverage.settings))]),
-    ]
-    seen = area_text(coverage.area(coverage.level != Level.UNSEEN), coverage.metric)
-    facts = [Fact("seen", seen), Fact("section", "none"), Fact("frames", str(len(coverage.names)))]
-    return Page(f"{name}: coverage", sections, facts, note=RESEARCH_USE)
 
 
 def _levels_note(settings: CoverageSettings) -> str:
@@ -90,31 +81,26 @@ def _levels_note(settings: CoverageSettings) -> str:
     )
 
 
-def partial_summary(coverage: PartialCoverage) -> list[str]:
+def summary(coverage: WallCoverage | PartialCoverage) -> list[str]:
     """A few lines for a terminal."""
-    seen = coverage.area(coverage.level != Level.UNSEEN)
-    return [
-        f"{area_text(seen, coverage.metric)} of reconstructed wall seen, {len(coverage.names)} frames",
-        *_level_lines(coverage, coverage.metric),
-        f"no map along the lumen, no length and no missed regions: {coverage.reason}",
-        RESEARCH_USE,
-    ]
+    levels = [f"{share:>5} %  {label} ({area})" for label, area, share in _levels(coverage)]
+    if isinstance(coverage, PartialCoverage):
+        seen = area_text(coverage.area(coverage.level != Level.UNSEEN), coverage.metric)
+        first = f"{seen} of reconstructed wall seen"
+        last = f"no map along the lumen, no length and no missed regions: {coverage.reason}"
+    else:
+        first = f"section of {coverage.section.length:.0f} mm"
+        missed = sum(region.area for region in coverage.regions)
+        limit = f"{coverage.settings.region_diameter:g} mm"
+        last = f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²"
+    return [f"{first}, {len(coverage.names)} frames", *levels, last, RESEARCH_USE]
 
 
-def _level_lines(coverage: SeenWall, metric: bool = True) -> list[str]:
-    """Share and area of each level."""
+def _levels(coverage: SeenWall) -> list[tuple[str, str, str]]:
+    """Label, area and share in percent of each level."""
     areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
     total = coverage.area()
-    return [f"{100.0 * area / total:>5.1f} %  {label} ({area_text(area, metric)})" for label, area in areas.items()]
-
-
-def summary(coverage: WallCoverage) -> list[str]:
-    """A few lines for a terminal."""
-    missed = sum(region.area for region in coverage.regions)
-    lines = [f"section of {coverage.section.length:.0f} mm, {len(coverage.names)} frames", *_level_lines(coverage)]
-    limit = f"{coverage.settings.region_diameter:g} mm"
-    lines.append(f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²")
-    return [*lines, RESEARCH_USE]
+    return [(label, area_text(area, coverage.metric), f"{100.0 * area / total:.1f}") for label, area in areas.items()]
 
 
 def clock_text(degrees: float) -> str:
@@ -123,23 +109,23 @@ def clock_text(degrees: float) -> str:
     return f"{minutes // 60 or 12}:{minutes % 60:02d}"
 
 
-def _facts(coverage: WallCoverage) -> list[Fact]:
-    total = coverage.area()
-    seen = 1.0 - coverage.area(coverage.level == Level.UNSEEN) / total
+def _facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
+    total, seen = coverage.area(), coverage.area(coverage.level != Level.UNSEEN)
+    frames = Fact("frames", str(len(coverage.names)))
+    if isinstance(coverage, PartialCoverage):
+        return [Fact("seen", area_text(seen, coverage.metric)), Fact("section", "none"), frames]
     missed = sum(region.area for region in coverage.regions)
     return [
-        Fact("seen", f"{100.0 * seen:.0f} % of the wall"),
+        Fact("seen", f"{100.0 * seen / total:.0f} % of the wall"),
         Fact("section", f"{coverage.section.length:.0f} mm of the lumen, {total / 100.0:.0f} cm²"),
         Fact("missed regions", f"{len(coverage.regions)}, {missed / 100.0:.1f} cm² together"),
         Fact("place guessed", f"{100.0 * coverage.area(coverage.guessed) / total:.0f} % of the wall"),
-        Fact("frames", str(len(coverage.names))),
+        frames,
     ]
 
 
-def _level_table(coverage: SeenWall, metric: bool = True) -> Table:
-    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
-    rows = [[name, area_text(area, metric), f"{100.0 * area / coverage.area():.1f}"] for name, area in areas.items()]
-    return simple_table(["wall", "area", "share, %"], rows)
+def _level_table(coverage: SeenWall) -> Table:
+    return simple_table(["wall", "area", "share, %"], [list(row) for row in _levels(coverage)])
 
 
 def _missed_regions(coverage: WallCoverage, views: Sequence[CoverageView]) -> Iterator[Block]:
@@ -181,22 +167,6 @@ def _region_table(coverage: WallCoverage) -> Table:
         for number, region in enumerate(coverage.regions, start=1)
     ]
     return simple_table([*head, "place guessed, %", "x, y, z, mm", "nearest frame"], rows)
-
-
-def _segment_table(coverage: WallCoverage) -> Table:
-    """Shares of each 20 mm of the section."""
-    levels = list(reversed(Level))
-    rows = []
-    areas, start = coverage.mesh.areas, coverage.section.start
-    while start < coverage.section.end:
-        end = min(start + _SEGMENT, coverage.section.end)
-        inside = (coverage.arc >= start) & (coverage.arc < end)
-        total = float(areas[inside].sum())
-        if total:
-            shares = [100.0 * float(areas[inside & (coverage.level == level)].sum()) / total for level in levels]
-            rows.append([f"{start:.0f} to {end:.0f}", f"{total / 100.0:.1f}", *(f"{share:.0f}" for share in shares)])
-        start = end
-    return simple_table(["along, mm", "area, cm²", *(f"{level.label}, %" for level in levels)], rows)
 
 
 def region_picture(

@@ -23,13 +23,7 @@ from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.surface.coverage.map import draw_map, draw_partial, face_colors
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
-from coliags_plugin.surface.coverage.page import (
-    RESEARCH_USE,
-    coverage_page,
-    partial_page,
-    partial_summary,
-    summary,
-)
+from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page, summary
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import recorded_views
 from coliags_plugin.surface.coverage.visibility import Level
@@ -60,13 +54,8 @@ def measure_scene(
     views = recorded_views(scene)
     with progress_callback() as progress:
         coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)
-    if isinstance(coverage, PartialCoverage):
-        values, lines = partial_values(coverage), partial_summary(coverage)
-        picture = draw_partial(coverage, views)
-        page = partial_page(coverage, picture, scene.name)
-    else:
-        values, lines, picture = coverage_values(coverage), summary(coverage), draw_map(coverage)
-        page = coverage_page(coverage, picture, views, scene.name)
+    picture = draw_partial(coverage, views) if isinstance(coverage, PartialCoverage) else draw_map(coverage)
+    values, page = coverage_values(coverage), coverage_page(coverage, picture, views, scene.name)
     with atomic_folder(output, overwrite) as folder:
         write_json(folder / "coverage.json", values)
         if values["regions"] is not None:
@@ -74,7 +63,7 @@ def measure_scene(
         write_png(folder / "map.png", picture)
         write_mesh(folder / "coverage.ply", colored_mesh(coverage))
         write_html(page, folder / "coverage.html")
-    return MeasuredCoverage(output, coverage, values, lines)
+    return MeasuredCoverage(output, coverage, values, summary(coverage))
 
 
 def open_recording(path: Path) -> Scene:
@@ -96,18 +85,36 @@ def colored_mesh(coverage: SeenWall) -> TriangleMesh:
     return TriangleMesh(vertices, np.arange(3 * len(mesh)).reshape(-1, 3), colors)
 
 
-def coverage_values(coverage: WallCoverage) -> dict[str, Any]:
-    """Everything that is measured of a section, as JSON values."""
-    return _seen_values(coverage) | {
-        "unit": "mm",
-        "seen": 1.0 - coverage.area(coverage.level == Level.UNSEEN) / coverage.area(),
+def coverage_values(coverage: WallCoverage | PartialCoverage) -> dict[str, Any]:
+    """Everything that is measured as JSON values: null is what only a section has, and limits that were not applied."""
+    views, seen, total = coverage.views, coverage.inside & coverage.views.seen, coverage.area()
+    settings, seen_area = coverage.settings.model_dump(), coverage.area(coverage.level != Level.UNSEEN)
+    values = {
+        "note": RESEARCH_USE,
+        "unit": "mm" if coverage.metric else "unknown",
+        "settings": {name: value if np.isfinite(value) else None for name, value in settings.items()},
+        "frames": len(coverage.names),
+        "area": total,
+        "seen_area": seen_area,
+        "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
+        "seen_surface": {
+            "median_distance": _median(coverage, views.distance, seen),
+            "median_incidence_degrees": _median(coverage, views.incidence, seen),
+            "median_pixels_per_length": _median(coverage, views.pixels_per_length, seen),
+            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
+        },
+    }
+    if isinstance(coverage, PartialCoverage):
+        return values | dict.fromkeys(("seen", "section", "guessed_share", "regions")) | {"no_section": coverage.reason}
+    return values | {
+        "seen": 1.0 - coverage.area(coverage.level == Level.UNSEEN) / total,
         "no_section": None,
         "section": {
             "start": round(coverage.section.start, 3),
             "end": round(coverage.section.end, 3),
             "rule": "from the first to the last place along the lumen where half of the wall of 10 mm was seen",
         },
-        "guessed_share": coverage.area(coverage.guessed) / coverage.area(),
+        "guessed_share": coverage.area(coverage.guessed) / total,
         "regions": [
             {
                 "number": number,
@@ -124,39 +131,6 @@ def coverage_values(coverage: WallCoverage) -> dict[str, Any]:
             }
             for number, region in enumerate(coverage.regions, start=1)
         ],
-    }
-
-
-def partial_values(coverage: PartialCoverage) -> dict[str, Any]:
-    """What was seen of the wall, as JSON values: null is what only a section has, and limits that were not applied."""
-    values = _seen_values(coverage)
-    return values | {
-        "unit": "mm" if coverage.metric else "unknown",
-        "settings": {name: value if np.isfinite(value) else None for name, value in values["settings"].items()},
-        "seen": None,
-        "section": None,
-        "no_section": coverage.reason,
-        "guessed_share": None,
-        "regions": None,
-    }
-
-
-def _seen_values(coverage: SeenWall) -> dict[str, Any]:
-    """Areas and how the seen surface was seen, as JSON values."""
-    views, seen, total = coverage.views, coverage.inside & coverage.views.seen, coverage.area()
-    return {
-        "note": RESEARCH_USE,
-        "settings": coverage.settings.model_dump(),
-        "frames": len(coverage.names),
-        "area": total,
-        "seen_area": coverage.area(coverage.level != Level.UNSEEN),
-        "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
-        "seen_surface": {
-            "median_distance": _median(coverage, views.distance, seen),
-            "median_incidence_degrees": _median(coverage, views.incidence, seen),
-            "median_pixels_per_length": _median(coverage, views.pixels_per_length, seen),
-            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
-        },
     }
 
 
