@@ -1,1 +1,1 @@
-"""Light and reflectance: lamps, beams, photometry, interreflection and tone curves."""
+"""Light: lamps, photometry and interreflection."""

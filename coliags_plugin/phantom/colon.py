@@ -13,9 +13,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from coliags_plugin.lighting.beams import smoothstep
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
+from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
 
 #: Length of the segment, mm.
 LENGTH = 232.0

@@ -20,7 +20,6 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.alignment import umeyama
-from coliags_plugin.lighting.tone_curve import KNEE
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
@@ -31,7 +30,7 @@ from coliags_plugin.phantom.measured import displaced, estimated_depth, pose_err
 from coliags_plugin.phantom.motion import poses_during
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
-from coliags_plugin.phantom.response import develop, exposure_for, exposures, meter_weights, white_balances
+from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, meter_weights, white_balances
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from

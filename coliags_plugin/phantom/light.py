@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.lighting.beams import SpreadLaw, beam
-from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
+from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, value_or_default
+from coliags_plugin.phantom.streams import smoothstep
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0
+#: cos psi below which the beam fades to 0 at 90 degrees: light guides only emit forward. No pixel looks there.
+_EDGE = float(np.cos(np.radians(72.0)))
 #: Normal reflectance of the mucus film: an index of refraction of 1.40.
 F0 = 0.028
 
@@ -67,8 +69,12 @@ class CameraLight:
         return bool(np.hypot(self.offset[0], self.offset[1]) > 0.0)
 
     def beam(self, cosine: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        """Intensity at an angle psi from the beam's axis by its cosine, 1 on the axis."""
-        return beam(cosine, self.spread_law, self.spread)
+        """Intensity at an angle psi from the beam's axis by its cosine, 1 on the axis (docs/phantom.md 2)."""
+        if self.spread_law == "cosine":
+            shape = np.maximum(cosine, 0.0) ** self.spread
+        else:
+            shape = np.exp(-self.spread * (1.0 - cosine))
+        return np.asarray(shape * smoothstep(cosine / _EDGE), dtype=cosine.dtype)
 
     def position(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
         """Where it is in the world, mm."""

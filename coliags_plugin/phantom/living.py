@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.lighting.beams import smoothstep
 from coliags_plugin.phantom.colon import DOME, LENGTH, Anatomy, ColonSurface, surface_of
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.streams import Purpose, stream
+from coliags_plugin.phantom.streams import Purpose, smoothstep, stream
 
 #: Length of the bend by breathing along the colon, mm: one period; and the time of one breath, s.
 _BEND, BREATH = 160.0, 4.0

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.lighting.beams import smoothstep
 from coliags_plugin.phantom.colon import RADIUS, Anatomy, ColonSurface
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
+from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
 
 #: Size, mm, and relative strength of the mottling of brightness.
 _MOTTLING = ((6.0, 0.06), (1.6, 0.045), (0.4, 0.045), (0.18, 0.045))

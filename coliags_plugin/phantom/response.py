@@ -8,16 +8,24 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.lighting.beams import smoothstep
-from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.phantom.imaging import Sensor
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
-from coliags_plugin.phantom.streams import Purpose, slow_drift, stream
+from coliags_plugin.phantom.streams import Purpose, slow_drift, smoothstep, stream
 
+#: Linear level above which the soft shoulder approaches 1.
+KNEE = 0.7
 #: Encoded level, 230 of 255, that metering of peaks aims at, and the share of the samples beyond it, %.
 _PEAK, _IGNORED = 0.9, 2.0
 #: Standard deviation of the weights of metering at the centre, as a share of the image's width.
 _CENTRE = 0.18
+
+
+def encode(linear: Float[np.ndarray, "..."], gamma: float, knee: float = KNEE) -> Float[np.ndarray, "..."]:
+    """Linear light to pixel values in [0, 1): a power law with a soft shoulder above the linear level ``knee``."""
+    linear = np.maximum(linear, 0.0)
+    room = 1.0 - knee
+    bent = np.where(linear > knee, 1.0 - room * np.exp(np.minimum(knee - linear, 0.0) / room), linear)
+    return np.asarray(bent ** (1.0 / gamma))
 
 
 def exposure_for(

@@ -1,4 +1,4 @@
-"""Independent random number streams per purpose from one seed, and smooth noise."""
+"""Independent random number streams per purpose from one seed, smooth noise and steps."""
 
 from __future__ import annotations
 
@@ -80,3 +80,9 @@ class SolidNoise:
         coordinates = np.einsum("nc,cd->dn", points.reshape(-1, 3), turn) + shift.astype(np.float32)[:, None]
         noise = scipy.ndimage.map_coordinates(self._volume, coordinates, order=1, mode="grid-wrap", output=np.float32)
         return np.asarray(noise.reshape(points.shape[:-1]))
+
+
+def smoothstep(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Cubic Hermite step: 0 below 0, 1 above 1."""
+    x = np.clip(x, 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
