@@ -1,6 +1,6 @@
-"""What covers the wall in an image: fluid, bubbles, and drops of water on the lens.
+"""What covers the wall in an image: fluid, bubbles, a tool, and drops of water on the lens.
 
-Bodies are triangle meshes that are drawn over the radiance of the wall.
+Bodies are triangle meshes, in the world or fixed to the camera, that are drawn over the radiance of the wall.
 """
 
 from __future__ import annotations
@@ -26,6 +26,11 @@ _POOL, _POOL_END = (34.0, 96.0), 12.0
 _BUBBLE, _CLUSTER, _SPREAD, _DRIFT = (0.35, 1.3), 12, 5.0, 1.5
 #: Arc lengths at which bubbles are, mm.
 _BUBBLES_AT = (30.0, 120.0)
+#: Radius of the tool, mm, and where in camera axes it leaves its channel, mm.
+_TOOL_RADIUS, _CHANNEL = 1.2, np.array([3.0, 3.6, 0.0])
+#: Distance from the channel to the tool's tip, smallest and largest, mm, and period of its motion, s.
+_TOOL_REACH, _TOOL_PERIOD = (4.0, 22.0), 5.0
+_TOOL_ALBEDO = np.array([0.07, 0.075, 0.08])
 #: Time that water stays on the lens, s, and how many drops there are.
 _WASH_TIME, _DROPS = 1.2, 9
 
@@ -37,6 +42,7 @@ class Cover(IntEnum):
     FLUID = 64
     BUBBLE = 128
     DROP = 192
+    TOOL = 255
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,7 @@ class Body:
     cover: Cover
     tracer: Tracer
     normals: Float[np.ndarray, "V 3"]
+    in_camera: bool  # whether its mesh is in camera axes instead of the world's
 
     def draw(
         self,
@@ -57,30 +64,33 @@ class Body:
         light: Float[np.ndarray, "N 3"],
     ) -> Bool[np.ndarray, "N"]:
         """Draw it over ``light`` where it is nearer than ``z_depth``; changes both and returns where."""
-        hits = self.tracer.cast(camera_to_world, directions)
+        pose = np.eye(4) if self.in_camera else camera_to_world
+        hits = self.tracer.cast(pose, directions)
         nearer = hits.found & (hits.z_depth < z_depth)
         if not nearer.any():
             return nearer
         hits, ahead = hits.only(nearer), directions[nearer]
         length = np.linalg.norm(ahead, axis=1)
-        to_eye = rotated(ahead, camera_to_world[:3, :3]) / -length[:, None]
-        points = camera_to_world[:3, 3].astype(np.float32) - to_eye * (hits.z_depth * length)[:, None]
+        to_eye = rotated(ahead, pose[:3, :3]) / -length[:, None]
+        points = pose[:3, 3].astype(np.float32) - to_eye * (hits.z_depth * length)[:, None]
         normals = self.tracer.interpolate(self.normals, hits)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
         facing = np.einsum("nc,nc->n", normals, to_eye)
         normals *= np.sign(facing)[:, None]
         facing = np.abs(facing)
         flat = np.zeros(len(facing), np.float32)
-        f0, roughness = (0.02, 0.2) if self.cover is Cover.FLUID else (0.04, 0.15)
+        f0, roughness = {Cover.FLUID: (0.02, 0.2), Cover.BUBBLE: (0.04, 0.15), Cover.TOOL: (0.35, 0.45)}[self.cover]
         received, diffuse, gloss = (np.zeros((len(facing), 1), np.float32) for _ in range(3))
         for lamp in lamps:
-            strength, to_lamp = lamp.irradiance(points, camera_to_world)
+            strength, to_lamp = lamp.irradiance(points, pose)
             strength *= length**-vignetting
             received += strength[:, None]
             diffuse += (strength * np.maximum(np.einsum("nc,nc->n", normals, to_lamp), 0.0))[:, None]
             surface = replace(lamp, f0=f0, roughness=roughness, specular=1.0)
             gloss += (strength * surface.gloss(normals, to_lamp, to_eye, flat))[:, None]
-        if self.cover is Cover.BUBBLE:
+        if self.cover is Cover.TOOL:
+            light[nearer] = _TOOL_ALBEDO * diffuse + gloss
+        elif self.cover is Cover.BUBBLE:
             # A film that hides little from the front and much at its rim, where it also scatters.
             rim = (1.0 - facing[:, None]) ** 2
             light[nearer] = light[nearer] * (1.0 - 0.65 * rim) + 0.3 * rim * received + gloss
@@ -94,10 +104,14 @@ class Body:
 
 def bodies_at(surface: ColonSurface, settings: PhantomSettings, time: float) -> tuple[Body, ...]:
     """The bodies at a time, s, over the wall as it then is; farther ones first."""
-    meshes = [(Cover.FLUID, _pool(surface, settings, time))] if settings.fluid else []
+    meshes = []
+    if settings.fluid:
+        meshes.append((Cover.FLUID, _pool(surface, settings, time), False))
     if settings.bubbles:
-        meshes.append((Cover.BUBBLE, _bubbles(surface, settings, time)))
-    return tuple(Body(cover, Tracer(mesh), mesh.normals) for cover, mesh in meshes)
+        meshes.append((Cover.BUBBLE, _bubbles(surface, settings, time), False))
+    if settings.tool:
+        meshes.append((Cover.TOOL, _tool(settings, time), True))
+    return tuple(Body(cover, Tracer(mesh), mesh.normals, in_camera) for cover, mesh, in_camera in meshes)
 
 
 def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh:
@@ -159,6 +173,25 @@ def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> M
     normals = np.broadcast_to(sphere.normals, vertices.shape)
     triangles = sphere.triangles[None] + len(sphere.vertices) * np.arange(count)[:, None, None]
     return _mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3))
+
+
+def _tool(settings: PhantomSettings, time: float) -> Mesh:
+    """A rod with a round end, in camera axes, that moves in and out of its channel and swings."""
+    phase = stream(settings.seed, Purpose.PROPS, 2).uniform(0.0, 2.0 * np.pi, 3)
+    low, high = _TOOL_REACH
+    turn = 2.0 * np.pi * time / _TOOL_PERIOD
+    reach = low + (high - low) * (0.5 - 0.5 * np.cos(turn + phase[0]))
+    swing = 0.06 * np.sin(np.array([1.7, 1.3]) * turn + phase[1:])
+    aim = _unit(np.array([swing[0] - 0.12, swing[1] - 0.16, 1.0]))
+    sphere = _sphere()
+    # A sphere whose rear half is drawn out behind the lens.
+    behind = sphere.vertices[:, 2] < 0.0
+    vertices = _TOOL_RADIUS * sphere.vertices
+    vertices[behind, 2] = -60.0
+    normals = np.where(behind[:, None], sphere.vertices * [1.0, 1.0, 0.0], sphere.vertices)
+    side = _unit(np.cross([0.0, 1.0, 0.0], aim))
+    axes = np.stack([side, np.cross(aim, side), aim], axis=1)
+    return _mesh(_CHANNEL + reach * aim + vertices @ axes.T, _unit(normals + 1e-9) @ axes.T, sphere.triangles)
 
 
 def _sphere() -> Mesh:

@@ -39,7 +39,8 @@ def _near_lens(offset: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 _Triple = tuple[float, float, float]
-_Albedo, _Error = Annotated[float, Field(ge=0.02, le=0.9)], Annotated[float, Field(ge=0.0, le=5.0)]
+_Albedo = Annotated[float, Field(ge=0.02, le=0.9)]
+_Error = Annotated[float, Field(ge=0.0, le=5.0)]
 _Offset = Annotated[_Triple, AfterValidator(_near_lens)]
 
 
@@ -215,6 +216,7 @@ class PhantomSettings(Settings):
     softness: float = Field(0.0, ge=0.0, le=4.0)  # standard deviation of the lens's blur, pixels; 0 is none
     fluid: float = Field(0.0, ge=0.0, le=8.0)  # depth of a pool of fluid, mm; 0 is none
     bubbles: int = Field(0, ge=0, le=1000)  # number of bubbles that drift along the wall, in clusters
+    tool: bool = False  # whether a tool moves in and out of the working channel
     washes: int = Field(0, ge=0, le=20)  # how often a wash leaves drops on the lens for 1.2 s
     fold_spacing: float = Field(25.0, ge=8.0, le=40.0)  # mean distance of folds along the colon, mm
     texture: float = Field(1.0, ge=0.0, le=1.0)  # contrast of the mucosa's colours and fine relief
@@ -264,7 +266,7 @@ class PhantomSettings(Settings):
     @property
     def covers(self) -> bool:
         """Whether anything but the wall is in view."""
-        return bool(self.fluid or self.bubbles or self.washes)
+        return bool(self.fluid or self.bubbles or self.tool or self.washes)
 
     @property
     def light_preset(self) -> Preset:

@@ -1,6 +1,6 @@
 """Files of meshes and of Gaussians have one frame and unit, as other programs read them: that of the scene.
 
-Of SPZ, which has axes of its own, ``tests/export/splats/test_independent_reader.py`` has the test.
+Of SPZ, which has axes of its own, ``tests/export/splats/test_splat_files.py`` has the test.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from coliags_plugin.export.splats.files import write_splats
 from coliags_plugin.geometry.meshes.files import write_mesh
@@ -40,25 +41,8 @@ def in_order(points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "splats.ply", "splats.glb"])
 def test_trimesh(folder, name):
-    trimesh = pytest.importorskip("trimesh")
     scene = trimesh.load_scene(folder / name, skip_materials=True)
     (placed,) = scene.dump()
     np.testing.assert_allclose(in_order(placed.vertices), PLACES, rtol=1e-6)
     if name.startswith("mesh"):
         np.testing.assert_array_equal(placed.visual.vertex_colors[np.argsort(placed.vertices[:, 2]), :3], COLORS)
-
-
-@pytest.mark.parametrize("name", ["mesh.glb", "splats.glb"])
-def test_pygltflib(folder, name):
-    """Neither file has a node that turns, scales or moves; the positions' bounds are those of the scene."""
-    document = pytest.importorskip("pygltflib").GLTF2().load(folder / name)
-    (node,) = document.nodes
-    assert node.rotation is None and node.scale is None and node.translation is None and node.matrix is None
-    positions = document.accessors[document.meshes[node.mesh].primitives[0].attributes.POSITION]
-    assert (positions.min, positions.max) == (PLACES.min(axis=0).tolist(), PLACES.max(axis=0).tolist())
-
-
-@pytest.mark.parametrize("name", ["mesh.ply", "splats.ply"])
-def test_plyfile(folder, name):
-    rows = pytest.importorskip("plyfile").PlyData.read(folder / name)["vertex"]
-    np.testing.assert_array_equal(np.stack([rows[axis] for axis in "xyz"], axis=1), PLACES)

@@ -50,7 +50,7 @@ def path_of(colon: Colon, **changes) -> np.ndarray:
     return camera_path(colon.centre_line, colon.settings.model_copy(update=changes), colon.tracer)
 
 
-@pytest.fixture(scope="module", params=[1, 4, 9])
+@pytest.fixture(scope="module", params=[1, 4])
 def colon(request):
     return colon_of(request.param)
 
@@ -104,12 +104,6 @@ def test_it_is_smooth(colon):
             assert of(finer).max() == pytest.approx(0.5 * of(poses).max(), rel=0.03)
 
 
-def test_the_same_seed_has_the_same_path_and_another_one_another(colon):
-    path = colon.paths["c3vd"]
-    np.testing.assert_array_equal(path_of(colon), path)
-    assert np.abs(path_of(colon, seed=colon.settings.seed + 1) - path).max() > 1.0
-
-
 def test_a_curve_that_rests_goes_through_its_values_and_stands_still_there():
     values = np.array([[0.0, 3.0], [2.0, -1.0], [2.0, 5.0]])
     np.testing.assert_array_equal(resting(values, np.array([0.0, 0.5, 1.0])), values)
@@ -147,20 +141,3 @@ def test_automatic_gain_swings_up_to_its_span_and_most_of_the_rotated_views_is_s
     row = told.stdout.splitlines()[2].split(" | ")
     assert row[3] == f"{gain.max() / gain.min():.2f}" and 6.0 <= float(row[4]) <= 7.0
     assert float(row[-1].rstrip(" |")) == pytest.approx(100.0 * np.mean(seen), abs=0.51)
-
-
-#: Positions, mm, and viewing directions of frames 0 and 30 of 60, written down before the path that inspects was there.
-EARLIER = """
-c3vd pullback -14.9409 -8.2985 73.6044 -0.2705 -0.3989 0.8762 -8.2516 -1.1216 49.8624 -0.3037 -0.2893 0.9078
-c3vd rotation -8.0643 -3.7285 53.0131 -0.3087 -0.3089 0.8996 -7.5433 -2.979 50.0678 -0.6002 -0.285 0.7474
-strong pullback -14.9536 -8.0554 73.6861 -0.2344 -0.4027 0.8848 -7.9796 0.231 50.2319 -0.3863 -0.1824 0.9042
-strong rotation -8.0658 -3.6535 53.0305 -0.3086 -0.3115 0.8988 -7.5973 -2.8606 50.0777 -0.656 -0.2812 0.7004
-"""
-
-
-def test_other_paths_are_those_of_earlier_versions():
-    colon = colon_of(3, mesh_spacing=1.2)
-    for light, trajectory, *told in map(str.split, EARLIER.strip().splitlines()):
-        poses = path_of(colon, light=light, trajectory=trajectory, frames=60)
-        found = [column for frame in (0, 30) for column in (poses[frame, :3, 3], poses[frame, :3, 2])]
-        np.testing.assert_allclose(np.ravel(found), np.array(told, float), atol=2e-3)

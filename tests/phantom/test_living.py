@@ -14,14 +14,15 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
+from coliags_plugin.phantom.imaging import Sensor
 from coliags_plugin.phantom.living import WAVE_LENGTH, WAVE_SPEED, breathing, peristalsis, wall_motion
 from coliags_plugin.phantom.motion import poses_between, poses_during, rotation
 from coliags_plugin.phantom.props import Cover
 from coliags_plugin.phantom.settings import IN_VIVO, PhantomSettings, phantom_settings
 from tests.phantom.phantom_layouts import TINY
 
-SMALL = TINY | {"width": 48, "height": 38, "mesh_spacing": 2.0, "rotation_views": 0}
-LIVING = SMALL | {"wave": 2.0, "breathing": 1.0, "fluid": 4.0, "bubbles": 80, "noise": 0.0}
+SMALL = TINY | {"width": 48, "height": 38, "mesh_spacing": 2.5, "texture_spacing": 0.8, "rotation_views": 0}
+LIVING = SMALL | {"wave": 2.0, "breathing": 1.0, "fluid": 4.0, "bubbles": 80, "tool": True, "noise": 0.0}
 
 
 def prepared(settings: PhantomSettings) -> PreparedPhantom:
@@ -34,9 +35,11 @@ def living() -> PreparedPhantom:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Path:
+def written(living, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("phantoms") / "living"
-    generate(PhantomSettings(**LIVING), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coliags_plugin.phantom.generate.prepare", lambda *_: living)  # which takes most of the time
+        generate(living.settings, folder)
     return folder
 
 
@@ -92,7 +95,7 @@ def test_depth_is_that_of_the_moved_wall_that_the_files_tell(written):
 
 
 def test_masks_are_exactly_where_the_wall_alone_would_look_different(living, written):
-    bare = replace(living, settings=living.settings.model_copy(update={"fluid": 0.0, "bubbles": 0}))
+    bare = replace(living, settings=living.settings.model_copy(update={"fluid": 0.0, "bubbles": 0, "tool": False}))
     found = set()
     for frame in (0, 4, 8):
         exposure, _ = living.render_frame(frame)
@@ -102,7 +105,7 @@ def test_masks_are_exactly_where_the_wall_alone_would_look_different(living, wri
         stored = cv2.imread(str(written / "truth" / "not_wall" / f"{frame:04d}.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(stored, living.sensor.image(exposure.cover))
         found |= set(np.unique(stored))
-    assert found == {Cover.WALL, Cover.FLUID, Cover.BUBBLE}
+    assert found == {Cover.WALL, Cover.FLUID, Cover.BUBBLE, Cover.TOOL}
 
 
 def test_drops_are_masked_and_the_rest_of_the_image_is_as_before():
@@ -155,8 +158,7 @@ def test_a_still_camera_is_not_blurred():
 
 
 def test_softness_spreads_light_and_keeps_it():
-    phantom = prepared(PhantomSettings(**SMALL))
-    sensor = phantom.sensor
+    sensor = Sensor.behind(PinholeLens(28.0, 28.0, 24.0, 19.0, 48, 38), np.ones((38, 48), bool), 1)
     point = np.zeros((38, 48, 3), np.float32)
     point[19, 24] = 1.0
     soft = sensor.image(sensor.softened(point[sensor.mask], 1.5))[..., 0]

@@ -103,7 +103,7 @@ def _written(
     unit = trained.scene.length_unit
     comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"
     write_splats(output, cloud, form, comment)
-    read = FORMATS[form].read
+    _, read = FORMATS[form]
     kept = cloud if read is None else read(output)
     record = {
         "format": "coliags-export",
@@ -111,7 +111,6 @@ def _written(
         "file": {
             "name": output.name,
             "format": form,
-            "keeps": FORMATS[form].keeps,
             "bytes": output.stat().st_size,
             "sha256": file_sha256(output),
         },
@@ -128,7 +127,6 @@ def _written(
             "step": trained.step,
         },
         "baking": baking,
-        "left_out": {name: module.untrained_views for name, module in trained.model.view_modules.items()},
         "cost": export_cost(trained, kept, held) if measure else None,
         "software": software(),
     }

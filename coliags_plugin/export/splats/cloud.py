@@ -83,12 +83,6 @@ class SplatCloud:
         attenuation = None if self.attenuation is None else self.attenuation * np.array([factor, 1.0], np.float32)
         return replace(self, means=self.means * length, scales=self.scales * length, attenuation=attenuation)
 
-    def concat(self, others: SplatCloud) -> SplatCloud:
-        """These Gaussians and others, of as many scales and harmonics."""
-        return SplatCloud(
-            **{name: np.concatenate([values, getattr(others, name)]) for name, values in self._arrays().items()}
-        )
-
     def _arrays(self) -> dict[str, np.ndarray]:
         """The arrays that it has, by the names of their fields."""
         return {name: values for name, values in vars(self).items() if values is not None}

@@ -6,7 +6,6 @@ import json
 import logging
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,24 +86,11 @@ log = logging.getLogger(__name__)
 THICKNESS_SHARE = 0.01
 
 
-@dataclass(frozen=True)
-class SplatFormat:
-    """A writer of path, cloud and comment, a reader where such files are read, and what of the numbers is kept."""
-
-    write: Callable[[Path, SplatCloud, str], None]
-    read: Callable[[Path], SplatCloud] | None
-    keeps: str
-
-
-#: By name, which is the suffix without its dot.
-FORMATS: Mapping[str, SplatFormat] = {
-    "ply": SplatFormat(write_splat_ply, read_splat_ply, "all numbers as float32"),
-    "spz": SplatFormat(
-        write_spz,
-        read_splat_spz,
-        "positions to 1/4096 unit, log scales to 1/16, colours, opacities and harmonics to 8 bits",
-    ),
-    "glb": SplatFormat(write_splat_glb, None, "all numbers as float32"),
+#: Writer of path, cloud and comment, and reader where such files are read, by name: the suffix without its dot.
+FORMATS: Mapping[str, tuple[Callable[[Path, SplatCloud, str], None], Callable[[Path], SplatCloud] | None]] = {
+    "ply": (write_splat_ply, read_splat_ply),
+    "spz": (write_spz, read_splat_spz),
+    "glb": (write_splat_glb, None),
 }
 
 
@@ -119,12 +105,13 @@ def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") ->
     check_format(name)
     if not len(cloud):
         raise InputError("no Gaussian to write", "at least one")
-    FORMATS[name].write(path, cloud.with_thickness(THICKNESS_SHARE), comment)
+    write, _ = FORMATS[name]
+    write(path, cloud.with_thickness(THICKNESS_SHARE), comment)
 
 
 def read_splats(path: Path) -> SplatCloud:
     """Read Gaussians, in the format of the suffix; rows that are not finite are dropped with a warning."""
-    readers = {f".{name}": known.read for name, known in FORMATS.items() if known.read is not None}
+    readers = {f".{name}": read for name, (_, read) in FORMATS.items() if read is not None}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: no reader for '{path.suffix}'", f"a file {', '.join(readers)}")

@@ -20,13 +20,13 @@ from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.exporting import export_cost
-from coliags_plugin.export.splats.cloud import cloud_of_field, field_of_cloud
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import read_splats, write_splats
 from coliags_plugin.export.splats.ply import write_splat_ply
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from tests.commands import refused, run
-from tests.export.splats.clouds import random_cloud
+from tests.export.splats.clouds import PARTS, random_cloud
 from tests.scenes import SMALL, write_wall
 
 ANCHORS, OTHERS = parse_assignments(SMALL), parse_assignments([SMALL[0], SMALL[2]])
@@ -163,7 +163,8 @@ def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(runs):
     one = cloud.part(np.arange(len(cloud)) == 0)
     shape = {"means": before[None], "scales": np.full_like(one.scales, 0.1), "opacities": np.float32([0.9])}
     blob = replace(one, **shape, harmonics=one.harmonics + np.float32(10.0))
-    assert distillation.best_frame(field_of_cloud(cloud.concat(blob)), trained, None) == 1
+    both = SplatCloud(**{name: np.concatenate([getattr(cloud, name), getattr(blob, name)]) for name in PARTS})
+    assert distillation.best_frame(field_of_cloud(both), trained, None) == 1
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):

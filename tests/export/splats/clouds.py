@@ -10,6 +10,8 @@ import numpy as np
 
 from coliags_plugin.export.splats.cloud import SplatCloud
 
+PARTS = ("means", "quats_wxyz", "scales", "opacities", "harmonics")
+
 
 def random_cloud(count: int = 50, degree: int = 3, scales: int = 3, seed: int = 0) -> SplatCloud:
     """Gaussians within 50 units of (20, -30, 60), of 0.05 to 2 units, with unit quaternions and colours about 0.5."""

@@ -5,6 +5,7 @@ import logging
 import struct
 from dataclasses import replace
 
+import gsply
 import numpy as np
 import pytest
 import torch
@@ -19,8 +20,6 @@ from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_sp
 from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
 from coliags_plugin.fields import spherical_harmonics
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
-
-PARTS = ("means", "quats_wxyz", "scales", "opacities", "harmonics")
 
 
 def written(tmp_path, cloud: SplatCloud, name: str):
@@ -69,7 +68,6 @@ def test_attributes_of_ply_stand_in_the_order_of_3dgs(tmp_path):
 
 
 def test_another_library_reads_the_ply(tmp_path):
-    gsply = pytest.importorskip("gsply")
     cloud = random_cloud(20)
     found = gsply.plyread(str(written(tmp_path, cloud, "ply")))
     np.testing.assert_array_equal(found.means, cloud.means)
@@ -119,7 +117,6 @@ def test_spz_round_trip_to_its_quantisation(tmp_path, degree):
 
 def test_spz_is_turned_to_its_own_axes(tmp_path):
     """y up and z backwards: positions, covariances and colours seen along turned directions."""
-    gsply = pytest.importorskip("gsply")
     cloud = random_cloud(40)
     path = written(tmp_path, cloud, "spz")
     assert struct.unpack("<II", gzip.decompress(path.read_bytes())[:8]) == (0x5053474E, 3)

@@ -8,8 +8,6 @@ import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from tests.scenes import SMALL
 
-FRAMES = 9
-
 
 @pytest.fixture(scope="session")
 def run_of(wall, tmp_path_factory):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.gaussians import Gaussians
 
 
@@ -25,29 +24,3 @@ def some_gaussians(count: int, scales: int = 3, seed: int = 0) -> Gaussians:
         source_index=index,
         visible_sources=index,
     )
-
-
-class Scripted(GaussianField):
-    """A field that yields the given Gaussians, one after the other, and notes the cameras."""
-
-    primitive = "gaussians3d"
-
-    def __init__(self, *views: Gaussians) -> None:
-        super().__init__()
-        self.views = list(views)
-        self.cameras = []
-
-    def gaussians(self, camera):
-        self.cameras.append(camera)
-        return self.views[min(len(self.cameras), len(self.views)) - 1]
-
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        raise NotImplementedError
-
-    @classmethod
-    def from_state(cls, state, settings):
-        raise NotImplementedError
-
-    def parameter_groups(self):
-        return {}
