@@ -12,7 +12,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
+from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.phantom.layouts.c3vd import depth_steps
 

@@ -14,11 +14,21 @@ from coliags_plugin.contracts.fields import (
     RadianceLevel,
     RadianceSamples,
 )
-from coliags_plugin.contracts.following import Follower, Logger, scalars
-from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear, steps_text
-from coliags_plugin.contracts.training import Draw, ParameterRows, Sampler, Strategy, TrainedModel, TrainingStep
+from coliags_plugin.contracts.training import (
+    Draw,
+    Follower,
+    Logger,
+    Loss,
+    LossSettings,
+    ParameterRows,
+    Sampler,
+    Strategy,
+    TrainedModel,
+    TrainingStep,
+    scalars,
+)
 
 __all__ = [
     "AppearanceHead",

@@ -1,24 +1,28 @@
-"""Training step, and the base classes of strategies and samplers."""
+"""Training step, and the base classes of strategies, samplers, losses and observers of a run."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Generic
 from typing import Protocol as TypingProtocol
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
+from pydantic import Field as Option
+from pydantic import model_validator
 from torch import Tensor
-from typing_extensions import TypeVar
+from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts.fields import Field
 from coliags_plugin.contracts.rendering import ViewModule
-from coliags_plugin.contracts.schedule import Schedule
+from coliags_plugin.contracts.schedule import Schedule, log_linear
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Target
-from coliags_plugin.core.settings import Settings, SettingsT
+from coliags_plugin.core.settings import Settings, SettingsT, refuse_zero_ends
 
 #: Field, or what a strategy uses of one.
 FieldT = TypeVar("FieldT", default=Any)
@@ -170,3 +174,112 @@ class Sampler(ABC, Generic[SettingsT]):
     @abstractmethod
     def next(self) -> list[Draw]:
         """The draws of the next step, at least one."""
+
+
+class LossSettings(Settings):
+    """Weight of a loss term over the run, and the steps at which it is active.
+
+    ``weight`` and ``final_weight`` are above 0; step numbers keep their share of a run of another length.
+    """
+
+    weight: float  # factor of the term, at the start where final_weight is set
+    final_weight: float | None = None  # factor at the last step, approached log-linearly; null: constant weight
+    min_weight: float = Option(default=0.0, ge=0.0)  # lower bound of the decaying weight
+    from_step: int = Option(default=0, ge=0)  # the term is active after this step
+    until_step: int | None = Option(default=None, ge=1)  # and up to this one; null: to the end
+
+    @model_validator(mode="after")
+    def _ends_above_zero(self) -> Self:
+        refuse_zero_ends(self, "weight", "final_weight")
+        return self
+
+    @model_validator(mode="after")
+    def _from_before_until(self) -> Self:
+        if self.until_step is not None and self.until_step <= self.from_step:
+            raise ValueError(f"until_step {self.until_step} does not come after from_step {self.from_step}")
+        return self
+
+    def active(self, step: int, schedule: Schedule) -> bool:
+        """Whether the term counts at a step, counted from 1."""
+        return step > schedule.at(self.from_step) and (self.until_step is None or step <= schedule.at(self.until_step))
+
+    def weight_at(self, step: int, steps: int) -> float:
+        """The weight at step ``step`` (from 1) of ``steps``."""
+        if self.final_weight is None:
+            return self.weight
+        return max(self.min_weight, log_linear(self.weight, self.final_weight, step / steps))
+
+
+#: Settings of a loss.
+LossSettingsT = TypeVar("LossSettingsT", bound=LossSettings, default=LossSettings)
+
+
+class Loss(ABC, Generic[LossSettingsT]):
+    """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+    #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
+    needs: ClassVar[frozenset[str]] = frozenset()
+    #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
+    whole_image: ClassVar[bool] = False
+    #: Whether it draws the rendered depth to ``Target.depth`` as to the truth, by confidence weighted at most.
+    trusts_depth: ClassVar[bool] = False
+    #: Whether it reads ``output.splats``, which only splatting renderers deliver.
+    needs_splats: ClassVar[bool] = False
+
+    def __init__(self, settings: LossSettingsT) -> None:
+        self.settings = settings
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """Outputs beyond rgb and alpha that the renderer must deliver."""
+        return frozenset()
+
+    def check(self, model: TrainedModel) -> None:
+        """Check, before training, that the model has what the term reads.
+
+        Raises:
+            InputError: It lacks something.
+        """
+
+    @abstractmethod
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term; pixels whose ``step.target.mask`` is False are ignored."""
+
+
+class Follower:
+    """Observer of a training run, called after every step and every row of the log; it changes nothing of the run."""
+
+    def logged(self, row: JsonObject) -> None:
+        """A row has been added to the training log (docs/results_files.md)."""
+
+    def stepped(self, step: int) -> None:
+        """A training step is done; the model stays as it is until this returns."""
+
+    def close(self) -> None:
+        """Training has ended, however it did."""
+
+
+class Logger(Follower, ABC):
+    """Base class of loggers, which copy the rows of the training log to another service or format.
+
+    Args:
+        run: The run folder.
+        title: Method, scene and seed.
+        config: The method config as plain values.
+        step: Of the checkpoint that training goes on from; 0 at the start. Later rows of an earlier attempt are void.
+    """
+
+    #: A library that may not be installed.
+    library: ClassVar[str]
+
+    @abstractmethod
+    def __init__(self, run: Path, title: str, config: Mapping[str, Any], step: int) -> None: ...
+
+
+def scalars(row: JsonObject) -> dict[str, float]:
+    """Numbers of a row of the training log but its step, those of the loss terms as ``terms/NAME``."""
+    flat = {name: value for name, value in row.items() if name != "step"}
+    terms = flat.pop("terms", {})
+    flat |= {f"terms/{name}": value for name, value in terms.items()}
+    return {name: float(value) for name, value in flat.items() if isinstance(value, (int, float))}

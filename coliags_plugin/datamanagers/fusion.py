@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.datamanagers.reading.parallel import parallel_map
+from coliags_plugin.datamanagers.reading.files import parallel_map
 
 log = logging.getLogger(__name__)
 

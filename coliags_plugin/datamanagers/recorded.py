@@ -21,7 +21,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.parallel import parallel_map
+from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name, with_valid_seen_masks
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings

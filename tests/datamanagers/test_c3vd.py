@@ -19,8 +19,8 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
 from coliags_plugin.datamanagers.c3vd_v2.reader import CANDIDATE_LENS, ORDER, read_camera_intrinsics
-from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.files import read_intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.c3vd import depth_steps
 from tests.datamanagers.kinds import write

@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers import stored_frames
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
-from coliags_plugin.datamanagers.reading.parallel import parallel_map
+from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
 

@@ -10,8 +10,9 @@ import pytest
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
 from coliags_plugin.pipeline.jobs import PartTask, work
@@ -74,7 +75,7 @@ def write_atlas(folder, counts=COUNTS, units=("unknown", "unknown", "unknown"), 
         points = poses[:, :3, 3] + depth * (number + 1) * poses[:, :3, 2]
         seen = [SeenPoints(np.array([[20.0, 16.0]]), np.array([index])) for index in range(count)]
         add_points(model, seen, points, np.zeros((count, 3), np.uint8))
-        write_model(folder, model, number)
+        write_reconstruction(folder / f"sparse/{number}", model)
         stretch = {"model": f"sparse/{number}", "unit": units[number], "frames": [*range(start, start + count)]}
         submaps.append(stretch)
         names += own

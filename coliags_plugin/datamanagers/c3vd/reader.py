@@ -14,8 +14,8 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.files import read_intrinsics
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import (
     ROTATION,

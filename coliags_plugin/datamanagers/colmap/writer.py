@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-
-from coliags_plugin.geometry.poses.colmap import write_reconstruction
 
 if TYPE_CHECKING:
     import pycolmap
@@ -42,8 +39,3 @@ def add_points(
     for position, track, color in zip(positions, tracks, colors, strict=True):
         model.add_point3D(position, track, color)
     model.update_point_3d_errors()
-
-
-def write_model(folder: Path, model: pycolmap.Reconstruction, number: int = 0) -> None:
-    """Write a binary model into ``sparse/NUMBER`` of a scene's folder."""
-    write_reconstruction(folder / "sparse" / str(number), model)

@@ -1,4 +1,4 @@
-"""Finding the files of a scene: numbered frames, files named by other files, and names of frames."""
+"""Files of a scene: numbered frames, names, those named by others, ``camera.json``, and reading many at once."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ import logging
 import os
 import posixpath
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.core.progress import Progress, with_progress
 
 log = logging.getLogger(__name__)
 
@@ -147,3 +153,53 @@ def warn_of_unposed(file: Path, others: Sequence[Path]) -> None:
 def first_few(names: Sequence[str]) -> str:
     """The first three names, for messages."""
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """The intrinsics of a ``camera.json``."""
+    data = read_json(path, "a JSON object")
+    keys = ("fx", "fy", "cx", "cy", "w", "h")
+    if not isinstance(data, dict) or any(key not in data for key in keys):
+        missing = [key for key in keys if not isinstance(data, dict) or key not in data]
+        raise InputError(
+            f"{path} has no {', '.join(missing)}",
+            "fx, fy, cx, cy in pixels (centres at integers) and the image's w, h",
+            "Add them",
+        )
+    fx, fy = (read_number(data, key, path, "a number above 0", above=0.0) for key in ("fx", "fy"))
+    cx, cy = (read_number(data, key, path) for key in ("cx", "cy"))
+    return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, *image_size(data, path))
+
+
+def write_camera_json(path: Path, intrinsics: Intrinsics, **more: float) -> None:
+    """Write a ``camera.json``; ``more`` are ``w`` and ``h``, pixels, and other values of a format, in this order."""
+    k = intrinsics
+    write_json(path, {"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5, **more})
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+#: Largest number of threads: more would wait for the disk.
+_READERS = 8
+
+
+def parallel_map(
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    what: str,
+    progress: Progress | None = None,
+    threads: int | None = None,
+) -> list[_Result]:
+    """Apply a function to every item in a thread pool and return the results in order; they are all held in memory.
+
+    ``what`` names the task for ``progress``. ``threads`` is by default what reads files fastest. The exception of the
+    first item that fails is raised, and the remaining items are cancelled.
+    """
+    with ThreadPoolExecutor(threads or min(_READERS, os.cpu_count() or 1)) as pool:
+        pending = [pool.submit(function, item) for item in items]
+        try:
+            return [future.result() for future in with_progress(pending, what, progress)]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise

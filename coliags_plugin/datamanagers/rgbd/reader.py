@@ -20,9 +20,14 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
-from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
+from coliags_plugin.datamanagers.reading.files import (
+    DEPTH_SUFFIXES,
+    IMAGE_SUFFIXES,
+    inventory,
+    read_intrinsics,
+    require_folder,
+)
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint

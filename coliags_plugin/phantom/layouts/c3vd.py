@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt16
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, part_folder

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
+from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
@@ -44,7 +44,7 @@ class ColmapLayout(Layout):
             local = points.positions[kept[indices]] @ matrix[:3, :3].T + matrix[:3, 3]
             observations.append(SeenPoints(lens.project(local), indices))
         add_points(model, observations, points.positions[kept], points.colors[kept])
-        write_model(folder, model)
+        write_reconstruction(folder / "sparse/0", model)
         write_unit(folder, "mm")
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt16
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
+from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses import tum

@@ -14,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.parallel import parallel_map
+from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.reconstruction.depth.completion import complete, data_weight, first_belief, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, depth_confidence, fuse_frame, sweep_weight

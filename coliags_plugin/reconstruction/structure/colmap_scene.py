@@ -13,8 +13,8 @@ from jaxtyping import UInt8
 from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
-from coliags_plugin.datamanagers.colmap.writer import write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
+from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
 from coliags_plugin.outputs.image_files import write_png
@@ -49,7 +49,7 @@ def write_sfm_scene(
                 mask = mask_of(reconstruction.images[index], masks)
                 if mask is not None:
                     write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
-            write_model(scratch, reconstruction.model, number)
+            write_reconstruction(scratch / "sparse" / str(number), reconstruction.model)
         write_unit(scratch, units[0])
         write_json(scratch / ATLAS_FILE, _record(atlas, units))
         write_png(scratch / RIBBON_FILE, draw_ribbon(atlas))
