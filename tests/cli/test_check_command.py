@@ -7,6 +7,8 @@ import re
 import sys
 from pathlib import Path
 
+import pytest
+
 from coliags_plugin.checks.method.check import CHECKS
 from coliags_plugin.checks.results import CheckResult, line, summary
 from coliags_plugin.config import registry
