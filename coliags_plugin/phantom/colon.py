@@ -269,8 +269,8 @@ def surface_of(
     along[tip] = np.broadcast_to(frames[:, None, :, 0], grid.shape)[tip]
     return ColonSurface(
         vertices=grid.reshape(-1, 3).astype(np.float32),
-        normals=_unit(normals).reshape(-1, 3).astype(np.float32),
-        tangents=_unit(along).reshape(-1, 3).astype(np.float32),
+        normals=unit(normals).reshape(-1, 3).astype(np.float32),
+        tangents=unit(along).reshape(-1, 3).astype(np.float32),
         triangles=_grid_triangles(*grid.shape[:2]),
         areas=areas.reshape(-1).astype(np.float32),
         arc=arc,
@@ -300,7 +300,8 @@ def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "F 3"]:
     return np.stack([even, odd], axis=2).reshape(-1, 3).astype(np.uint32)
 
 
-def _unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+def unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+    """Vectors of length 1."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin.phantom.colon import ColonSurface
+from coliags_plugin.phantom.colon import ColonSurface, unit
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
@@ -124,8 +124,8 @@ def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh
     # A straight axis, so that the surface is level.
     centres = np.polynomial.polynomial.polyval(arc, np.polynomial.polynomial.polyfit(arc, grid[rows].mean(axis=1), 1)).T
     down = grid[rows, clock % surface.columns] - grid[rows, (clock + surface.columns // 2) % surface.columns]
-    down = _unit(down.mean(axis=0))
-    side = _unit(np.cross(down, centres[-1] - centres[0]))
+    down = unit(down.mean(axis=0))
+    side = unit(np.cross(down, centres[-1] - centres[0]))
     # Deep enough that, at the ends of the pool, the wall rises above it.
     lowest = float(np.max((grid[rows] - centres[:, None]) @ down))
     ends = np.clip(1.0 - np.minimum(arc - _POOL[0], _POOL[1] - arc) / _POOL_END, 0.0, 1.0)
@@ -137,7 +137,7 @@ def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh
     for scale, speed, turn in ((5.0, 9.0, phase[0]), (8.0, 12.0, phase[1]), (3.1, 7.0, phase[2])):
         along = arc[:, None] * np.cos(turn) + across[None, :] * np.sin(turn)
         slope += 0.03 * np.sin(2.0 * np.pi * (along - speed * time) / scale)
-    normals = _unit(-down + slope[:, :, None] * side + slope[:, ::-1, None] * np.cross(side, down))
+    normals = unit(-down + slope[:, :, None] * side + slope[:, ::-1, None] * np.cross(side, down))
     row, column = np.meshgrid(np.arange(len(rows) - 1), np.arange(len(across) - 1), indexing="ij")
     a = row * len(across) + column
     b = a + len(across)
@@ -167,7 +167,7 @@ def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> M
         below = grid[low + 1, left] * (1.0 - right) + grid[low + 1, following] * right
         return np.asarray(above * (1.0 - down) + below * down)
 
-    centres = on_wall(surface.vertices) + 0.5 * radius[:, None] * _unit(on_wall(surface.normals))
+    centres = on_wall(surface.vertices) + 0.5 * radius[:, None] * unit(on_wall(surface.normals))
     sphere = _sphere()
     vertices = centres[:, None] + radius[:, None, None] * sphere.vertices
     normals = np.broadcast_to(sphere.normals, vertices.shape)
@@ -182,16 +182,16 @@ def _tool(settings: PhantomSettings, time: float) -> Mesh:
     turn = 2.0 * np.pi * time / _TOOL_PERIOD
     reach = low + (high - low) * (0.5 - 0.5 * np.cos(turn + phase[0]))
     swing = 0.06 * np.sin(np.array([1.7, 1.3]) * turn + phase[1:])
-    aim = _unit(np.array([swing[0] - 0.12, swing[1] - 0.16, 1.0]))
+    aim = unit(np.array([swing[0] - 0.12, swing[1] - 0.16, 1.0]))
     sphere = _sphere()
     # A sphere whose rear half is drawn out behind the lens.
     behind = sphere.vertices[:, 2] < 0.0
     vertices = _TOOL_RADIUS * sphere.vertices
     vertices[behind, 2] = -60.0
     normals = np.where(behind[:, None], sphere.vertices * [1.0, 1.0, 0.0], sphere.vertices)
-    side = _unit(np.cross([0.0, 1.0, 0.0], aim))
+    side = unit(np.cross([0.0, 1.0, 0.0], aim))
     axes = np.stack([side, np.cross(aim, side), aim], axis=1)
-    return _mesh(_CHANNEL + reach * aim + vertices @ axes.T, _unit(normals + 1e-9) @ axes.T, sphere.triangles)
+    return _mesh(_CHANNEL + reach * aim + vertices @ axes.T, unit(normals + 1e-9) @ axes.T, sphere.triangles)
 
 
 def _sphere() -> Mesh:
@@ -239,7 +239,3 @@ def wet_lens(
         through = cv2.remap(through, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         image = np.where((cover == Cover.DROP)[..., None], through, image)
     return image, cover
-
-
-def _unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -1,20 +1,29 @@
-"""Colours of places on a surface, from the views that show them best."""
+"""Colours of places on a surface, and textures of meshes, from the views that show each place best."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.sampling import bilinear
+from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 from coliags_plugin.surface.meshing.views import DepthView, looked_at
 
 #: Quality counts by this power: of two views, one twice as near has nearly all of the weight.
 _POWER = 4
+#: Share of a texture that triangles cover, about; and its width and height at most.
+_COVERED, _LARGEST = 0.6, 8192
+#: Texels between charts, largest stretch of triangles in them, and triangles that are laid out at once.
+_GUTTER, _STRETCH, _AT_ONCE = 2.0, 0.3, 8_000
 
 
 def best_colors(
@@ -40,3 +49,34 @@ def best_colors(
     if known.any() and not known.all():
         colors[~known] = colors[known][cKDTree(points[known]).query(points[~known])[1]]
     return np.asarray(colors)
+
+
+def best_texture(
+    mesh: TriangleMesh,
+    texel: float,
+    views: Sequence[DepthView],
+    image_of: Callable[[DepthView], UInt8[Tensor, "H W 3"]],
+) -> Texture:
+    """A texture of texels of about such an edge, scene units, each coloured as :func:`best_colors` does.
+
+    Charts are laid out by UVAtlas (open3d), which takes edges of two triangles at most. Texels without
+    a triangle have the colour of the nearest one with.
+    """
+    size = min(math.ceil(math.sqrt(mesh.areas.sum() / _COVERED) / texel), _LARGEST)
+    open3d, made = import_open3d("lays out textures"), mesh.to_open3d()
+    if broken := len(made.get_non_manifold_edges()):  # at which UVAtlas ends the process
+        raise InputError(
+            f"{broken} edges of the mesh have more than two triangles",
+            "a surface",
+            "Try another --voxel, or no texture",
+        )
+    parts = 1 + len(mesh) // _AT_ONCE
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        made.compute_uvatlas(size=size, gutter=_GUTTER, max_stretch=_STRETCH, parallel_partitions=parts)
+    baked = made.bake_vertex_attr_textures(size, {"positions"}, fill=math.nan, update_material=False)
+    places = baked["positions"].numpy()
+    known = np.isfinite(places).all(axis=-1)
+    image = np.zeros((size, size, 3), np.uint8)
+    image[known] = best_colors(places[known], views, image_of)
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return Texture(image[tuple(nearest)], made.triangle.texture_uvs.numpy())

@@ -15,11 +15,9 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 from coliags_plugin.outputs.image_files import eight_bit
-from coliags_plugin.surface.meshing.colors import best_colors
-from coliags_plugin.surface.meshing.holes import close_holes
+from coliags_plugin.surface.meshing.colors import best_colors, best_texture
+from coliags_plugin.surface.meshing.mending import close_holes, smoothed
 from coliags_plugin.surface.meshing.settings import MeshSettings, voxel_size_of
-from coliags_plugin.surface.meshing.smoothing import smoothed
-from coliags_plugin.surface.meshing.texturing import best_texture
 from coliags_plugin.surface.meshing.views import DepthView, rendered_depth
 from coliags_plugin.surface.meshing.volume import Volume
 

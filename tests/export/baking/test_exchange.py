@@ -206,7 +206,12 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(runs, method):
 
 
 @pytest.mark.parametrize(
-    "method", ["coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs", "pr-endo", "3dgs"]
+    "method",
+    [
+        *("coliags", "pr-endo", "3dgs"),
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("coliags-plus", "scaffold-gs-distance")),
+        pytest.param("scaffold-gs", marks=pytest.mark.thorough),
+    ],
 )
 def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
     explicit = method in ("pr-endo", "3dgs")

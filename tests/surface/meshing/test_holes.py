@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.meshing.holes import close_holes, loops
+from coliags_plugin.surface.meshing.mending import close_holes, loops
 from coliags_plugin.surface.meshing.views import DepthView
 from tests.scenes import camera_at
 from tests.surface.coverage.tubes import joined, plane

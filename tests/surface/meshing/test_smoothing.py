@@ -9,7 +9,7 @@ import pytest
 
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import angles_between
-from coliags_plugin.surface.meshing.smoothing import smoothed
+from coliags_plugin.surface.meshing.mending import smoothed
 from tests.surface.coverage.tubes import plane
 
 
