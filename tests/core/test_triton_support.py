@@ -19,17 +19,7 @@ def lacks(monkeypatch):
     return tables.what_triton_lacks.__wrapped__
 
 
-def test_without_triton(lacks, monkeypatch):
-    monkeypatch.setattr(tables, "find_spec", lambda name: None)
-    assert "triton is not installed" in lacks()
-
-
-def test_with_a_triton_that_cannot_compile_the_kernels(lacks, monkeypatch):
-    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.5.1"))
-    assert "triton 3.5.1 is older than 3.6" in lacks()
-
-
-def test_without_a_compiler_or_the_headers_of_python(lacks, monkeypatch, tmp_path):
+def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
     (tmp_path / "Python.h").touch()
     monkeypatch.setattr(sysconfig, "get_paths", lambda scheme: {"include": str(tmp_path)})
     monkeypatch.setattr(shutil, "which", lambda name: None)
@@ -38,6 +28,10 @@ def test_without_a_compiler_or_the_headers_of_python(lacks, monkeypatch, tmp_pat
     assert lacks() is None
     (tmp_path / "Python.h").unlink()
     assert "headers of Python" in lacks()
+    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.5.1"))
+    assert "triton 3.5.1 is older than 3.6" in lacks()
+    monkeypatch.setattr(tables, "find_spec", lambda name: None)
+    assert "triton is not installed" in lacks()
 
 
 @pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")

@@ -241,11 +241,17 @@ def test_gradients_are_those_of_finite_differences():
         assert parameter.grad[index].item() == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4, abs=1e-7)
 
 
-def test_the_pose_gets_a_gradient():
+def test_names_and_the_gradient_of_the_pose():
     field, camera = varied(), camera_at(0, 0, 0)
+    rows = ["means", "scales", "quats", "opacities", "albedos", "roughness", "f0"]
+    assert list(field.parameter_groups()) == [*rows, "lamp", "diffuse_network"]
     pose = camera.camera_to_world.float().requires_grad_()
-    field.gaussians(replace(camera, camera_to_world=pose)).colors.sum().backward()
+    seen = field.gaussians(replace(camera, camera_to_world=pose))
+    seen.colors.sum().backward()
     assert pose.grad[:3, 3].abs().min() > 0
+    assert seen.features.keys() == field.feature_channels == {"albedo", "diffuse_factor", "f0", "roughness"}
+    output = render_gaussians(seen, camera, tuple(field.feature_channels))
+    assert 0.1 < (output["roughness"][12, 16] / output.alpha[12, 16]).item() < 0.6
 
 
 def test_gaussians_too_faint_to_be_drawn_are_left_out(monkeypatch):
@@ -260,21 +266,6 @@ def test_gaussians_too_faint_to_be_drawn_are_left_out(monkeypatch):
     assert len(seen) < len(everything)
     images = [render_gaussians(each, camera).rgb for each in (seen, everything)]
     torch.testing.assert_close(*images, rtol=0, atol=2e-6)
-
-
-def test_channels_are_composited():
-    field, camera = varied(), camera_at(0, 0, 0)
-    names = sorted(field.feature_channels)
-    assert names == ["albedo", "diffuse_factor", "f0", "roughness"]
-    output = render_gaussians(field.gaussians(camera), camera, ("rgb", *names))
-    assert output["albedo"].shape == (24, 32, 3)
-    middle = output["roughness"][12, 16] / output.alpha[12, 16]
-    assert 0.1 < middle.item() < 0.6
-
-
-def test_parameter_groups():
-    rows = ["means", "scales", "quats", "opacities", "albedos", "roughness", "f0"]
-    assert list(make().parameter_groups()) == [*rows, "lamp", "diffuse_network"]
 
 
 def test_padding_of_reduced_products_changes_no_gradient():

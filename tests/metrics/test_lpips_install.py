@@ -260,12 +260,6 @@ def test_the_real_squeezenet_is_installed_and_scores_as_where_it_was(shared_data
     assert value == network(first, second, comparison.valid).item()
 
 
-def test_the_real_folder_has_no_vgg(shared_data, nowhere, cache):
-    with pytest.raises(InputError, match=r"has no vgg16-397923af\.pth.*https://download\.pytorch\.org/models/vgg16"):
-        install(DEFAULT_NETS, None, shared_data / "lpips")
-    assert not cache.exists()
-
-
 # The package
 
 

@@ -1,4 +1,4 @@
-"""Image displacements: pixels are moved as told, between frames in time, and a known motion is learned."""
+"""Image displacements: pixels are moved as told, and between frames in time."""
 
 from __future__ import annotations
 
