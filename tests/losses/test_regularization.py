@@ -132,29 +132,22 @@ def test_alpha_of_the_weight_has_no_gradient():
     assert alpha.grad is None and normals.grad.any()
 
 
-def test_distortion_is_the_mean_of_its_output():
-    distortion = torch.rand(17, 23, generator=torch.Generator().manual_seed(0))
-    output = make_output(torch.zeros(17, 23, 3), distortion=distortion)
-    assert make("distortion")(output, frame()).item() == pytest.approx(distortion.mean().item(), rel=1e-6)
-
-
-def test_single_pixels_are_refused():
-    output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
-    with pytest.raises(InputError, match="whole images"):
-        make("normal-consistency")(output, make_frame(torch.zeros(4, 1, 3)))
-
-
 # --- opacity ----------------------------------------------------------------------------------------------------------
 
 
-def test_opacity_is_the_mean_transparency_of_valid_pixels():
+def test_opacity_is_the_mean_transparency_of_valid_pixels_and_distortion_the_mean_of_its_output():
     alpha = torch.tensor([[1.0, 0.75], [0.25, torch.nan]], requires_grad=True)
     mask = torch.tensor([[True, True], [True, False]])
     frame = make_frame(torch.zeros(2, 2, 3, dtype=torch.uint8), mask=mask)
-    term = make("opacity")(make_output(torch.zeros(2, 2, 3), alpha=alpha), frame)
+    output = make_output(torch.zeros(2, 2, 3), alpha=alpha, distortion=torch.tensor([[0.1, 0.2], [0.6, torch.nan]]))
+    term = make("opacity")(output, frame)
     term.backward()
     assert term.item() == pytest.approx((0.0 + 0.25 + 0.75) / 3)
     assert alpha.grad.flatten().tolist() == pytest.approx([-1 / 3, -1 / 3, -1 / 3, 0.0])
+    assert make("distortion")(output, frame).item() == pytest.approx(0.3)
+    output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
+    with pytest.raises(InputError, match="whole images"):
+        make("normal-consistency")(output, make_frame(torch.zeros(4, 1, 3)))
 
 
 # --- gains ------------------------------------------------------------------------------------------------------------

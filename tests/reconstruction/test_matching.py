@@ -64,6 +64,7 @@ def test_nothing_matches_nothing():
     for pair in ((none, some), (some, none)):
         assert mutual_matches(*pair, 0.8, 0.7).shape == (0, 2)
         assert epipolar_matches(*pair, (camera(), camera(1.0)), *LOOSE).shape == (0, 2)
+    assert not len(epipolar_matches(some, some, (camera(), camera()), *LOOSE))  # from one place
 
 
 def test_poses_tell_look_alikes_apart():
@@ -92,11 +93,6 @@ def test_the_epipolar_error_is_sampsons_rays_meet_in_front_and_scales_agree(x, y
     at = seen(cameras[0], [[0.0, 0, 20]])
     other = features(at + np.array([x, y]), alike, 2.0 * scale)
     assert len(epipolar_matches(features(at, alike), other, cameras, *LOOSE)) == count
-
-
-def test_cameras_in_one_place_match_nothing():
-    spots = features([[10, 10], [40, 40]], np.eye(128)[:2])
-    assert not len(epipolar_matches(spots, spots, (camera(), camera()), *LOOSE))
 
 
 def test_highlights_and_masks_yield_no_features():

@@ -91,9 +91,8 @@ def test_a_missing_file_and_a_rig_of_two_cameras_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*gone\.xml"):
         read_calibration(tmp_path / "gone.xml")
     camera = VICALIB.removeprefix("<rig>").removesuffix("</rig>\n")
-    other = camera.replace("717.2", "720")
     with pytest.raises(InputError, match="has 2 different cameras"):
-        read_calibration(write(tmp_path, f"<rig>{camera}{other}</rig>"))
+        read_calibration(write(tmp_path, f"<rig>{camera}{camera.replace('717.2', '720')}</rig>"))
     assert read_calibration(write(tmp_path, f"<rig>{camera}{camera}</rig>")).lens.fx == 717.2
 
 

@@ -103,14 +103,11 @@ def test_a_pause_changes_no_distance():
         assert [paused[other] for other in chosen(paused)[index]] == [1.0, 2.0, 4.0, 5.0]
 
 
-def test_at_an_end_the_other_side_gives_more():
-    assert len(chosen([0.5 * k for k in range(20)])[0]) == 4
-
-
 def test_frames_turned_away_are_no_neighbours():
     axes = np.tile([0.0, 0.0, 1.0], (5, 1))
     axes[3] = [1.0, 0.0, 0.0]
     assert 3 not in chosen([1.0 * k for k in range(5)], axes=axes)[1]
+    assert len(chosen([0.5 * k for k in range(20)])[0]) == 4  # at an end the other side gives more
 
 
 ALL = np.ones((80, 96), bool)
@@ -144,10 +141,7 @@ def test_brightness_gives_depth():
     half[:, ::2] = 0.0
     prior = np.exp(LightPrior().log_depth(frame, ALL, known, half, 40.0))
     assert np.abs(prior / depth - 1.0)[5:-5, 5:-5].max() < 0.03
-
-
-def test_without_known_depth_the_law_of_a_lamp_at_the_lens_holds():
-    frame, depth = lit_frame()
+    # Without known depth the law of a lamp at the lens holds.
     prior = np.exp(LightPrior().log_depth(frame, ALL, NOWHERE, NOWHERE, float(np.median(depth))))
     np.testing.assert_allclose(prior[5:-5, 5:-5], depth[5:-5, 5:-5], rtol=0.02)
 
