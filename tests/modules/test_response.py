@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
 from coliags_plugin.modules.response import CameraResponse, ResponseSettings
-from coliags_plugin.phantom.response import encode
 from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 
