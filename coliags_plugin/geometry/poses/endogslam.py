@@ -106,6 +106,11 @@ def write(path: Path, trajectory: Trajectory) -> None:
     write_arrays(path, arrays)
 
 
+def recognise(path: Path) -> bool:
+    """Whether a file is a ZIP archive, as NPZ files are."""
+    return head(path).startswith(b"PK\x03\x04")
+
+
 def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
     """Image index of each of EndoGSLAM's poses: all, or all but 7, 15, 23, ...; None if the counts match neither. [F]
 
@@ -194,6 +199,5 @@ def _shape(shape: tuple[int | str, ...], sizes: dict[str, int]) -> str:
 
 
 _KEEPS = frozenset({"intrinsics"})
-#: NPZ files are ZIP archives.
-FORMAT = Format("endogslam", read, write, lambda path: head(path).startswith(b"PK\x03\x04"), unit="mm", keeps=_KEEPS)
+FORMAT = Format("endogslam", read, write, recognise, unit="mm", keeps=_KEEPS)
 TRUTH_FORMAT = Format("endogslam-truth", read_truth, None, None, unit="mm", keeps=_KEEPS)
