@@ -416,14 +416,15 @@ def shorten(arrays: dict[str, np.ndarray]) -> None:
     arrays["gt_w2c_all_frames"] = arrays["gt_w2c_all_frames"][:-2]
 
 
-def confident(spoil: Callable[[int, dict], object]) -> Spoil:
+def confident(spoil: Callable[[int, dict], object] = lambda index, frame: None, dtype: str = "uint8") -> Spoil:
     """Every frame of nerfstudio's gets a confidence, then the frames are spoilt."""
 
     def change(folder: Path) -> None:
         def add(index: int, frame: dict) -> None:
             frame["confidence_file_path"] = frame["depth_file_path"].replace("depth/", "confidence/")
+            pixels = np.zeros((32, 40), dtype if index == 2 else "uint8")
             (folder / "confidence").mkdir(exist_ok=True)
-            cv2.imwrite(str(folder / frame["confidence_file_path"]), np.zeros((32, 40), "uint8"))
+            cv2.imwrite(str(folder / frame["confidence_file_path"]), pixels)
             spoil(index, frame)
 
         change_frames("transforms.json", add)(folder)
@@ -742,6 +743,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (change_frames("transforms.json", fourth_without("depth_file_path")), "10 of 11 frames have a depth_file_path"),
         (confident(fourth_without("confidence_file_path")), r"10 of 11 frames have a confidence_file_path; images/f"),
         (confident(lambda index, entry: entry.pop("depth_file_path")), "confidence_file_path, but no depth_file_path"),
+        (confident(dtype="uint16"), r"confidence/frame_00003\.png is an image of 1 channel of uint16.*255 = 1"),
         (change_json("transforms.json", camera_model="PANORAMA"), "camera_model is PANORAMA"),
         (change_json("transforms.json", k4=0.1), "OPENCV with k4 = 0.1"),
     ],
