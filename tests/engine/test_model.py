@@ -13,8 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import View
 from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
-from tests.export.viewer.made import Scripted
-from tests.renderers.test_torch_renderer import pinhole, random_gaussians
+from tests.renderers.test_torch_renderer import FieldOf, pinhole, random_gaussians
 
 
 class Shift(ViewModule):
@@ -50,7 +49,7 @@ class Shift(ViewModule):
 
 
 def make_model(**modules):
-    field = Scripted(random_gaussians(40, 0))
+    field = FieldOf(random_gaussians(40, 0))
     return Model(field, TorchRenderer(TorchRendererSettings()), modules)
 
 

@@ -15,7 +15,7 @@ from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.pose_refinement import refined_camera, refined_scores
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
-from tests.export.viewer.made import Scripted
+from tests.renderers.test_torch_renderer import FieldOf
 from tests.textured_tube import tube_frames
 
 
@@ -36,7 +36,7 @@ def model():
         torch.arange(count),
         torch.arange(count),
     )
-    made = Model(Scripted(wall), TorchRenderer(TorchRendererSettings()), {})
+    made = Model(FieldOf(wall), TorchRenderer(TorchRendererSettings()), {})
     made.register_parameter("weight", torch.nn.Parameter(torch.ones(1)))
     return made
 

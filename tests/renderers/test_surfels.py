@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config import registry
-from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS
@@ -487,23 +486,6 @@ def test_equal_depths_keep_the_order_they_came_in(primitive):
 
 
 # --- the component ----------------------------------------------------------------------------------------------------
-
-
-class Surfels(GaussianField):
-    """A field that holds surfels."""
-
-    primitive = "surfels"
-    feature_channels = frozenset()
-
-    def __init__(self, gaussians):
-        torch.nn.Module.__init__(self)
-        self._gaussians = gaussians
-
-    def gaussians(self, camera):
-        return self._gaussians
-
-
-Surfels.__abstractmethods__ = frozenset()
 
 
 def test_the_registered_component_renders_both_primitives_with_their_own_outputs():

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
@@ -302,14 +303,24 @@ def test_shapes_and_ranges(n, width, height, tile_size, wants, dtype, seed):
 # --- the component ----------------------------------------------------------------------------------------------------
 
 
-class FieldOf:
-    primitive = "gaussians3d"
+class FieldOf(GaussianField):
+    """A field of given Gaussians or surfels."""
+
+    feature_channels = frozenset()
 
     def __init__(self, gaussians):
+        torch.nn.Module.__init__(self)
         self._gaussians = gaussians
+        self.primitive = "surfels" if gaussians.scales.shape[1] == 2 else "gaussians3d"
 
     def gaussians(self, camera):
         return self._gaussians
+
+    def parameter_groups(self):
+        return {}
+
+
+FieldOf.__abstractmethods__ = frozenset()
 
 
 def test_what_cannot_be_rendered_says_so():
