@@ -496,7 +496,7 @@ def test_the_registered_component_renders_both_primitives_with_their_own_outputs
     assert renderer_class.outputs_of("gaussians3d") == renderer_class.outputs == set(SOLID_OUTPUTS)
     for field, wants in (
         (FieldOf(solid_smooth_scene()[0]), ("depth_expected",)),
-        (Surfels(smooth_scene()[0]), ("distortion",)),
+        (FieldOf(smooth_scene()[0]), ("distortion",)),
     ):
         gaussians, camera = field.gaussians(None), smooth_scene()[1]
         output = renderer_class(renderer_class.Settings()).render(field, camera, wants)
