@@ -1,11 +1,11 @@
-"""Pages as plain text for the terminal, as Markdown and as LaTeX: formats without figures."""
+"""Pages as plain text for the terminal, as Markdown, LaTeX and JSON values: formats without figures."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from rich.cells import cell_len
 
@@ -309,3 +309,51 @@ def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def page_values(page: Page) -> dict[str, Any]:
+    """Facts, cautions and tables of a page; no figures and no explaining sentences."""
+    return {
+        "title": page.title,
+        "facts": _fact_values(page.facts),
+        "cautions": list(page.cautions),
+        "sections": [_section_values(section) for section in page.text_sections],
+    }
+
+
+def _fact_values(facts: Sequence[Fact]) -> dict[str, Any]:
+    return {fact.name: {"value": fact.value, "unit": fact.unit} if fact.unit else fact.value for fact in facts}
+
+
+def _section_values(section: Section | Folded) -> dict[str, Any]:
+    values: dict[str, Any] = {"title": section.title}
+    for block in section.blocks:
+        name, value = _block_values(block)
+        if name:
+            values.setdefault(name, []).append(value)
+    return values
+
+
+def _block_values(block: Block) -> tuple[str, Any]:
+    match block:
+        case Table():
+            return "tables", _table_values(block)
+        case FactList():
+            return "facts", _fact_values(block.facts)
+        case Bullets():
+            return "items", [{"name": item.lead, "text": item.text, "href": item.href} for item in block.items]
+        case Section() | Folded():
+            return "sections", _section_values(block)
+        case _:
+            return "", None
+
+
+def _table_values(table: Table) -> dict[str, Any]:
+    """Columns with their units, and rows of plain values by their keys."""
+    columns = [
+        {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
+        for column in table.columns
+    ]
+    cells = [[cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells]
+    rows = [dict(zip((column.key for column in table.columns), row, strict=True)) for row in cells]
+    return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}

@@ -12,7 +12,6 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
-from coliags_plugin.reporting.json_values import page_values
 from coliags_plugin.reporting.model import (
     Bullet,
     Bullets,
@@ -34,7 +33,14 @@ from coliags_plugin.reporting.model import (
     simple_table,
 )
 from coliags_plugin.reporting.numbers import DASH
-from coliags_plugin.reporting.text_formats import DisplayTable, latex_text, markdown_text, page_text, terminal_text
+from coliags_plugin.reporting.text_formats import (
+    DisplayTable,
+    latex_text,
+    markdown_text,
+    page_text,
+    page_values,
+    terminal_text,
+)
 
 PLAIN = DisplayTable(
     "A <title>",

@@ -28,7 +28,6 @@ from coliags_plugin.comparison.report.study import MissingResult, Part, Study
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
-from coliags_plugin.reporting.json_values import page_values
 from coliags_plugin.reporting.model import (
     Block,
     Column,
@@ -41,7 +40,7 @@ from coliags_plugin.reporting.model import (
     Template,
 )
 from coliags_plugin.reporting.numbers import counted
-from coliags_plugin.reporting.text_formats import latex_text, markdown_text
+from coliags_plugin.reporting.text_formats import latex_text, markdown_text, page_values
 from coliags_plugin.results.tables import csv_text, frame_rows
 
 _TIMES = "\N{MULTIPLICATION SIGN}"
