@@ -724,6 +724,13 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
     "rgbd-by-order": [
         (copy("rgb/*.png", "cover.png"), r"cover\.png: no number in its name"),
         (
+            lambda folder: (
+                [remove("rgb/7.png")(folder), remove("depth/7.png")(folder)]
+                and change_lines("groundtruth.txt", lambda rows: [*rows[:5], *rows[6:]])(folder)
+            ),
+            r"pose 5 has timestamp 6, but image 5 is 5\.png",
+        ),
+        (
             lambda folder: [shutil.copytree(folder / "depth", folder / "confidence"), shutil.rmtree(folder / "depth")],
             "holds confidence/, but no depth",
         ),
@@ -751,6 +758,11 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (remove("transforms_true_test.json"), r"has no transforms_true_test\.json.*choose another split"),
         (write("transforms_val.json", "{"), r"transforms_val\.json is not JSON"),
         (frame(1, "*_train.json", file_path=None), r"_train\.json, frame 1: no file_path"),
+        (
+            change_frame("transforms_test.json", 0, lambda matrix: matrix.__setitem__((0, 3), 0.5)),
+            r"_test\.json: pose or distance map of images/0000_color\.png differs",
+        ),
+        (change_json("*_val.json", scene_scale=0.5), r"_val\.json: scene_scale differs from transforms_train\.json"),
         (
             change_json("transforms_train.json", lambda content: content["frames"].append(content["frames"][0])),
             r"_train\.json: 'images/0000_color\.png' is repeated",

@@ -39,6 +39,11 @@ PARTS = ("train", "val", "test", "true_test")
 EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-NeRF's preprocessing writes them"
 #: z-depth at which C3VD's depth is clipped, mm. The preprocessing treats clipped pixels as valid.
 C3VD_RANGE = 100.0
+#: Keys that have the same value in all files of a sequence.
+_SHARED = (
+    *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "w", "h"),
+    *("camera_model", "scene_scale", "distmap_scale", "scene_T"),
+)
 #: Digits tried of numbers in file names.
 _DIGITS = 6
 
@@ -132,6 +137,9 @@ class ReimNerfDataManager(RecordedDataManager):
             )
         contents = {part: _read(file) for part, file in files.items()}
         file, first = files["train"], contents["train"]
+        _refuse_different(
+            files, {part: {key: content.get(key) for key in _SHARED} for part, content in contents.items()}
+        )
         lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
         distmap_scale = read_number(
             {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
@@ -140,7 +148,16 @@ class ReimNerfDataManager(RecordedDataManager):
         frames_of = {}
         for part, content in contents.items():
             frames_of[part] = _frames(path, files[part], content, scale, shift, settings.outside_files)
-            frames = frames_of[part] | frames
+            for name, frame in frames_of[part].items():
+                known = frames.setdefault(name, frame)
+                if known.distances != frame.distances or not np.allclose(
+                    known.camera_to_world, frame.camera_to_world, atol=1e-4
+                ):
+                    raise InputError(
+                        f"{files[part]}: pose or distance map of {name} differs from another file's",
+                        "the same values for a frame in all files",
+                        "Write all files in one run",
+                    )
         unordered = [*frames]
         names = [unordered[index] for index in natural_order(unordered)]
         if len({frame.distances is None for frame in frames.values()}) > 1:
@@ -213,6 +230,18 @@ def _read(file: Path) -> dict[str, Any]:
     if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
         raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
     return content
+
+
+def _refuse_different(files: Mapping[str, Path], shared: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse files whose camera or scale differs from that of the training frames."""
+    for part, values in shared.items():
+        key = next((key for key in _SHARED if values[key] != shared["train"][key]), None)
+        if key is not None:
+            raise InputError(
+                f"{files[part]}: {key} differs from {files['train'].name}",
+                "one camera and one scale for all files",
+                "Write all files in one run",
+            )
 
 
 def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:

@@ -276,6 +276,7 @@ class RGBDDataManager(RecordedDataManager):
                 "a pose for every image, in order",
                 "Restore the missing ones, or --set datamanager.association=time if its timestamps name images",
             )
+        self._check_times_say_the_same(numbered, trajectory, file)
         deep = _by_number(depths)
         if deep and deep.keys() != numbered.keys():
             lone = min(deep.keys() ^ numbered.keys())
@@ -288,6 +289,23 @@ class RGBDDataManager(RecordedDataManager):
         return _Frames(
             list(numbered.values()), [deep.get(key) for key in numbered], range(len(numbered)), {"by": "order"}
         )
+
+    def _check_times_say_the_same(
+        self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
+    ) -> None:
+        """Refuse a trajectory whose timestamps are frame numbers that match most, but not all, images."""
+        if trajectory.timestamps is None or self.settings.association == "order":
+            return
+        named = np.array([key[0] if len(key) == 1 else -1 for key in numbered], np.float64)
+        agrees = named == trajectory.timestamps
+        if 0.5 < agrees.mean() < 1.0 or (set(named) == set(trajectory.timestamps) and not agrees.all()):
+            index = int(np.argmin(agrees))
+            raise InputError(
+                f"{file}: pose {index} has timestamp {trajectory.timestamps[index]:g}, but image {index} is "
+                f"{list(numbered.values())[index].name}",
+                "line n for image n, or timestamps equal to the image names",
+                "--set datamanager.association=time if the names are timestamps, or order if these mean nothing",
+            )
 
     def _depth_scale(self, camera: _CameraFile, path: Path) -> float:
         said, given = camera.depth_scale, self.settings.depth_scale
