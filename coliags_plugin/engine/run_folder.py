@@ -162,8 +162,9 @@ class RunFolder:
         """Content of the provenance file."""
         found: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
         if (written := found.get("format")) != FORMAT:
+            version = found.get("package_version", "?")
             raise InputError(
-                f"{self.path} is a run of coliags_plugin {found.get('package_version', '?')}, in format {written}",
+                f"{self.provenance_file} is of coliags_plugin {version}, in format {written}",
                 f"format {FORMAT}, of version {__version__}",
                 "Train again, or use the version that wrote it",
             )
@@ -280,12 +281,20 @@ class RunFolder:
         """Numbers of the training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
         import numpy as np
 
-        from coliags_plugin.contracts import scalars
-
-        steps = [(row["step"], scalars(row)) for row in self.log_rows()]
-        numbers = [{"step": step} | {name.replace("/", "."): each for name, each in row.items()} for step, row in steps]
+        numbers = [_numbers(row) for row in self.log_rows()]
         names = dict.fromkeys(name for row in numbers for name in row)
         return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
+
+
+def _numbers(row: JsonObject, prefix: str = "") -> dict[str, float]:
+    """Numbers of a row of the training log by their dotted names."""
+    numbers: dict[str, float] = {}
+    for name, value in row.items():
+        if isinstance(value, dict):
+            numbers |= _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            numbers[prefix + name] = float(value)
+    return numbers
 
 
 def _last_lines(file: Path) -> list[str]:

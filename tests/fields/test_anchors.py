@@ -211,3 +211,12 @@ def test_a_head_that_does_not_see_the_distance_expects_nothing():
     starts = ("scene_distances", "pytorch")
     plain, other = (make(SCAFFOLD, appearance_head={"name": "plain", "bias_init": start}) for start in starts)
     assert torch.equal(plain.appearance_head.color_mlp[0].bias, other.appearance_head.color_mlp[0].bias)
+
+
+def test_coliags_with_plain_heads_is_scaffold_to_the_bit():
+    plain = {"geometry_head": {"name": "plain"}, "appearance_head": {"name": "plain"}}
+    ours, theirs = make({**COLIAGS, **plain}), make(SCAFFOLD)
+    camera = camera_at(1.0, 0.5, 2.0)
+    first, second = ours.gaussians(camera), theirs.gaussians(camera)
+    for name in ("means", "quats_wxyz", "scales", "opacities", "colors", "source_index", "visible_sources"):
+        assert torch.equal(getattr(first, name), getattr(second, name))

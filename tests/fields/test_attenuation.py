@@ -103,3 +103,30 @@ def test_colors_do_not_move_gaussians():
     field = make_anchors(appearance_head={"name": "attenuated", "head": "plain"})
     field.gaussians(camera_at(0.0, 0.0, 0.0)).colors.sum().backward()
     assert not field.offsets.grad.any() and field.appearance_head.exponents.grad.abs().max() > 0
+
+
+@pytest.mark.thorough
+def test_the_law_of_a_lamp_is_found():
+    """Gaussians of one albedo under an inverse-square lamp 3.6 mm behind the lens, spread as cos^1.2, at gamma 2.2."""
+    generator = torch.Generator().manual_seed(0)
+    camera, head = camera_at(0, 0, 0).to("cpu", torch.float32), make_head(cosine_exponent=0.0)
+    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 40.0]) + torch.tensor([-8.0, -8, 5])
+    distances = (points - torch.tensor([0.0, 0.0, -3.6])).norm(dim=1)
+    true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * ((points[:, 2] + 3.6) / distances) ** (1.2 / 2.2)
+    head.init_from_distances(torch.tensor([20.0]))
+    albedo = torch.tensor(0.3, requires_grad=True)
+    fit = torch.optim.LBFGS([head.exponents, head.lamp_offset, albedo], max_iter=200, line_search_fn="strong_wolfe")
+
+    def error() -> torch.Tensor:
+        fit.zero_grad()
+        lit = head.apply_light(albedo.expand(2000, 3), points, None, camera, None)
+        value = (lit[:, 0].log() - true.log()).square().mean()
+        value.backward()
+        return value
+
+    for _ in range(3):
+        fit.step(error)
+    learned = head.learned
+    assert learned["distance_exponent"][0] == pytest.approx(-2 / 2.2, rel=0.02)
+    assert learned["cosine_exponent"][0] == pytest.approx(1.2 / 2.2, rel=0.05)
+    assert learned["lamp_offset"] == pytest.approx([0.0, 0.0, -3.6], abs=0.2)

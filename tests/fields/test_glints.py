@@ -87,3 +87,26 @@ def test_a_field_keeps_the_normals_of_the_wall_for_heads_that_see_them(appearanc
     assert all(gradient.isfinite().all() for gradient in gradients)
     without = make_field("anchors", geometry_head="plain", appearance_head="plain")
     assert without.normals is None and "normals" not in without.state_dict()
+
+
+@pytest.mark.thorough
+def test_a_glint_beside_the_normal_is_learned():
+    """One anchor that glints about a direction 10 degrees off the wall's normal: IMIA finds none of it."""
+    generator = torch.Generator().manual_seed(0)
+    offsets = 0.5 * torch.rand(150, 2, generator=generator) - 0.25
+    directions = torch.cat([offsets, (1.0 - offsets.square().sum(1, keepdim=True)).sqrt()], dim=1)
+    glint = torch.exp(-(offsets - torch.tensor([0.17, 0.0])).square().sum(1) / 0.06**2)
+    normals, distances = unit((0.0, 0.0, 1.0)).expand(150, 3), torch.full((150, 1), 7.0)
+    errors = {}
+    for name in ("imia", "imia-glints"):
+        head = make_head(name)
+        head.init_from_distances(torch.linspace(5.0, 9.0, 5))
+        fit = torch.optim.Adam(head.parameters(), lr=0.02)
+        for _ in range(400):
+            fit.zero_grad()
+            colors = head(torch.ones(150, 4), directions, distances, torch.ones(150, 1), normals)
+            error = (colors - (0.3 + 0.6 * glint)[:, None, None]).square().mean()
+            error.backward()
+            fit.step()
+        errors[name] = float(error.detach())
+    assert errors["imia-glints"] < 0.75 * errors["imia"]

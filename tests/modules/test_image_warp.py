@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
@@ -56,3 +58,19 @@ def test_held_out_frames_move_as_the_frames_around_them(untrained, moves):
     expected = module.shade(picture(), first).rgb if moves else picture().rgb
     torch.testing.assert_close(module.shade(picture(), between).rgb, expected)
     assert torch.equal(module.shade(picture(), None).rgb, picture().rgb)
+
+
+@pytest.mark.thorough
+def test_a_motion_is_learned():
+    scene, module = make(cells=2)
+    smooth = torch.linspace(0.0, 6.0, WIDTH).sin()[None, :] * torch.linspace(0.0, 5.0, HEIGHT).cos()[:, None]
+    still = replace(picture(), rgb=smooth[..., None].expand(-1, -1, 3))
+    moved = torch.cat([still.rgb[:, 1:], still.rgb[:, -1:]], dim=1)  # every pixel shows what was one to its right
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
+    for _ in range(200):
+        optimizer.zero_grad()
+        pairs = [(0, moved), (1, still.rgb)]
+        sum((module.shade(still, of_frame(scene, row)).rgb - target).abs().mean() for row, target in pairs).backward()
+        optimizer.step()
+    shift = (module.displacement[0] - module.displacement[1]).detach() * WIDTH / 100.0
+    assert shift[0].mean() == pytest.approx(1.0, abs=0.05) and shift[1].abs().mean() < 0.1

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
 from coliags_plugin.modules.response import CameraResponse, ResponseSettings
+from coliags_plugin.phantom.response import encode
 from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 
@@ -91,3 +92,28 @@ class _Curve(torch.nn.Module):
 
     def forward(self, colors):
         return self.module.curve(colors)
+
+
+@pytest.mark.thorough
+def test_a_known_shoulder_is_found():
+    """Colours under five gains through the phantom's tone curve: the curve is found to half a percent."""
+    generator = torch.Generator().manual_seed(0)
+    colors = torch.rand(400, 1, generator=generator) * 0.9
+    gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.5])
+    seen = torch.from_numpy(encode(((colors * gains).numpy()) ** 2.2, 2.2)).float()
+    module = make()
+    log_colors, log_gains = (torch.zeros(shape, requires_grad=True) for shape in (colors.shape, gains.shape))
+    with torch.no_grad():
+        log_colors.copy_(seen[:, 2:3].clamp_min(1e-3).log())
+    adam = torch.optim.Adam([log_colors, log_gains, module.log_slope], lr=0.02)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, 800)
+    for _ in range(800):
+        adam.zero_grad()
+        drawn = log_colors.exp() * (log_gains - log_gains[2]).exp()
+        (module.curve(drawn) - seen).abs().mean().backward()
+        adam.step()
+        schedule.step()
+    asked = torch.linspace(0.1, 1.3, 25)
+    expected = encode(asked.numpy() ** 2.2, 2.2)
+    np.testing.assert_allclose(module.curve(asked).detach(), expected, atol=0.005)
+    np.testing.assert_allclose((log_gains - log_gains[2]).exp().detach(), gains, rtol=0.005)
