@@ -79,7 +79,7 @@ def test_truth_beside_the_scene_is_found(tmp_path):
     (tmp_path / "scene/truth").mkdir(parents=True)
     write_mesh(tmp_path / "scene/truth/mesh.ply", wall_mesh())
     np.savez(tmp_path / "scene/truth/mesh_seen.npz", face_seen=np.abs(wall_mesh().centers[:, :2]).max(axis=1) < 5)
-    scene = with_provenance(wall_scene(9, 160, 120), path=str(tmp_path / "scene"))
+    scene = replace(wall_scene(9, 160, 120), folder=tmp_path / "scene")
     made = mesh_run(exact_run(scene=scene), tmp_path / "mesh", SETTINGS)
     assert made.comparison.seen_area == pytest.approx(100.0, rel=0.15)
     assert made.comparison.scores[0].recall == 1.0
