@@ -36,7 +36,8 @@ def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
 
 def without_places(text: str, places: Iterable[Path]) -> str:
     """A message in which files and folders, and what they hold, stand without the absolute path that leads to them."""
-    for parent in {path.parent for place in places for path in (place.absolute(), place.resolve())}:
+    parents = {path.parent for place in places for path in (place.absolute(), place.resolve())}
+    for parent in sorted(parents, key=lambda parent: -len(parent.parts)):  # the longest first, as they may be nested
         if parent != parent.parent:
             text = text.replace(f"{parent}/", "")
     return text
