@@ -203,6 +203,7 @@ def test_list_and_config_and_doctor(capsys):
     assert "would use cpu" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
 def test_phantom_trains(tmp_path):
     coarse = [part for s in ("mesh_spacing=3.0", "texture_spacing=1.0") for part in ("--set", s)]
     argv = ("phantom", "-o", tmp_path / "p", "--size", "48x38", "--frames", 9, "--rotation-views", 2, *coarse)

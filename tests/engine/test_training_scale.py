@@ -78,6 +78,7 @@ def test_the_median_depth_in_view_becomes_that_of_a_colon(small, factor):
     assert training_scale(replace(small, points=PointCloud(torch.zeros(0, 3)))) == 1.0
 
 
+@pytest.mark.thorough
 def test_a_scene_of_unknown_unit_trains_like_the_same_in_mm(runs, factor):
     own, mm = runs
     assert own.provenance["scene"]["provenance"][SCALE_KEY] == own.model.scale == factor

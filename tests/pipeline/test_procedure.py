@@ -157,6 +157,7 @@ KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0
 OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
 
 
+@pytest.mark.thorough
 def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers):
     executor = workers()
     made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)

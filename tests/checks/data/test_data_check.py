@@ -107,6 +107,7 @@ def test_poses_in_another_convention_are_called_by_it(scene, reading):
         assert "poses agree with the images when read as" in whats(changed(wrong, depth=lambda depth: None))
 
 
+@pytest.mark.thorough
 def test_sound_poses_without_depth_are_not_suspected(scene):
     assert whats(changed(scene, depth=lambda depth: None)) == ""
 
@@ -165,11 +166,13 @@ def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
     assert what in whats(each(estimate, posed))
 
 
+@pytest.mark.thorough
 def test_depth_that_is_not_confident_anywhere_leaves_poses_to_the_images(estimate):
     check = check_scene(each(estimate, lambda frame: replace(frame, depth_confidence=0.0 * frame.depth_confidence)))
     assert (check.findings, check.agreement, check.matched_by) == ([], {}, "features")
 
 
+@pytest.mark.thorough
 def test_everything_in_metres(scene):
     metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
     findings = whats(metres)
