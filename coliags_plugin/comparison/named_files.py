@@ -47,7 +47,7 @@ def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> t
 
 
 def _valid(check: Callable[[Any], object]) -> AfterValidator:
-    """Of a value that a function takes, which raises InputError where it is not valid; None is."""
+    """Make a pydantic validator of a function that raises InputError for invalid values; None is valid."""
 
     def validated(value: Any) -> Any:
         try:

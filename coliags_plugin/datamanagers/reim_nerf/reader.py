@@ -137,9 +137,7 @@ class ReimNerfDataManager(RecordedDataManager):
             )
         contents = {part: _read(file) for part, file in files.items()}
         file, first = files["train"], contents["train"]
-        _refuse_different(
-            files, {part: {key: content.get(key) for key in _SHARED} for part, content in contents.items()}
-        )
+        _refuse_different(files, contents)
         lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
         distmap_scale = read_number(
             {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
@@ -232,10 +230,11 @@ def _read(file: Path) -> dict[str, Any]:
     return content
 
 
-def _refuse_different(files: Mapping[str, Path], shared: Mapping[str, Mapping[str, Any]]) -> None:
+def _refuse_different(files: Mapping[str, Path], contents: Mapping[str, Mapping[str, Any]]) -> None:
     """Refuse files whose camera or scale differs from that of the training frames."""
-    for part, values in shared.items():
-        key = next((key for key in _SHARED if values[key] != shared["train"][key]), None)
+    first = contents["train"]
+    for part, content in contents.items():
+        key = next((key for key in _SHARED if content.get(key) != first.get(key)), None)
         if key is not None:
             raise InputError(
                 f"{files[part]}: {key} differs from {files['train'].name}",
