@@ -27,8 +27,8 @@ from coliags_plugin.contracts.training import (
     Strategy,
     TrainedModel,
     TrainingStep,
-    scalars,
 )
+from coliags_plugin.core.json_files import scalars
 
 __all__ = [
     "AppearanceHead",

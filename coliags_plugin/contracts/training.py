@@ -275,11 +275,3 @@ class Logger(Follower, ABC):
 
     @abstractmethod
     def __init__(self, run: Path, title: str, config: Mapping[str, Any], step: int) -> None: ...
-
-
-def scalars(row: JsonObject) -> dict[str, float]:
-    """Numbers of a row of the training log but its step, those of the loss terms as ``terms/NAME``."""
-    flat = {name: value for name, value in row.items() if name != "step"}
-    terms = flat.pop("terms", {})
-    flat |= {f"terms/{name}": value for name, value in terms.items()}
-    return {name: float(value) for name, value in flat.items() if isinstance(value, (int, float))}

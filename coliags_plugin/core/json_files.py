@@ -78,3 +78,15 @@ def image_size(values: Mapping[str, Any], where: object) -> tuple[int, int]:
     if width != int(width) or height != int(height):
         raise InputError(f"{where}: w = {width}, h = {height}", "whole pixels")
     return int(width), int(height)
+
+
+def scalars(row: JsonObject) -> dict[str, float]:
+    """Numbers of a row of the training log but its step, those of the loss terms as ``terms/NAME``."""
+    flat = {name: value for name, value in row.items() if name != "step"}
+    terms = flat.pop("terms", None)
+    flat |= {f"terms/{name}": value for name, value in terms.items()} if isinstance(terms, dict) else {}
+    return {
+        name: float(value)
+        for name, value in flat.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }

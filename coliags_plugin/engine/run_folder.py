@@ -19,7 +19,7 @@ from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
-from coliags_plugin.core.json_files import JsonObject, parse_json, read_json
+from coliags_plugin.core.json_files import JsonObject, parse_json, read_json, scalars
 from coliags_plugin.core.locks import locked
 from coliags_plugin.results.hashing import code_key
 from coliags_plugin.results.record import TRUTH_SUFFIX
@@ -281,20 +281,9 @@ class RunFolder:
         """Numbers of the training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
         import numpy as np
 
-        numbers = [_numbers(row) for row in self.log_rows()]
-        names = dict.fromkeys(name for row in numbers for name in row)
-        return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
-
-
-def _numbers(row: JsonObject, prefix: str = "") -> dict[str, float]:
-    """Numbers of a row of the training log by their dotted names."""
-    numbers: dict[str, float] = {}
-    for name, value in row.items():
-        if isinstance(value, dict):
-            numbers |= _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            numbers[prefix + name] = float(value)
-    return numbers
+        rows = [{"step": float(row["step"]), **scalars(row)} for row in self.log_rows()]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name.replace("/", "."): np.array([row.get(name, math.nan) for row in rows]) for name in names}
 
 
 def _last_lines(file: Path) -> list[str]:

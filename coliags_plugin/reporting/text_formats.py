@@ -1,9 +1,9 @@
-"""Pages as plain text for the terminal, as Markdown, LaTeX and JSON values: formats without figures."""
+"""Pages as plain text for the terminal, as Markdown and as JSON values, and their tables as LaTeX: without figures."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -61,18 +61,17 @@ _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 class _PlainText:
     """Plain text, and what the formats without figures that derive from it share."""
 
-    between: ClassVar[str] = "\n\n"  # stands between blocks
     dash: ClassVar[str] = "-"  # stands for a missing value
     plus_minus: ClassVar[str] = "±"
 
     def text(self, blocks: Sequence[Block], level: int = 2) -> str:
         """Blocks one after the other, without those that have no text; titles are headings of a level and deeper."""
-        return self.between.join(filter(None, (self._block(block, level) for block in blocks)))
+        return "\n\n".join(filter(None, (self._block(block, level) for block in blocks)))
 
     def _block(self, block: Block, level: int) -> str:
         match block:
             case Paragraph():
-                return self._sentences(block.text)
+                return self._escaped(block.text)
             case Bullets():
                 return "\n".join(map(self._item, block.items))
             case FactList():
@@ -87,9 +86,6 @@ class _PlainText:
     def _escaped(self, text: str) -> str:
         """Words of a text, none of whose characters has a meaning of its own."""
         return text
-
-    def _sentences(self, text: str) -> str:
-        return self._escaped(text)
 
     def _item(self, item: Bullet) -> str:
         return ": ".join(filter(None, (item.href or item.lead, item.text)))
@@ -180,28 +176,15 @@ class _Markdown(_PlainText):
 
 
 class _Latex(_Markdown):
-    """Tables, and all else as comments."""
+    """Tables alone."""
 
-    between, dash, plus_minus = "\n", "--", r"$\pm$"
+    dash, plus_minus = "--", r"$\pm$"
 
     def _escaped(self, text: str) -> str:
         """Plain text as LaTeX; what stands between backticks in typewriter type."""
         parts = _CODE.split(" ".join(text.split()))
         plain = [_SPECIAL.sub(lambda match: _ESCAPES[match.group()], part) for part in parts]
         return "".join(rf"\texttt{{{part}}}" if number % 2 else part for number, part in enumerate(plain))
-
-    def _sentences(self, text: str) -> str:
-        return f"% {' '.join(text.split())}"
-
-    def _item(self, item: Bullet) -> str:
-        return self._sentences(": ".join(filter(None, (item.lead, item.text))))
-
-    def _facts(self, facts: Sequence[Fact]) -> str:
-        return "\n".join(self._sentences(f"{fact.name}: {fact.text}") for fact in facts)
-
-    def _titled(self, title: str, body: str, level: int) -> str:
-        head = f"\n{self._sentences(f'==== {title}')}" if level == 2 else self._sentences(f"-- {title}")
-        return "\n".join(filter(None, (head, body)))
 
     def _table(self, table: Table) -> str:
         count = f" ({table.count})" if table.count else ""
@@ -286,11 +269,17 @@ def markdown_table(table: Table) -> str:
 
 
 def latex_text(page: Page) -> str:
-    """All tables in the order of the page, with the text between them as comments."""
-    parts = [_HEAD, _LATEX._sentences(page.title), _LATEX._sentences(page.note) if page.note else ""]
-    parts.append(_LATEX.text([FactList([fact for fact in page.facts if not fact.wide])]))
-    parts += [_LATEX._sentences(caution) for caution in page.cautions]
-    return "\n".join(filter(None, [*parts, _LATEX.text(page.text_sections)])) + "\n"
+    """All tables in the order of the page, below its title and cautions as comments."""
+    head = "\n".join([_HEAD, *(f"% {' '.join(text.split())}" for text in (page.title, *page.cautions))])
+    return "\n\n".join([head, *map(latex_table, _tables_of(page.text_sections))]) + "\n"
+
+
+def _tables_of(blocks: Sequence[Block]) -> Iterator[Table]:
+    for block in blocks:
+        if isinstance(block, Table):
+            yield block
+        elif isinstance(block, (Section, Folded)):
+            yield from _tables_of(block.blocks)
 
 
 def latex_table(table: Table) -> str:
@@ -328,24 +317,14 @@ def _fact_values(facts: Sequence[Fact]) -> dict[str, Any]:
 def _section_values(section: Section | Folded) -> dict[str, Any]:
     values: dict[str, Any] = {"title": section.title}
     for block in section.blocks:
-        name, value = _block_values(block)
-        if name:
-            values.setdefault(name, []).append(value)
+        match block:
+            case Table():
+                values.setdefault("tables", []).append(_table_values(block))
+            case FactList():
+                values.setdefault("facts", []).append(_fact_values(block.facts))
+            case Section() | Folded():
+                values.setdefault("sections", []).append(_section_values(block))
     return values
-
-
-def _block_values(block: Block) -> tuple[str, Any]:
-    match block:
-        case Table():
-            return "tables", _table_values(block)
-        case FactList():
-            return "facts", _fact_values(block.facts)
-        case Bullets():
-            return "items", [{"name": item.lead, "text": item.text, "href": item.href} for item in block.items]
-        case Section() | Folded():
-            return "sections", _section_values(block)
-        case _:
-            return "", None
 
 
 def _table_values(table: Table) -> dict[str, Any]:
@@ -354,6 +333,7 @@ def _table_values(table: Table) -> dict[str, Any]:
         {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
         for column in table.columns
     ]
-    cells = [[cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells]
-    rows = [dict(zip((column.key for column in table.columns), row, strict=True)) for row in cells]
+    keys = [column.key for column in table.columns]
+    cells = ([cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells)
+    rows = [dict(zip(keys, row, strict=True)) for row in cells]
     return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +56,7 @@ def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
     )
 
 
-def common_scenes(methods: Sequence[BySeed]) -> list[str]:
+def common_scenes(methods: Sequence[Mapping[str, Collection[object]]]) -> list[str]:
     """Scenes for which every method has a value, in the order of the first method."""
     known = [{scene for scene, seeds in values.items() if seeds} for values in methods]
     return [scene for scene in methods[0] if all(scene in scenes for scenes in known)] if methods else []
@@ -84,15 +84,11 @@ class RivalComparison:
     lead: float | None  # mean over the scenes, positive where the reference is better; None without a common scene
     better_on: int  # number of scenes on which the reference is better
     tests: PairedTests | None  # None with fewer than six common scenes
-    exploratory: bool = False  # not decided beforehand, so that no p is significant
 
     @property
     def stars(self) -> str:
-        """One star for each level that the adjusted Wilcoxon p stays below, as far as so many scenes can give it.
-
-        What is exploratory has none.
-        """
-        if self.tests is None or self.exploratory:
+        """One star for each level that the adjusted Wilcoxon p stays below, as far as so many scenes can give it."""
+        if self.tests is None:
             return ""
         possible = [level for level in LEVELS if smallest_p(len(self.scenes)) < level]
         return "*" * sum(self.tests.wilcoxon_holm < level for level in possible)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from coliags_plugin.comparison.report.study import Part, Study, StudyRun
+from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.reporting.model import Block, Chart, Figures, Folded, Paragraph, Section, Template
+from coliags_plugin.results.comparisons import common_scenes
 from coliags_plugin.results.record import ProfileRecord
 
 #: Bins with a smaller share of the pixels are left out.
@@ -22,6 +22,8 @@ _LOG_DEPTH_FROM, _LOG_LOSS_FROM = 20.0, 8.0
 _MOST_POINTS = 120
 #: Columns of the log against which curves are drawn: group of the charts, and label of the axis.
 _TRAINING_AXES = {"step": ("by-step", "step"), "seconds": ("by-seconds", "training time [s]")}
+#: Training log of a run: method, its style, and the columns.
+_Log = tuple[str, int, Mapping[str, np.ndarray]]
 
 
 def profile_section(study: Study) -> Section:
@@ -39,12 +41,12 @@ def _profile_charts(part: Part) -> list[Chart]:
     charts, unit = [], part.study.length_unit
     axes = {"distance": f"distance to the camera [{unit}]", "angle": "angle to the optical axis [degrees]"}
     for name, x_label in axes.items():
-        profiles = {method: _profiles(part, method, name) for method in part.study.methods}
+        profiles = _profiles(part, name)
         for title, y_label in (("PSNR", "PSNR [dB]"), ("Depth error", f"RMS depth error [{unit}]")):
             lines = [
-                _profile_line(method, style, own, of_depth=title != "PSNR")
-                for style, (method, own) in enumerate(profiles.items())
-                if own and len({profile.edges for profile in own}) == 1
+                _profile_line(method, part.study.methods.index(method), own, of_depth=title != "PSNR")
+                for method, own in profiles.items()
+                if len({profile.edges for profile in own}) == 1
             ]
             log = title != "PSNR" and _spans(lines, _LOG_DEPTH_FROM)
             charts.append(
@@ -53,20 +55,15 @@ def _profile_charts(part: Part) -> list[Chart]:
     return [chart for chart in charts if chart.has_points]
 
 
-def _profiles(part: Part, method: str, name: str) -> list[ProfileRecord]:
-    """Of the scenes on which every method has them, so that all are of the same pixels."""
-    having = [
-        {scene for scene in part.scenes for run in part.runs(scene, other) if name in _profiles_of(part, run)}
-        for other in part.study.methods
-    ]
-    known = [scenes for scenes in having if scenes]
-    shared = [scene for scene in part.scenes if known and all(scene in scenes for scenes in known)]
-    runs = [run for scene in shared for run in part.runs(scene, method)]
-    return [own[name] for run in runs if name in (own := _profiles_of(part, run))]
-
-
-def _profiles_of(part: Part, run: StudyRun) -> Mapping[str, ProfileRecord]:
-    return run.result.sets[part.set_name].profiles
+def _profiles(part: Part, name: str) -> dict[str, list[ProfileRecord]]:
+    """Profiles of the methods that have some, of the scenes that all of them have: all are of the same pixels."""
+    found: dict[str, dict[str, list[ProfileRecord]]] = {}
+    for run in part.study.runs:
+        record = part.record(run)
+        if record is not None and name in record.profiles:
+            found.setdefault(run.method, {}).setdefault(run.scene, []).append(record.profiles[name])
+    shared = common_scenes([*found.values()])
+    return {method: [each for scene in shared for each in by_scene[scene]] for method, by_scene in found.items()}
 
 
 def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of_depth: bool) -> Series:
@@ -74,7 +71,7 @@ def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of
     edges = np.array(profiles[0].edges)
     pixels = np.array([profile.pixels for profile in profiles], dtype=np.float64)
     errors = [profile.depth_mse if of_depth else profile.rgb_mse for profile in profiles]
-    values = np.array([[math.nan if error is None else error for error in own] for own in errors])
+    values = np.array(errors, dtype=np.float64)  # NaN for None
     total = pixels.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         means = np.where(pixels > 0, pixels * values, 0.0).sum(axis=0) / np.where(total > 0, total, math.nan)
@@ -83,32 +80,31 @@ def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of
     return Series(method, style, ((edges[:-1] + edges[1:]) / 2.0)[enough].tolist(), shown[enough].tolist())
 
 
-@dataclass(frozen=True)
-class _Log:
-    """Training log of one run, under its method's name and style."""
-
-    method: str
-    style: int
-    columns: Mapping[str, np.ndarray]
-
-
 def training_blocks(study: Study) -> list[Block]:
     """Curves of every scene against steps and seconds; says so where there is no log."""
-    by_scene = {scene: logs for scene in study.scenes if (logs := _logs(study, scene))}
-    if not by_scene:
+    logs: dict[str, list[_Log]] = {}
+    for style, (method, runs) in enumerate(study.by_method.items()):
+        for run in runs:
+            if run.run is not None and (columns := RunFolder(run.run).history()):
+                logs.setdefault(run.scene, []).append((method, style, columns))
+    if not logs:
         return [Paragraph("No training log: only results files are here, or runs without metrics.jsonl.")]
-    figures = {scene: Figures(_training_charts(logs), legend=study.methods) for scene, logs in by_scene.items()}
+    figures = {
+        scene: Figures(_training_charts(logs[scene]), legend=study.methods) for scene in study.scenes if scene in logs
+    }
     folded = [Folded(scene, [own], is_open=index == 0) for index, (scene, own) in enumerate(figures.items())]
-    hints = Paragraph(" ".join(_training_hints(study, [*by_scene.values()])))
-    return [Template("curves.html"), hints, *(folded if len(figures) > 1 else figures.values())]
-
-
-def _logs(study: Study, scene: str) -> list[_Log]:
+    hints = []
+    per_point = math.ceil(max(len(columns["step"]) for own in logs.values() for *_, columns in own) / _MOST_POINTS)
+    if per_point > 1:
+        hints.append(f"Each point is the mean of up to {per_point} logged steps.")
+    if len(study.methods) > 1:
+        hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
+    if any(len({method for method, *_ in own}) < len(own) for own in logs.values()):
+        hints.append("One curve for each seed.")
     return [
-        _Log(method, style, columns)
-        for style, (method, runs) in enumerate(study.by_method.items())
-        for run in runs
-        if run.scene == scene and run.run is not None and (columns := RunFolder(run.run).history())
+        Template("curves.html"),
+        Paragraph(" ".join(hints)),
+        *(folded if len(figures) > 1 else figures.values()),
     ]
 
 
@@ -119,34 +115,24 @@ def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
             ("psnr", "training PSNR [dB]", "PSNR of the training view at each step"),
             ("loss", "loss", "Loss"),
         ):
-            having = [log for log in logs if x in log.columns and y in log.columns]
-            lines = [_training_line(log, x, y) for log in having]
+            lines = [
+                Series(method, style, *_smoothed(columns[x], columns[y]))
+                for method, style, columns in logs
+                if x in columns and y in columns
+            ]
             log = y == "loss" and _spans(lines, _LOG_LOSS_FROM)
             charts.append(Chart(lines, x_label, _log_label(y_label, log), title, log_y=log, group=group))
     return charts
 
 
-def _training_line(log: _Log, x: str, y: str) -> Series:
-    known = np.isfinite(log.columns[x])
-    along, values = log.columns[x][known], log.columns[y][known]
+def _smoothed(along: np.ndarray, values: np.ndarray) -> tuple[list[float], list[float]]:
+    """Points of a curve; of many, means over intervals."""
+    along, values = along[np.isfinite(along)], values[np.isfinite(along)]
     if len(along) > _MOST_POINTS:
         intervals = np.array_split(np.arange(len(along)), _MOST_POINTS)
         kept = [part for part in (part[np.isfinite(values[part])] for part in intervals) if part.size]
         along, values = (np.array([every[part].mean() for part in kept]) for every in (along, values))
-    return Series(log.method, log.style, along.tolist(), values.tolist())
-
-
-def _training_hints(study: Study, logs: Sequence[Sequence[_Log]]) -> list[str]:
-    hints = []
-    longest = max(len(values) for own in logs for log in own for values in log.columns.values())
-    per_point = math.ceil(longest / _MOST_POINTS)
-    if per_point > 1:
-        hints.append(f"Each point is the mean of up to {per_point} logged steps.")
-    if len(study.methods) > 1:
-        hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
-    if any(len({log.method for log in own}) < len(own) for own in logs):
-        hints.append("One curve for each seed.")
-    return hints
+    return along.tolist(), values.tolist()
 
 
 def frame_charts(study: Study) -> list[Folded]:

@@ -20,90 +20,71 @@ _MARKS_SHOWN = 3
 
 
 @dataclass(frozen=True)
-class _CostColumn:
-    """A cost: how it is read, printed and, better lower or higher, ranked; and what depends on the device for it."""
+class _Cost:
+    """A cost: its column, how it is read and printed, and the work whose device it depends on."""
 
     column: Column
     value: Callable[[CostRecord], float | None]
     text: Callable[[float], str]
-    work: Literal["training", "rendering"] | None
+    work: Literal["training", "rendering"] | None = None
     missing: str = "not measured"
+
+
+def _mark(mark: str) -> _Cost:
+    column = Column(f"seconds_to_{mark}", f"To {mark} dB", "", "lower")
+    return _Cost(column, lambda cost: cost.seconds_to_psnr.get(mark), duration, "training", "not reached")
 
 
 def _mib(cost: CostRecord) -> float | None:
     return None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
 
 
-def _mark_column(mark: str) -> _CostColumn:
-    column = Column(f"seconds_to_{mark}", f"To {mark} dB", "", "lower")
-    return _CostColumn(column, lambda cost: cost.seconds_to_psnr.get(mark), duration, "training", "not reached")
-
-
-def _time(key: str, title: str) -> _CostColumn:
-    return _CostColumn(Column(key, title, "", "lower"), attrgetter(key), duration, "training")
-
-
-_TIMES = (_time("train_seconds", "Training"), _time("processor_seconds", "Processor time"))
 _NO_GAUSSIANS = "not counted, or a radiance field, which has none"
-_FPS, _MEMORY = Column("fps", "Rendering", "views/s", "higher"), Column("memory", "Peak memory", "MiB", "lower")
-_OTHERS = (
-    _CostColumn(_FPS, attrgetter("render_fps"), "{:.3g}".format, "rendering"),
-    _CostColumn(_MEMORY, attrgetter("peak_memory_mib"), "{:,.0f}".format, "training"),
-    _CostColumn(Column("gaussians", "Gaussians"), attrgetter("gaussians"), "{:,.0f}".format, None, _NO_GAUSSIANS),
-    _CostColumn(Column("checkpoint", "Checkpoint", "MiB", "lower"), _mib, "{:,.1f}".format, None),
-)
+#: Costs before and behind the marks.
+_TIMES = [
+    _Cost(Column(key, title, "", "lower"), attrgetter(key), duration, "training")
+    for key, title in (("train_seconds", "Training"), ("processor_seconds", "Processor time"))
+]
+_OTHERS = [
+    _Cost(Column("fps", "Rendering", "views/s", "higher"), attrgetter("render_fps"), "{:.3g}".format, "rendering"),
+    _Cost(Column("memory", "Peak memory", "MiB", "lower"), attrgetter("peak_memory_mib"), "{:,.0f}".format, "training"),
+    _Cost(Column("gaussians", "Gaussians"), attrgetter("gaussians"), "{:,.0f}".format, missing=_NO_GAUSSIANS),
+    _Cost(Column("checkpoint", "Checkpoint", "MiB", "lower"), _mib, "{:,.1f}".format),
+]
 
 
 def cost_table(study: Study) -> Table:
     """Mean costs of every method over the scenes that all methods have, seeds averaged."""
-    shared = [scene for scene in study.scenes if all(_costs(study, method, scene) for method in study.methods)]
+    shared = [s for s in study.scenes if all(any(run.scene == s for run in own) for own in study.by_method.values())]
     costs = [run.result.cost for run in study.runs]
     devices = {
         "training": {training_device(cost) for cost in costs},
         "rendering": {_rendering_device(cost) for cost in costs},
     }
-    marks = [
-        _mark_column(mark) for mark in sorted({mark for cost in costs for mark in cost.seconds_to_psnr}, key=float)
-    ]
-    kinds = [*_TIMES, *marks, *_OTHERS]
-    cells = {kind.column.key: [_cell(study, shared, kind, method) for method in study.methods] for kind in kinds}
-    hidden = _hidden_marks({kind.column.key: cells[kind.column.key] for kind in marks})
-    columns, in_order = [Column("steps", "Steps")], [[_steps(study, method) for method in study.methods]]
-    for kind in kinds:
-        comparable = kind.work is None or len(devices[kind.work]) == 1
-        column = kind.column if comparable else replace(kind.column, direction=None)
-        columns.append(replace(column, shown=column.key not in hidden))
-        in_order.append(_ranked(column, cells[column.key]))
+    marks = [_mark(name) for name in sorted({name for cost in costs for name in cost.seconds_to_psnr}, key=float)]
+    cells = {"steps": [_steps(study, method) for method in study.methods]}
+    columns = [METHOD, Column("steps", "Steps")]
+    for cost in (*_TIMES, *marks, *_OTHERS):
+        is_ranked = cost.work is None or len(devices[cost.work]) == 1
+        columns.append(cost.column if is_ranked else replace(cost.column, direction=None))
+        cells[cost.column.key] = _ranked(columns[-1], [_cell(study, shared, cost, method) for method in study.methods])
+    # The highest marks that all methods reached, then the lowest that some did.
+    reached = {mark.column.key: [bool(cell.text) for cell in cells[mark.column.key]] for mark in marks}
+    by_all = [key for key in reversed(reached) if all(reached[key])]
+    by_some = [key for key in reached if any(reached[key]) and key not in by_all]
+    hidden = reached.keys() - {*[*by_all, *by_some][:_MARKS_SHOWN]}
     if len(devices["training"]) > 1:
         columns.append(Column("device", "Device", words=True))
-        own = ([training_device(run.result.cost) for run in study.by_method[method]] for method in study.methods)
-        in_order.append([TableCell("; ".join(dict.fromkeys(each))) for each in own])
+        own = ([training_device(run.result.cost) for run in runs] for runs in study.by_method.values())
+        cells["device"] = [TableCell("; ".join(dict.fromkeys(each))) for each in own]
     return Table(
         title="Costs",
-        columns=[METHOD, *columns],
-        rows=method_rows(study, columns, in_order),
-        notes=[*_notes(study, shared, devices), *_plans(study)],
+        columns=[replace(column, shown=column.key not in hidden) for column in columns],
+        rows=method_rows(study, cells),
+        notes=_notes(study, shared, devices),
         count=f"means over {counted(len(shared), 'scene')}" if len(shared) > 1 else "",
         name="costs",
     )
-
-
-def _plans(study: Study) -> list[str]:
-    """Recorded plans of densification and pruning, one line for each method and plan."""
-    return [
-        f"{method}: {plan}"
-        for method, own in study.by_method.items()
-        for plan in dict.fromkeys(run.result.provenance.get("training", {}).get("plan") for run in own)
-        if plan
-    ]
-
-
-def _hidden_marks(cells: dict[str, list[TableCell]]) -> set[str]:
-    """Marks not to show: all but the highest that all methods reached, and the lowest that some did."""
-    reached = {key: [cell.value is not None for cell in own] for key, own in cells.items()}
-    by_all = [key for key in reversed(reached) if all(reached[key])]
-    by_some = [key for key in reached if any(reached[key]) and not all(reached[key])]
-    return set(reached) - {*[*by_all, *by_some][:_MARKS_SHOWN]}
 
 
 def _steps(study: Study, method: str) -> TableCell:
@@ -111,29 +92,28 @@ def _steps(study: Study, method: str) -> TableCell:
     return TableCell(f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}", steps[-1])
 
 
-def _cell(study: Study, shared: Sequence[str], kind: _CostColumn, method: str) -> TableCell:
+def _cell(study: Study, shared: Sequence[str], cost: _Cost, method: str) -> TableCell:
     """Mean over scenes of the means over seeds; missing unless it is known of every run."""
     if not shared:
         return TableCell(note="no scene that all methods have")
-    by_scene = [[kind.value(cost) for cost in _costs(study, method, scene)] for scene in shared]
-    means = [np.mean([number for number in own if number is not None]) for own in by_scene if None not in own]
-    if len(means) == len(shared):
-        mean = float(np.mean(means))
-        return TableCell(kind.text(mean), mean)
-    known = f"; known of {len(means)} of {len(shared)} scenes" if means else ""
-    return TableCell(note=f"{kind.column.title}: {kind.missing}{known}")
+    by_scene = [[cost.value(run.result.cost) for run in study.by_method[method] if run.scene == s] for s in shared]
+    means = np.array([np.mean(np.array(values, dtype=np.float64)) for values in by_scene])  # NaN where one is missing
+    known = np.count_nonzero(np.isfinite(means))
+    if known == len(shared):
+        return TableCell(cost.text(float(means.mean())), float(means.mean()))
+    where = f"; known of {known} of {len(shared)} scenes" if known else ""
+    return TableCell(note=f"{cost.column.title}: {cost.missing}{where}")
 
 
 def _ranked(column: Column, cells: Sequence[TableCell]) -> list[TableCell]:
-    """By the printed text: values that look alike share a rank."""
-    first: dict[str, float | None] = {}
-    for cell in cells:
-        first.setdefault(cell.text, cell.value)
+    """Cells with their ranks; values that look alike share one."""
+    first = {cell.text: cell.value for cell in reversed(cells)}
     ranks = ranks_of([first[cell.text] for cell in cells], column.direction)
     return [replace(cell, rank=rank) for cell, rank in zip(cells, ranks, strict=True)]
 
 
 def _notes(study: Study, shared: Sequence[str], devices: dict[str, set[str]]) -> list[str]:
+    """What the means leave out, devices, and the recorded plans of densification and pruning."""
     notes = []
     if len(shared) < len(study.scenes):
         missing = ", ".join(scene for scene in study.scenes if scene not in shared)
@@ -147,7 +127,9 @@ def _notes(study: Study, shared: Sequence[str], devices: dict[str, set[str]]) ->
     notes += [f"All {work} on {next(iter(names))}" for work, names in devices.items() if len(names) == 1]
     if any(run.result.cost.seconds_to_psnr for run in study.runs):
         notes.append("To N dB: training time until the logged PSNR, smoothed, first reached N dB")
-    return [*notes, "Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean"]
+    notes.append("Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean")
+    plans = dict.fromkeys((run.method, run.result.provenance.get("training", {}).get("plan")) for run in study.runs)
+    return notes + [f"{method}: {plan}" for method, plan in plans if plan]
 
 
 def training_device(cost: CostRecord) -> str:
@@ -164,7 +146,3 @@ def _rendering_device(cost: CostRecord) -> str:
 
 def _with_threads(device: str, threads: int | None) -> str:
     return device if threads is None else f"{device}, {counted(threads, 'thread')}"
-
-
-def _costs(study: Study, method: str, scene: str) -> list[CostRecord]:
-    return [run.result.cost for run in study.by_method[method] if run.scene == scene]

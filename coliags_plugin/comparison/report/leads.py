@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import starmap
 
-from coliags_plugin.comparison.report.metric_tables import metric_columns, metric_title, shared_scenes, spreads
+from coliags_plugin.comparison.report.metric_tables import metric_columns, metric_title, spreads
 from coliags_plugin.comparison.report.study import Part, Study
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import check_name
 from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
 from coliags_plugin.results.comparisons import (
     FEWEST_SCENES,
-    LEVELS,
     PairedTests,
     RivalComparison,
     compare_with_rivals,
@@ -44,47 +41,35 @@ _TESTS = {
 
 def choose_reference(study: Study, chosen: str | None) -> str:
     """The method that the others are compared with: that chosen, else that decided, else ``coliags``, else the best."""
-    if chosen is None:
-        if study.decided is not None and study.decided.reference in study.methods:
-            return study.decided.reference
-        return PREFERRED if PREFERRED in study.methods else _best_method(study.parts[0])
-    if chosen not in study.methods:
-        known = ", ".join(study.methods)
-        raise InputError(
-            f"--reference {chosen}: no such method", f"one of {known}", did_you_mean(chosen, study.methods)
-        )
-    return chosen
+    if chosen is not None:
+        check_name("method", chosen, study.methods)
+    decided = None if study.decided is None else study.decided.reference
+    return next((name for name in (chosen, decided, PREFERRED) if name in study.methods), None) or _best_method(study)
 
 
-def _best_method(part: Part) -> str:
+def _best_method(study: Study) -> str:
     """The method that is best by the first metric; the first one where none has a value."""
-    column = metric_columns(part)[0]
-    values = part.values(column.key)
-    found = dict(zip(values, spreads(values, shared_scenes(values)), strict=True))
+    column = metric_columns(study.parts[0])[0]
+    found = spreads(study.parts[0].values(column.key))
     means = {method: own.mean for method, own in found.items() if own.mean is not None}
     sign = 1.0 if column.direction == "higher" else -1.0
-    return max(means, key=lambda method: sign * means[method]) if means else part.study.methods[0]
+    return max(means, key=lambda method: sign * means[method]) if means else study.methods[0]
 
 
 def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
     """Paired comparisons of the reference with every method by one metric; empty where it has no value."""
-    study, values = part.study, part.values(column.key)
+    values = part.values(column.key)
     if column.direction is None or not values[reference]:
         return []
     rivals = {method: by_scene for method, by_scene in values.items() if by_scene}
-    compared = compare_with_rivals(rivals, reference, column.direction == "higher", _family(study, reference))
-    is_primary = study.decided is not None and is_decided(study, reference) and column.key in study.decided.primary
-    return [replace(row, exploratory=not is_primary) for row in compared]
+    return compare_with_rivals(rivals, reference, column.direction == "higher", part.study.rivals(reference))
 
 
-def _family(study: Study, reference: str) -> int:
-    """Number of rivals that p-values are adjusted for: all methods that were planned or given."""
-    return len({*study.family, *study.methods} - {reference})
-
-
-def is_decided(study: Study, reference: str) -> bool:
-    """Whether the reference is that which was decided before the first result."""
-    return study.decided is not None and study.decided.reference == reference
+def stars(study: Study, metric: str, reference: str, row: RivalComparison) -> str:
+    """Stars of a comparison, if its reference and metric were decided before the first run; else none."""
+    decided = study.decided
+    is_decided = decided is not None and decided.reference == reference and metric in decided.primary
+    return row.stars if is_decided else ""
 
 
 def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
@@ -97,40 +82,40 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
         Column("better", "Better on"),
     ]
     if any(row.tests for row in compared):
-        columns += [Column("interval", "95 % t interval", column.unit), *starmap(Column, _TESTS.items())]
+        columns.append(Column("interval", "95 % t interval", column.unit))
+        columns += [Column(key, title) for key, title in _TESTS.items()]
     decimals = column_decimals(column.unit, [row.lead for row in compared])
-    untested = dict.fromkeys(
-        [each.key for each in columns[4:]], TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")
-    )
+    untested = TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")
+    rows: list[dict[str, TableCell | int]] = []
+    for row in compared:
+        cells = {each.key: untested for each in columns[4:]}
+        if row.tests is not None:
+            cells = _test_cells(row.tests, len(row.scenes), decimals, stars(part.study, column.key, reference, row))
+        own: dict[str, TableCell | int] = {
+            "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
+            "scenes": len(row.scenes),
+            "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
+            "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
+        }
+        rows.append({**own, **cells})
     return Table(
         title=f"{column.title}: lead of {reference}",
         columns=columns,
-        rows=[
-            {
-                "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
-                "scenes": len(row.scenes),
-                "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
-                "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
-                **(untested if row.tests is None else _test_cells(row, row.tests, decimals)),
-            }
-            for row in compared
-        ],
-        notes=["Exploratory: no stars"] if all(row.exploratory for row in compared) else [],
+        rows=rows,
         count=part.title + (f", {unit}" if unit else ""),
         name=f"lead-{part.name}-{column.key}",
     )
 
 
-def _test_cells(row: RivalComparison, tests: PairedTests, decimals: int) -> dict[str, TableCell]:
-    scenes = len(row.scenes)
+def _test_cells(tests: PairedTests, scenes: int, decimals: int, marks: str) -> dict[str, TableCell]:
     low, high = (_signed(end, decimals) for end in tests.interval)
     undefined = TableCell(note="all differences are equal")
     t_tests = {"t_test": tests.t_test, "t_test_holm": tests.t_test_holm}
     return {
         "interval": TableCell(f"{low.text} to {high.text}", low.value),
-        "smallest": TableCell(smallest_p_text(scenes), smallest_p(scenes)),
+        "smallest": TableCell(p_text(smallest_p(scenes), digits=3), smallest_p(scenes)),
         "wilcoxon": TableCell(p_text(tests.wilcoxon), tests.wilcoxon),
-        "wilcoxon_holm": TableCell(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=row.stars),
+        "wilcoxon_holm": TableCell(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=marks),
         **{name: undefined if p is None else TableCell(p_text(p), p) for name, p in t_tests.items()},
         "cohen_dz": undefined if tests.cohen_dz is None else _signed(tests.cohen_dz, 2),
         "rank_biserial": _signed(tests.rank_biserial, 2),
@@ -142,62 +127,32 @@ def _signed(value: float, decimals: int) -> TableCell:
     return TableCell(f"+{text}" if value > 0 and text.strip("0.") else text, value)
 
 
-def statistics_text(study: Study, compared: Sequence[RivalComparison], reference: str, chosen: bool) -> list[str]:
-    """Sentences on the unit, the number of scenes and the smallest possible p of one metric; or why no test is run.
-
-    They tell what was decided beforehand, and the family that p-values are adjusted for. A reference that was not
-    chosen beforehand, but for being the best, is warned of.
-    """
+def statistics_text(study: Study, compared: Sequence[RivalComparison], reference: str) -> str:
+    """What the tests of one metric can say: unit, scenes, smallest p, family, stars; empty without a common scene."""
     most = max((len(row.scenes) for row in compared), default=0)
     if not most:
-        return []
+        return ""
+    smallest = p_text(smallest_p(most), digits=3)
     if most < FEWEST_SCENES:
-        return [
+        return (
             f"No test is run: {counted(most, 'scene')} cannot tell methods apart. The unit is the scene, not the "
             f"frame, and of {counted(most, 'difference')} the two-sided Wilcoxon test cannot give less than p = "
-            f"{smallest_p_text(most)}; tests are run from {FEWEST_SCENES} scenes on "
-            f"(p = {smallest_p_text(FEWEST_SCENES)})."
-        ]
-    rivals = _family(study, reference)
-    text = [
+            f"{smallest}; tests are run from {FEWEST_SCENES} scenes on "
+            f"(p = {p_text(smallest_p(FEWEST_SCENES), digits=3)})."
+        )
+    rivals, decided = study.rivals(reference), "nothing"
+    if study.decided is not None:
+        metrics = ", ".join(map(metric_title, study.decided.primary))
+        decided = f"{study.decided.reference} against the others by {metrics}, on {study.decided.date}"
+    return (
         f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
-        f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or {smallest_p_text(most, rivals)} "
-        f"after Holm's adjustment for {counted(rivals, 'rival')}."
-    ]
-    if min(1.0, rivals * smallest_p(most)) >= LEVELS[0]:
-        needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
-        text.append(f"No star is possible, as that is not below {p_text(LEVELS[0])}; it takes {needed} scenes.")
-    text += ["The adjustment counts every method that was planned or given.", _decision_text(study, reference)]
-    if not chosen:
-        text.append(
-            f"{reference} is the reference because it came out best, so that the p-values are too small: choose one "
-            "beforehand, with --reference."
-        )
-    return text
-
-
-def _decision_text(study: Study, reference: str) -> str:
-    """Sentences on the pre-registered reference and metrics, and on which p-values are exploratory."""
-    decided = study.decided
-    if decided is None:
-        return (
-            "All p-values are exploratory, without stars: reference and primary metrics were not decided before the "
-            "first run (`coliags compare --reference METHOD --primary METRIC`)."
-        )
-    text = (
-        f"Decided on {decided.date}, before the first run: {decided.reference} is compared with the others by "
-        f"{', '.join(map(metric_title, decided.primary))}."
+        f"two-sided Wilcoxon signed-rank test can give is {smallest}, or "
+        f"{p_text(min(1.0, rivals * smallest_p(most)), digits=3)} after Holm's adjustment for "
+        f"{counted(rivals, 'rival')}: every method that was planned or given. Stars are for what was decided before "
+        f"the first run ({decided}); all other p-values are exploratory."
     )
-    if is_decided(study, reference):
-        return f"{text} p-values of other metrics are exploratory, without stars."
-    return f"{text} {reference} is another reference, so that all p-values are exploratory, without stars."
 
 
 def p_text(p: float, digits: int = 2) -> str:
     """A p-value with significant digits, without a leading zero; ``1`` and ``< .0001`` at the ends."""
     return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.{digits}g}".removeprefix("0")
-
-
-def smallest_p_text(scenes: int, rivals: int = 1) -> str:
-    """The smallest p that so many scenes can give, adjusted for so many rivals."""
-    return p_text(min(1.0, rivals * smallest_p(scenes)), digits=3)

@@ -14,18 +14,18 @@ from coliags_plugin.comparison.report.comparability import cautions
 from coliags_plugin.comparison.report.costs import cost_table
 from coliags_plugin.comparison.report.leads import (
     EXPLANATION,
-    PREFERRED,
     choose_reference,
     compare,
-    is_decided,
     lead_table,
+    stars,
     statistics_text,
 )
-from coliags_plugin.comparison.report.metric_tables import check_columns, means_table, metric_columns
+from coliags_plugin.comparison.report.metric_tables import ALL_COLUMNS, means_table, metric_columns
 from coliags_plugin.comparison.report.provenance import provenance_section
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.comparison.report.study import MissingResult, Part, Study
 from coliags_plugin.comparison.report.views import view_section
+from coliags_plugin.core.errors import check_name
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
 from coliags_plugin.reporting.model import (
@@ -101,7 +101,8 @@ def write_report(
 
 def text_page(study: Study, choices: Choices) -> Page:
     """The page without what only a screen shows."""
-    check_columns(study, choices.columns)
+    for name in choices.columns:
+        check_name("metric", name, [*study.metrics, ALL_COLUMNS])
     reference = choose_reference(study, choices.reference)
     return Page(
         title=choices.title if choices.title is not None else _title(study),
@@ -180,11 +181,14 @@ def _metrics(study: Study, choices: Choices, reference: str) -> Section:
 def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     columns = metric_columns(part, choices.columns)
     compared = {column.key: compare(part, column, reference) for column in columns}
-    blocks: list[Block] = [means_table(part, columns, comparisons=compared)]
+    marks = {
+        metric: {row.rival: stars(part.study, metric, reference, row) for row in rows}
+        for metric, rows in compared.items()
+    }
+    blocks: list[Block] = [means_table(part, columns, stars=marks)]
     shown = [column for column in columns if column.shown and compared[column.key]]
-    if shown:
-        chosen = choices.reference is not None or reference == PREFERRED or is_decided(part.study, reference)
-        blocks += [Paragraph(text) for text in statistics_text(part.study, compared[shown[0].key], reference, chosen)]
+    if shown and (text := statistics_text(part.study, compared[shown[0].key], reference)):
+        blocks.append(Paragraph(text))
     if shown and len(part.scenes) > 1:
         leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
         blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))

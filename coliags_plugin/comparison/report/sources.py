@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, ComparisonPlan, read_plan
+from coliags_plugin.comparison.plan_file import (
+    FAILURES,
+    PLAN_FILE,
+    RESULTS,
+    ComparisonPlan,
+    PlannedCell,
+    read_plan,
+)
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.results.hashing import training_config
+from coliags_plugin.results.hashing import training_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -43,46 +48,41 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
             missing += failed
         else:
             runs.append(_read_run(path, protocol))
-    _refuse_twice(runs)
+    files = [run.file.resolve() for run in runs]
+    for number, run in enumerate(runs):
+        if files[number] in files[:number]:
+            raise InputError(f"{run.run or run.file} is given twice", "each result once")
     if not runs:
         raise _nothing_yet(paths, missing)
     runs = disambiguate_labels(runs)
-    family = dict.fromkeys(run.method for run in runs)
-    family |= dict.fromkeys([*(cell.method for plan in plans for cell in plan.cells), *(one.method for one in missing)])
+    family = dict.fromkeys([*(run.method for run in runs), *(cell.method for plan in plans for cell in plan.cells)])
     decisions = {plan.decided for plan in plans}
-    shown, missing = _only(methods, runs, missing) if methods else (runs, missing)
-    refuse_incomparable(shown)
-    return Study(tuple(shown), tuple(missing), tuple(family), decisions.pop() if len(decisions) == 1 else None)
-
-
-def _only(
-    methods: Sequence[str], runs: Sequence[StudyRun], missing: Sequence[MissingResult]
-) -> tuple[list[StudyRun], list[MissingResult]]:
-    """Results and failures of some methods, in their order."""
-    known = list(dict.fromkeys([run.method for run in runs] + [one.method for one in missing]))
-    for name in methods:
-        check_name("method", name, known)
-    kept = [run for name in dict.fromkeys(methods) for run in runs if name == run.method]
-    return kept, [one for one in missing if one.method in methods]
+    if methods:
+        for name in methods:
+            known = dict.fromkeys([*(run.method for run in runs), *(one.method for one in missing)])
+            check_name("method", name, known)
+        runs = [run for name in dict.fromkeys(methods) for run in runs if name == run.method]
+        missing = [one for one in missing if one.method in methods]
+    refuse_incomparable(runs)
+    return Study(tuple(runs), tuple(missing), tuple(family), decisions.pop() if len(decisions) == 1 else None)
 
 
 def _read_run(folder: Path, protocol: str) -> StudyRun:
-    evaluation = folder / "eval" / protocol
-    file = evaluation / RESULT_FILE
+    file = folder / "eval" / protocol / RESULT_FILE
     if file.is_file():
         return _read_file(file, folder.resolve().name, folder)
     name = protocol.removesuffix(TRUTH_SUFFIX)
     truth = "" if name == protocol else " --truth SCENE"
-    do = f"Run `coliags eval {folder} --protocol {name}{truth}`"
     if not (folder / "eval").is_dir() and not (folder / "config.yaml").is_file():
         raise InputError(
             f"{folder} holds no results",
             "a run folder, a results file, or the folder of a comparison",
             "Check the path",
         )
-    missing = file.relative_to(folder)
     raise InputError(
-        f"{folder} has no evaluation by protocol '{protocol}' ({missing} is missing)", "one", f"{do} first"
+        f"{folder} has no evaluation by protocol '{protocol}' ({file.relative_to(folder)} is missing)",
+        "one",
+        f"Run `coliags eval {folder} --protocol {name}{truth}` first",
     )
 
 
@@ -101,59 +101,38 @@ def _read_comparison(
     folder: Path, plan: ComparisonPlan | None, protocol: str
 ) -> tuple[list[StudyRun], list[MissingResult]]:
     """Results and failures of one protocol: those of the plan, in its order; without a plan, all results."""
-    if plan is not None:
-        return _read_planned(folder, plan, protocol)
-    found = [_read_file(file, file.stem) for file in sorted([*folder.glob(_CELL), *(folder / RESULTS).glob(_CELL)])]
-    _refuse_other_protocols(folder, protocol, {one.result.protocol.name for one in found})
-    return [one for one in found if one.result.protocol.name == protocol], []
-
-
-def _read_planned(folder: Path, plan: ComparisonPlan, protocol: str) -> tuple[list[StudyRun], list[MissingResult]]:
-    found, missing = [], []
-    runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
-    for entry in (entry for entry in plan.cells if entry.protocol == protocol):
-        file = folder / entry.result
-        if file.is_file():
-            own = _with_images(folder / entry.run, protocol)
-            one = replace(_read_file(file, file.stem, own), method=entry.method)
-            if own is not None:
-                runs[one.result.key] = own
-            found.append(one)
-        else:
-            failure = folder / FAILURES / Path(entry.result).relative_to(RESULTS)
-            reason = _failure_reason(failure) if failure.is_file() else None
-            missing.append(MissingResult(entry.scene, entry.method, entry.seed, reason))
-    _refuse_other_protocols(folder, protocol, {entry.protocol for entry in plan.cells})
-    return [replace(one, run=one.run or runs.get(one.result.key)) for one in found], missing
-
-
-def _refuse_other_protocols(folder: Path, protocol: str, protocols: set[str]) -> None:
+    if plan is None:
+        every = [_read_file(file, file.stem) for file in sorted([*folder.glob(_CELL), *(folder / RESULTS).glob(_CELL)])]
+        found, missing = [one for one in every if one.result.protocol.name == protocol], list[MissingResult]()
+        protocols = {one.result.protocol.name for one in every}
+    else:
+        found, missing = _read_planned(folder, [cell for cell in plan.cells if cell.protocol == protocol])
+        protocols = {cell.protocol for cell in plan.cells}
     if protocols and protocol not in protocols:
         raise InputError(
             f"{folder} has results of protocol {', '.join(sorted(protocols))} only",
             f"some of '{protocol}'",
             f"Pass --protocol {min(protocols)}",
         )
+    return found, missing
 
 
-def _with_images(run: Path, protocol: str) -> Path | None:
-    """The run, if it still has the images of its evaluation."""
-    return run if (run / "eval" / protocol / "renders").is_dir() else None
-
-
-def _failure_reason(file: Path) -> str:
-    record = read_json(file, "the reason of a failure")
-    reason = record.get("reason") if isinstance(record, dict) else None
-    return str(reason or "no reason was recorded")
-
-
-def _refuse_twice(runs: Iterable[StudyRun]) -> None:
-    files: set[Path] = set()
-    for one in runs:
-        file = one.file.resolve()
-        if file in files:
-            raise InputError(f"{one.run or one.file} is given twice", "each result once")
-        files.add(file)
+def _read_planned(folder: Path, cells: Sequence[PlannedCell]) -> tuple[list[StudyRun], list[MissingResult]]:
+    found, missing = list[StudyRun](), list[MissingResult]()
+    runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
+    for cell in cells:
+        file, failure = folder / cell.result, folder / FAILURES / Path(cell.result).relative_to(RESULTS)
+        if file.is_file():
+            one = replace(_read_file(file, file.stem), method=cell.method)
+            if (folder / cell.run / "eval" / cell.protocol / "renders").is_dir():
+                runs[one.result.key] = folder / cell.run
+            found.append(one)
+        else:
+            record = read_json(failure, "the reason of a failure") if failure.is_file() else None
+            told = record.get("reason") if isinstance(record, dict) else None
+            reason = str(told or "no reason was recorded") if failure.is_file() else None
+            missing.append(MissingResult(cell.scene, cell.method, cell.seed, reason))
+    return [replace(one, run=runs.get(one.result.key)) for one in found], missing
 
 
 def _nothing_yet(paths: Sequence[Path], missing: Sequence[MissingResult]) -> InputError:
@@ -174,47 +153,28 @@ def disambiguate_labels(runs: Sequence[StudyRun]) -> list[StudyRun]:
     Runs of one config that differ in seed share a label. Where a method has several configs or several runs of one
     seed, its label is followed by what tells them apart: steps, the stamp of the run, or a hash of the config.
     """
-    groups: dict[str, list[int]] = {}
-    for index, run in enumerate(runs):
-        groups.setdefault(run.method, []).append(index)
-    labelled = list(runs)
-    for own in groups.values():
-        group = [runs[index] for index in own]
-        if not _is_one_method(group):
-            for index, label in zip(own, _distinct_labels(group), strict=True):
-                labelled[index] = replace(labelled[index], method=label)
-    return labelled
+    labels: dict[Path, str] = {}
+    for name in dict.fromkeys(run.method for run in runs):
+        group = [run for run in runs if name == run.method]
+        steps, stamps = [f"{run.result.steps:,} steps" for run in group], [run.stamp for run in group]
+        configs = [f"config {_config_key(run)[:8]}" for run in group]
+        numbered = [f"{stamp} ({index})" for index, stamp in enumerate(stamps, 1)]
+        one_scene = len({run.scene for run in group}) == 1
+        for suffixes in ([""] * len(group), steps, *((stamps, configs) if one_scene else (configs, stamps)), numbered):
+            same = [[run for run, own in zip(group, suffixes, strict=True) if own == each] for each in {*suffixes}]
+            if all(map(_is_one_method, same)):
+                break
+        labels |= {run.file: f"{name} · {own}" if own else name for run, own in zip(group, suffixes, strict=True)}
+    return [replace(run, method=labels[run.file]) for run in runs]
 
 
 def _is_one_method(runs: Sequence[StudyRun]) -> bool:
     """Whether runs of one label are one method: one config on each scene and split, and one run per seed."""
-    configs: dict[tuple[str, str], str] = {}
-    seeds = set()
-    for run in runs:
-        scene = run.result.scene
-        key, config = (scene.name, scene.split), _config_hash(run)
-        if configs.setdefault(key, config) != config or (key, run.result.seed) in seeds:
-            return False
-        seeds.add((key, run.result.seed))
-    return True
+    places = [(run.scene, run.result.scene.split) for run in runs]
+    configs = {(place, _config_key(run)) for place, run in zip(places, runs, strict=True)}
+    seeds = {(place, run.result.seed) for place, run in zip(places, runs, strict=True)}
+    return len(configs) == len({*places}) and len(seeds) == len(runs)
 
 
-def _distinct_labels(runs: Sequence[StudyRun]) -> list[str]:
-    one_scene = len({run.scene for run in runs}) == 1
-    steps, stamps = [f"{run.result.steps:,} steps" for run in runs], [run.stamp for run in runs]
-    configs = [f"config {_config_hash(run)[:8]}" for run in runs]
-    for suffixes in (steps, stamps, configs) if one_scene else (steps, configs, stamps):
-        labels = [f"{run.method} · {suffix}" for run, suffix in zip(runs, suffixes, strict=True)]
-        groups = ([run for run, own in zip(runs, labels, strict=True) if own == label] for label in set(labels))
-        if all(map(_is_one_method, groups)):
-            return labels
-    labels = [f"{run.method} · {run.stamp}" for run in runs]
-    return [
-        f"{label} ({labels[: index + 1].count(label)})" if labels.count(label) > 1 else label
-        for index, label in enumerate(labels)
-    ]
-
-
-def _config_hash(run: StudyRun) -> str:
-    text = json.dumps([training_config(run.result.config), run.result.steps], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+def _config_key(run: StudyRun) -> str:
+    return training_key(run.result.config, "", run.result.steps, "")

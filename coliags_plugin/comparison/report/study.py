@@ -100,6 +100,10 @@ class Part:
                 own.setdefault(run.scene, {})[run.result.seed] = mean
         return dict(values)
 
+    def has(self, metric: str) -> bool:
+        """Whether any result has a value of a metric."""
+        return any(self.values(metric).values())
+
     def frame_means(self, scene: str, method: str, metric: str) -> dict[str, float]:
         """A metric of every frame of a scene that has it, mean over the seeds that have it."""
         by_frame: dict[str, list[float]] = {}
@@ -168,6 +172,10 @@ class Study:
             metrics |= {name: metric for name, metric in run.result.metrics.items() if name not in metrics}
         bases = dict.fromkeys(name.removesuffix(SEEN_SUFFIX) for name in metrics)
         return {name: metrics[name] for base in bases for name in (base, base + SEEN_SUFFIX) if name in metrics}
+
+    def rivals(self, reference: str) -> int:
+        """Number of rivals that p-values are adjusted for: all methods that were planned or given."""
+        return len({*self.family, *self.methods} - {reference})
 
     @property
     def length_unit(self) -> str:

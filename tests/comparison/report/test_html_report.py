@@ -385,7 +385,7 @@ def refuses(tmp_path, runs, match, **options):
 
 def test_what_is_missing_is_refused(tmp_path, two_runs):
     refuses(tmp_path, two_runs, "at least one", choices=Choices(frames=0))
-    refuses(tmp_path, two_runs, "no such metric", choices=Choices(columns=("x",)))
+    refuses(tmp_path, two_runs, "no metric 'x'", choices=Choices(columns=("x",)))
     (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
     refuses(tmp_path, two_runs, r"renders/test/0004\.png is missing")
     write_report(two_runs, tmp_path / "table.txt", ("markdown",))  # which has no images
@@ -399,7 +399,11 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
         ("result.json", b"{", r"result\.json is cut off"),
         ("truth/test/0004.png", b"x", r"truth/test/0004\.png .*cannot be decoded"),
         ("depth/test/0004.tiff", b"x", r"depth/test/0004\.tiff .*cannot be decoded"),
-        ("renders/test/0004.png", encode_png(np.zeros((5, 6, 3), np.uint8)), r"6 x 5 px\. Expected 16 x 12 px"),
+        (
+            "renders/test/0004.png",
+            encode_png(np.zeros((5, 6, 3), np.uint8)),
+            r"6 x 5 px\. Expected 16 x 12 px, as the truth",
+        ),
     ],
 )
 def test_what_is_damaged_is_refused(tmp_path, file, content, match):
