@@ -12,7 +12,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from coliags_plugin.checks.data.findings import points_findings
+from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.colmap.reader import find_models, read_model
@@ -291,7 +291,9 @@ def test_observations_that_poses_do_not_explain_are_counted(mine):
     change_model(stretch)(mine)
     facts = load(mine).provenance
     assert facts["misplaced_observations"] > 0.7 * facts["observations"]
-    assert "poses and points of the model contradict each other" in [found.what for found in points_findings(facts)]
+    assert "poses and points of the model contradict each other" in [
+        found.what for found in findings_of("points", facts)
+    ]
 
 
 def test_depth_only_of_points_that_are_seen_often_and_fall_where_they_were_seen(mine):

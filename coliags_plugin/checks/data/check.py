@@ -14,6 +14,7 @@ from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.matches import EpipolarAgreement, FrameMatches, epipolar_agreement, follow, match
 from coliags_plugin.checks.data.reprojection import CHANGES, Agreement, BestScale, Pair, agreement, best_scale
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 
@@ -31,10 +32,10 @@ class SceneCheck:
 
     scene: Scene  # the scene checked
     pairs: list[tuple[Frame, Frame]]  # source and target frames of the reprojection or matching
-    depth: facts.DepthFacts | None  # statistics; None where there is nothing to measure
-    path: facts.PathFacts | None
-    images: facts.ImageFacts
-    lamp: facts.LampFacts | None
+    depth: JsonObject | None  # statistics, see :mod:`.facts`; None where there is nothing to measure
+    path: JsonObject | None
+    images: JsonObject
+    lamp: JsonObject | None
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
     #: epipolar errors of matched points, by pose hypothesis; empty where there is depth or too few are matched
@@ -43,7 +44,7 @@ class SceneCheck:
     findings: list[Finding]  # suspected problems
     undecided: list[Finding]  # what the data are not enough to check
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> JsonObject:
         """The same as JSON values; unavailable ones are null."""
         values = {
             "scene": self.scene.name,
@@ -118,15 +119,18 @@ def check_scene(
     scale = best_scale(with_depth) if with_depth else None
     depth, path = facts.depth_facts(sample), facts.path_facts(video)
     images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
+    measured = [
+        ("points", scene.provenance),
+        ("depth", depth and depth | {"metric": scene.is_metric}),
+        ("lamp", lamp),
+        ("path", path),
+        *(("camera", camera) for camera in facts.camera_facts(video)),
+        ("images", images | {"repeats": len(images["repeated"])}),
+    ]
     findings = [
         *rules.agreement_findings(agreements, scale, path, depth, is_estimated(video)),
         *rules.match_findings(matches),
-        *rules.points_findings(scene.provenance),
-        *rules.depth_findings(depth, scene.is_metric),
-        *rules.lamp_findings(lamp),
-        *rules.path_findings(path),
-        *rules.calibration_findings(video),
-        *rules.image_findings(images),
+        *(finding for about, values in measured for finding in rules.findings_of(about, values)),
     ]
     return SceneCheck(
         scene, pairs, depth, path, images, lamp, agreements, scale, matches, matched_by, findings, undecided

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.stats
 import torch
 from jaxtyping import Float
 
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Frame
 
 #: Largest number of frames sampled for depth and image statistics.
@@ -23,60 +24,14 @@ _DARKEST, _BRIGHTEST = 3, 253
 _MIN_DEPTH_RATIO = 1.15
 
 
-@dataclass(frozen=True)
-class DepthFacts:
-    """z-depth of the sampled frames, scene units; shares of the unmasked pixels."""
-
-    nearest: float
-    median: float
-    farthest: float
-    invalid_share: float
-    clipped_share: float
-
-
-@dataclass(frozen=True)
-class PathFacts:
-    """Camera path: lengths in scene units, rotation in degrees; ``moving_step`` as of :func:`moving_step`."""
-
-    length: float
-    mean_step: float
-    moving_step: float
-    largest_step: float
-    largest_step_at: str
-    extent: float
-    turn: float
-
-
-@dataclass(frozen=True)
-class ImageFacts:
-    """Intensities of the sampled frames, grey levels; shares of the unmasked pixels."""
-
-    mean: float
-    darkest_frame: float
-    darkest_at: str
-    brightest_frame: float
-    overexposed_share: float
-    masked_share: float
-    repeated: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class LampFacts:
-    """Rank correlation (Spearman's) of brightness and distance from the camera within frames."""
-
-    correlation: float  # median of the frames; -1 where every farther pixel is darker, as under a lamp at the camera
-    rising_share: float  # share of the frames in which it is positive
-    frames: int  # number of frames
-
-
 def sampled_frames(frames: Sequence[Frame], count: int = _FRAMES) -> list[Frame]:
     """Evenly spaced sample of the frames, at most ``count``."""
     indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int))
     return [frames[index] for index in indices]
 
 
-def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
-    """Depth statistics, None where no frame has depth."""
+def depth_facts(frames: Sequence[Frame]) -> JsonObject | None:
+    """Statistics of z-depth, scene units; shares are of the unmasked pixels. None where no frame has depth."""
     known, pixels, clipped = [], 0, 0
     for frame in frames:
         depth, bound = frame.depth, frame.depth_at_least
@@ -89,14 +44,13 @@ def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
     if not pixels:
         return None
     values = torch.cat(known).double().numpy()
-    if not len(values):
-        return DepthFacts(math.nan, math.nan, math.nan, 1.0, clipped / pixels)
-    nearest, median, farthest = (float(value) for value in np.quantile(values, (0.01, 0.5, 0.99)))
-    return DepthFacts(nearest, median, farthest, 1.0 - len(values) / pixels, clipped / pixels)
+    quantiles = np.quantile(values, (0.01, 0.5, 0.99)).tolist() if len(values) else [math.nan] * 3
+    shares = {"invalid_share": 1.0 - len(values) / pixels, "clipped_share": clipped / pixels}
+    return dict(zip(("nearest", "median", "farthest"), quantiles, strict=True)) | shares
 
 
-def path_facts(video: Sequence[Frame]) -> PathFacts | None:
-    """Path statistics, None for fewer than two frames."""
+def path_facts(video: Sequence[Frame]) -> JsonObject | None:
+    """Camera path: lengths in scene units, ``turn`` in degrees; None for fewer than two frames."""
     if len(video) < 2:
         return None
     poses = np.stack([frame.camera.camera_to_world.double().numpy() for frame in video])
@@ -106,15 +60,15 @@ def path_facts(video: Sequence[Frame]) -> PathFacts | None:
     steps = lengths / np.maximum(1, np.diff([frame.index for frame in video]))
     relative = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
     cosines = np.clip((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
-    return PathFacts(
-        length=float(lengths.sum()),
-        mean_step=float(steps.mean()),
-        moving_step=moving_step(steps),
-        largest_step=float(steps.max()),
-        largest_step_at=video[int(steps.argmax()) + 1].name,
-        extent=float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() * 2.0),
-        turn=float(np.degrees(np.arccos(cosines)).sum()),
-    )
+    return {
+        "length": float(lengths.sum()),
+        "mean_step": float(steps.mean()),
+        "moving_step": moving_step(steps),
+        "largest_step": float(steps.max()),
+        "largest_step_at": video[int(steps.argmax()) + 1].name,
+        "extent": float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() * 2.0),
+        "turn": float(np.degrees(np.arccos(cosines)).sum()),
+    }
 
 
 def moving_step(steps: Float[np.ndarray, "N"]) -> float:
@@ -128,8 +82,28 @@ def moving_step(steps: Float[np.ndarray, "N"]) -> float:
     return float(ordered[np.searchsorted(lengths, 0.5 * lengths[-1])])
 
 
-def image_facts(frames: Sequence[Frame]) -> ImageFacts:
-    """Image statistics of frames in video order."""
+def camera_facts(frames: Sequence[Frame]) -> list[JsonObject]:
+    """Intrinsics of each camera, px, with its first frame: how far off the middle, fx / fy, and degrees across."""
+    facts: dict[Intrinsics, JsonObject] = {}
+    for frame in frames:
+        k = frame.camera.intrinsics
+        derived = {
+            "frame": frame.name,
+            "off_middle": max(abs(k.cx / k.width - 0.5), abs(k.cy / k.height - 0.5)),
+            "ratio": k.fx / k.fy,
+            "angle": angle_across(k),
+        }
+        facts.setdefault(k, vars(k) | derived)
+    return list(facts.values())
+
+
+def angle_across(pinhole: Intrinsics) -> float:
+    """Horizontal field of view, degrees."""
+    return 2.0 * math.degrees(math.atan(0.5 * pinhole.width / pinhole.fx))
+
+
+def image_facts(frames: Sequence[Frame]) -> JsonObject:
+    """Intensities of frames in video order, grey levels; shares of the unmasked pixels; names of repeated frames."""
     means, over, masked, repeated = [], [], [], []
     before: torch.Tensor | None = None
     for frame in frames:
@@ -141,24 +115,27 @@ def image_facts(frames: Sequence[Frame]) -> ImageFacts:
         if before is not None and before.shape == image.shape and torch.equal(before, image):
             repeated.append(frame.name)
         before = image
-    return ImageFacts(
-        mean=float(np.mean(means)),
-        darkest_frame=float(min(means)),
-        darkest_at=frames[int(np.argmin(means))].name,
-        brightest_frame=float(max(means)),
-        overexposed_share=float(np.mean(over)),
-        masked_share=float(np.mean(masked)),
-        repeated=tuple(repeated),
-    )
+    return {
+        "mean": float(np.mean(means)),
+        "darkest_frame": float(min(means)),
+        "darkest_at": frames[int(np.argmin(means))].name,
+        "brightest_frame": float(max(means)),
+        "overexposed_share": float(np.mean(over)),
+        "masked_share": float(np.mean(masked)),
+        "repeated": repeated,
+    }
 
 
-def lamp_facts(frames: Sequence[Frame]) -> LampFacts | None:
-    """Correlation of brightness with distance in an even sample of the frames; None where none has enough depth."""
+def lamp_facts(frames: Sequence[Frame]) -> JsonObject | None:
+    """Rank correlation (Spearman's) of brightness with distance within frames: median, share above 0, and their number.
+
+    It is -1 where every farther pixel is darker, as under a lamp at the camera. None where no frame has enough depth.
+    """
     values = [_correlation(frame) for frame in sampled_frames(frames, _LAMP_FRAMES)]
     known = np.array([value for value in values if value is not None])
     if not len(known):
         return None
-    return LampFacts(float(np.median(known)), float(np.mean(known > 0.0)), len(known))
+    return {"correlation": float(np.median(known)), "rising_share": float(np.mean(known > 0.0)), "frames": len(known)}
 
 
 def _correlation(frame: Frame) -> float | None:

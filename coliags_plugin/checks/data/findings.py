@@ -1,16 +1,14 @@
-"""Rules that turn the measured statistics into suspected problems, with evidence and advice."""
+"""Suspected problems: rules on the measured facts, and what the pose hypotheses come to."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, LampFacts, PathFacts
 from coliags_plugin.checks.data.matches import EpipolarAgreement
 from coliags_plugin.checks.data.reprojection import ADVICE, GIVEN, NO_MOTION, Agreement, BestScale
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.json_files import JsonObject
 
 #: Largest median depth difference of agreeing frames, relative to the depth, if it is true; and if it is estimated: two
 #: normal errors that are below 5 % with the least probability compared, 0.8, differ by 3.7 %. It may be twice as large
@@ -24,15 +22,6 @@ CLEARLY_BETTER = 2.0
 SCALE_TOLERANCE = 0.1
 #: Smallest share of pixels that must project into the other image, and of good matches in front of both cameras.
 MIN_SHARE, MIN_IN_FRONT = 0.3, 0.6
-#: Largest share of a model's observations that are not where its poses project its points.
-MAX_MISPLACED = 0.5
-#: Steps longer than this many typical steps of the moving camera are jumps.
-JUMP = 10.0
-#: Rank correlation of brightness and distance, and share of at least so many frames where it is positive, above which
-#: depth is taken to be reversed.
-REVERSED, REVERSED_SHARE, REVERSED_FRAMES = 0.3, 0.75, 4
-#: The renderers' default near plane, scene units.
-NEAR = 0.2
 
 
 @dataclass(frozen=True)
@@ -44,59 +33,137 @@ class Finding:
     do: str  # what the user can do about it
 
 
-def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
-    """Implausible depth: mostly unknown, constant, or in another unit than mm, which ``metric`` says it is in."""
-    if depth is None:
-        return
-    if depth.invalid_share > 0.5:
-        yield Finding(
+def is_flat(depth: JsonObject) -> bool:
+    """Whether depth is the same everywhere; False where it is unknown."""
+    return bool(depth["farthest"] - depth["nearest"] < 1e-3 * depth["median"])
+
+
+#: By the facts they are about: the test, what is suspect, the evidence, with the facts' values, and the advice.
+RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str, str, str]]] = {
+    "points": [
+        (
+            lambda data: data.get("misplaced_observations", 0) > 0.5 * data.get("observations", 0),
+            "poses and points of the model contradict each other",
+            "{misplaced_observations} of {observations} observations of points are not where the poses project them",
+            "Take poses, points and intrinsics from one model: a factor on the poses alone, another camera or poses of "
+            "other images do this",
+        ),
+    ],
+    "depth": [
+        (
+            lambda depth: depth["invalid_share"] > 0.5,
             "most of the depth is unknown",
-            f"{depth.invalid_share:.0%} of the unmasked pixels",
+            "{invalid_share:.0%} of the unmasked pixels",
             "Check that the depth files belong to these images and are read with the right number of bits",
-        )
-    if math.isnan(depth.median):
-        return
-    if _is_flat(depth):
-        yield Finding(
+        ),
+        (
+            is_flat,
             "depth is the same everywhere",
-            f"{depth.nearest:.4g} to {depth.farthest:.4g}",
+            "{nearest:.4g} to {farthest:.4g}",
             "Check the depth files: a failed export can leave images of one value",
-        )
-    if depth.median < 1.0 and metric:
-        yield Finding(
+        ),
+        (
+            lambda depth: depth["metric"] and depth["median"] < 1.0,
             "depth looks like metres",
-            f"median {depth.median:.4g} mm; renderers clip at a near plane of {NEAR:g} mm",
+            "median {median:.4g} mm; renderers clip at a near plane of 0.2 mm",
             "State the unit of the files: --set datamanager.unit=m, or unit.txt with m",
-        )
-    elif depth.median > 1000.0 and metric:
-        yield Finding(
-            "depth is too far for an endoscope", f"median {depth.median:.4g} mm", "Check the unit of the depth files"
-        )
-
-
-def lamp_findings(lamp: LampFacts | None) -> Iterator[Finding]:
-    """Brightness that rises with distance, as of depth that is reversed."""
-    if lamp is None or lamp.frames < REVERSED_FRAMES:
-        return
-    if lamp.correlation > REVERSED and lamp.rising_share > REVERSED_SHARE:
-        yield Finding(
+        ),
+        (
+            lambda depth: depth["metric"] and depth["median"] > 1000.0,
+            "depth is too far for an endoscope",
+            "median {median:.4g} mm",
+            "Check the unit of the depth files",
+        ),
+    ],
+    "lamp": [
+        (
+            lambda lamp: lamp["frames"] >= 4 and lamp["correlation"] > 0.3 and lamp["rising_share"] > 0.75,
             "the far is brighter than the near",
-            f"brightness rises with distance (rank correlation {lamp.correlation:.2f}, the median of {lamp.frames} "
-            "frames), though the lamp is at the camera",
+            "brightness rises with distance (rank correlation {correlation:.2f}, the median of {frames} frames), "
+            "though the lamp is at the camera",
             "Check whether the depth is reversed: a disparity, inverse or inverted depth, or one of other images",
-        )
+        ),
+    ],
+    "path": [
+        (
+            lambda path: path["length"] == 0.0,
+            "the camera does not move",
+            "all poses have one centre",
+            "Check the pose file",
+        ),
+        (
+            lambda path: path["largest_step"] > 10.0 * max(path["moving_step"], 1e-3 * path["mean_step"]),
+            "the camera jumps",
+            "{largest_step:.4g} to {largest_step_at}, {moving_step:.4g} typically while it moves",
+            "Check the poses around that frame: a cut in the video, or lines missing",
+        ),
+    ],
+    "camera": [
+        (
+            lambda camera: camera["off_middle"] > 0.2,
+            "the principal point is far from the middle",
+            "{frame}: ({cx:.4g}, {cy:.4g}) of {width} x {height} px",
+            "Check that the intrinsics are for images of this size",
+        ),
+        (
+            lambda camera: not 1 / 1.15 < camera["ratio"] < 1.15,
+            "pixels are far from square",
+            "{frame}: fx / fy = {ratio:.3g}",
+            "Check the intrinsics, or the working width and height",
+        ),
+        (
+            lambda camera: not 25.0 < camera["angle"] < 160.0,
+            "the field of view is implausible for an endoscope",
+            "{frame}: {angle:.3g} degrees across",
+            "Check the focal length and the image size it is for",
+        ),
+    ],
+    "images": [
+        (
+            lambda images: images["darkest_frame"] < 4.0,
+            "an image is black",
+            "{darkest_at}: mean {darkest_frame:.2g} of 255",
+            "Leave it out",
+        ),
+        (
+            lambda images: images["overexposed_share"] > 0.25,
+            "images are overexposed",
+            "{overexposed_share:.0%} of the pixels are white",
+            "",
+        ),
+        (
+            lambda images: images["masked_share"] > 0.75,
+            "most pixels are masked",
+            "{masked_share:.0%} of the pixels are ignored",
+            "Check the meaning of the mask: black is ignored here",
+        ),
+        (
+            lambda images: bool(images["repeated"]),
+            "images repeat",
+            "{repeats} of the images looked at equal the one before, {repeated[0]} first",
+            "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
+            "endoscope's",
+        ),
+    ],
+}
+
+
+def findings_of(about: str, facts: JsonObject | None) -> Iterator[Finding]:
+    """What the rules of a kind find suspect in facts; nothing where there are none."""
+    if facts is not None:
+        yield from (Finding(what, said.format(**facts), do) for test, what, said, do in RULES[about] if test(facts))
 
 
 def agreement_findings(
     readings: Mapping[str, Agreement],
     scale: BestScale | None,
-    path: PathFacts | None,
-    depth: DepthFacts | None,
+    path: JsonObject | None,
+    depth: JsonObject | None,
     estimated: bool,
 ) -> Iterator[Finding]:
     """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
     given = readings.get(GIVEN)
-    if given is None or path is None or path.length == 0.0 or depth is None or _is_flat(depth):
+    if given is None or not (path and path["length"] and depth) or is_flat(depth):
         return
     tolerance = MAX_ESTIMATE_ERROR if estimated else MAX_DEPTH_ERROR
     error = math.inf if given.depth_error is None or given.share < MIN_SHARE else given.depth_error
@@ -193,18 +260,6 @@ def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
         )
 
 
-def points_findings(facts: Mapping[str, Any]) -> Iterator[Finding]:
-    """Points of a model that do not project to their observations; ``facts`` are the scene's provenance."""
-    count, misplaced = facts.get("observations", 0), facts.get("misplaced_observations", 0)
-    if count and misplaced > MAX_MISPLACED * count:
-        yield Finding(
-            "poses and points of the model contradict each other",
-            f"{misplaced} of {count} observations of points are not where the poses project them",
-            "Take poses, points and intrinsics from one model: a factor on the poses alone, another camera or poses of "
-            "other images do this",
-        )
-
-
 def unmatched(matched: int, pairs: int) -> Iterator[Finding]:
     """Poses that cannot be judged, as too few points are found again in other frames."""
     yield Finding(
@@ -213,74 +268,6 @@ def unmatched(matched: int, pairs: int) -> Iterator[Finding]:
         "Judge the poses by what comes of them: held-out frames, and the depth and mesh by eye; or check a part of the "
         "video that is sharper or has less motion between frames",
     )
-
-
-def path_findings(path: PathFacts | None) -> Iterator[Finding]:
-    """Jumps of the camera, or a static camera."""
-    if path is None:
-        return
-    if path.length == 0.0:
-        yield Finding("the camera does not move", "all poses have one centre", "Check the pose file")
-    elif path.largest_step > JUMP * max(path.moving_step, 1e-3 * path.mean_step):
-        yield Finding(
-            "the camera jumps",
-            f"{path.largest_step:.4g} to {path.largest_step_at}, {path.moving_step:.4g} typically while it moves",
-            "Check the poses around that frame: a cut in the video, or lines missing",
-        )
-
-
-def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
-    """Implausible intrinsics, mostly those of another image size."""
-    seen: set[tuple[float, ...]] = set()
-    for frame in frames:
-        camera = frame.camera
-        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        if key in seen:
-            continue
-        seen.add(key)
-        off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
-        if off > 0.2:
-            numbers = f"({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px"
-            advice = "Check that the intrinsics are for images of this size"
-            yield Finding("the principal point is far from the middle", f"{frame.name}: {numbers}", advice)
-        ratio = camera.fx / camera.fy
-        if not 1 / 1.15 < ratio < 1.15:
-            advice = "Check the intrinsics, or the working width and height"
-            yield Finding("pixels are far from square", f"{frame.name}: fx / fy = {ratio:.3g}", advice)
-        angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
-        if not 25.0 < angle < 160.0:
-            what = "the field of view is implausible for an endoscope"
-            advice = "Check the focal length and the image size it is for"
-            yield Finding(what, f"{frame.name}: {angle:.3g} degrees across", advice)
-
-
-def image_findings(images: ImageFacts) -> Iterator[Finding]:
-    """Black, overexposed, mostly masked or repeated images."""
-    if images.darkest_frame < 4.0:
-        yield Finding(
-            "an image is black", f"{images.darkest_at}: mean {images.darkest_frame:.2g} of 255", "Leave it out"
-        )
-    if images.overexposed_share > 0.25:
-        yield Finding("images are overexposed", f"{images.overexposed_share:.0%} of the pixels are white", "")
-    if images.masked_share > 0.75:
-        yield Finding(
-            "most pixels are masked",
-            f"{images.masked_share:.0%} of the pixels are ignored",
-            "Check the meaning of the mask: black is ignored here",
-        )
-    if images.repeated:
-        others = len(images.repeated) - 1
-        yield Finding(
-            "images repeat",
-            f"{images.repeated[0]}{f' and {others} more equal' if others else ' equals'} the image before",
-            "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
-            "endoscope's",
-        )
-
-
-def _is_flat(depth: DepthFacts) -> bool:
-    """Whether depth is the same everywhere; False where it is unknown."""
-    return depth.farthest - depth.nearest < 1e-3 * depth.median
 
 
 def _percent(value: float | None) -> str:

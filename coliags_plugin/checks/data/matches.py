@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.checks.data.reprojection import CHANGES, GIVEN
-from coliags_plugin.core.images import write_image
+from coliags_plugin.checks.data.reprojection import CHANGES, GIVEN, changed
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
-from coliags_plugin.reconstruction.structure.matching import have_positive_depths, mutual_matches
-from coliags_plugin.reconstruction.structure.point_tracks import track_points
+from coliags_plugin.reconstruction.structure.matching import have_positive_depths, mutual_matches, rays, relative_pose
+from coliags_plugin.reconstruction.structure.point_tracks import PointTracker
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
 #: Features that are matched; largest ratio in Lowe's test, and largest distance of descriptors.
@@ -87,21 +84,17 @@ def follow(stretches: Sequence[Sequence[Frame]], progress: Progress | None = Non
     epipolar geometry explains, are left out.
     """
     matches = []
-    # Bridges would find points again after a gap, of which most are not needed.
-    settings = TrackSettings(bridge_below=0)
     for stretch in with_progress(stretches, "follow points", progress):
         if len({frame.image.shape for frame in stretch}) > 1:
             continue
-        with tempfile.TemporaryDirectory(prefix="coliags-check-") as scratch:
-            masks = {}
-            for number, frame in enumerate(stretch):
-                path = Path(scratch) / f"{number}.png"
-                write_image(path, frame.image.numpy())
-                masks[path] = frame.valid.numpy()
-            points = track_points(list(masks), settings, masks)
+        # Bridges would find points again after a gap, of which most are not needed.
+        tracker = PointTracker(TrackSettings(bridge_below=0))
+        points = [tracker.advance(frame.image.numpy(), frame.valid.numpy()) for frame in stretch]
         _, here, there = np.intersect1d(points[0].ids, points[-1].ids, assume_unique=True, return_indices=True)
-        pixels, pixels_there = points[0].pixels[here], points[-1].pixels[there]
-        matches += _explained(stretch[0], stretch[-1], pixels.astype(np.float64), pixels_there.astype(np.float64))
+        pixels, pixels_there = (
+            of.pixels[rows].astype(np.float64) for of, rows in ((points[0], here), (points[-1], there))
+        )
+        matches += _explained(stretch[0], stretch[-1], pixels, pixels_there)
     return matches
 
 
@@ -112,23 +105,17 @@ def _explained(source: Frame, target: Frame, here: np.ndarray, there: np.ndarray
 
 
 def supported(here: Float[np.ndarray, "K 2"], there: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "K"] | None:
-    """Matches that one epipolar geometry explains; None if they are few, or no more than of random ones."""
-    if len(here) < _MIN_MATCHES:
-        return None
-    inlier = _epipolar_inliers(here, there)
-    needed = max(_MIN_MATCHES, _FREE + _MIN_EXPLAINED * (len(here) - _FREE))
-    return inlier if inlier.sum() >= needed else None
-
-
-def _epipolar_inliers(here: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, "K"]:
-    """Which matches some fundamental matrix explains; none where OpenCV finds no such matrix. [K]"""
+    """Matches that one fundamental matrix explains; None if they are few, or no more than of random ones."""
     import cv2
 
+    if len(here) < _MIN_MATCHES:
+        return None
     try:
-        _, inliers = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _MAX_RESIDUAL, 0.999, 10_000)
+        _, found = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _MAX_RESIDUAL, 0.999, 10_000)
     except cv2.error:  # raised instead of returning nothing where all samples are degenerate
-        inliers = None
-    return np.zeros(len(here), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
+        found = None
+    inlier = np.zeros(len(here), bool) if found is None else np.asarray(found[:, 0] > 0)
+    return inlier if inlier.sum() >= max(_MIN_MATCHES, _FREE + _MIN_EXPLAINED * (len(here) - _FREE)) else None
 
 
 def epipolar_agreement(matches: Sequence[FrameMatches], change: str = GIVEN) -> EpipolarAgreement | None:
@@ -148,28 +135,15 @@ def epipolar_agreement(matches: Sequence[FrameMatches], change: str = GIVEN) -> 
 
 def _epipolar_errors(pair: FrameMatches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Distances from the epipolar lines, px; whether points are in front of both cameras; parallax, px. [K] each"""
-    cameras = [
-        replace(frame.camera, camera_to_world=CHANGES[change](frame.camera.camera_to_world.double()))
-        for frame in (pair.source, pair.target)
-    ]
-    relative = (cameras[1].world_to_camera @ cameras[0].camera_to_world).numpy()
-    rotation, translation = relative[:3, :3], relative[:3, 3]
+    camera, there = (changed(frame.camera, CHANGES[change]) for frame in (pair.source, pair.target))
+    rotation, translation = relative_pose((camera, there))
     length = float(np.linalg.norm(translation))
     if length == 0.0:
         return None
-    matrices = [camera.intrinsics_matrix.double().numpy() for camera in cameras]
-    pixels, pixels_there = _homogeneous(pair.pixels), _homogeneous(pair.pixels_there)
-    rays, rays_there = pixels @ np.linalg.inv(matrices[0]).T, pixels_there @ np.linalg.inv(matrices[1]).T
-    x, y, z = translation / length
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    lines = np.linalg.inv(matrices[1]).T @ essential @ rays.T
-    distance = np.abs((pixels_there * lines.T).sum(axis=1)) / np.linalg.norm(lines[:2], axis=0)
-    turned = rays @ rotation.T
+    turned, seen = rays(pair.pixels, camera) @ rotation.T, rays(pair.pixels_there, there)
+    lines, focal = np.cross(translation / length, turned), np.array([there.fx, there.fy])
+    distance = np.abs((seen * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2] / focal, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = (turned / turned[:, 2:]) @ matrices[1].T
-    parallax = np.where(turned[:, 2] > 0.0, np.linalg.norm(far[:, :2] - pair.pixels_there, axis=1), np.inf)
-    return distance, have_positive_depths(turned, rays_there, translation), parallax
-
-
-def _homogeneous(pixels: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 3"]:
-    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+        moved = np.linalg.norm((turned[:, :2] / turned[:, 2:] - seen[:, :2]) * focal, axis=1)
+    parallax = np.where(turned[:, 2] > 0.0, moved, np.inf)
+    return distance, have_positive_depths(turned, seen, translation), parallax

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 
 from coliags_plugin.checks.data.check import SceneCheck, is_estimated
+from coliags_plugin.checks.data.facts import angle_across
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.reprojection import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
@@ -62,28 +62,30 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     several = " and others" if " to " in size else ""
     yield model.Fact("image size", f"{size} px" + (f", stored {stored[0]} x {stored[1]}{several}" if stored else ""))
     yield model.Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
-    angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
     focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"
-    yield model.Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
+    yield model.Fact("calibration", f"{focal}, {center} px, {angle_across(camera.intrinsics):.1f} degrees across")
     yield model.Fact("pose convention", _convention(data.get("pose_convention")))
     unit = scene.length_unit
     stated = "unknown (--set datamanager.unit=mm or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
-    if depth := check.depth:
-        values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
-        unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"
-        yield model.Fact("depth", f"{values} {unit}; {unknown}")
-    else:
-        yield model.Fact("depth", "none")
-    if path := check.path:
-        steps = f"steps {path.mean_step:.3g} (largest {path.largest_step:.3g} to {path.largest_step_at})"
-        yield model.Fact("trajectory", f"{path.length:.4g} {unit} long, {steps}, turns {path.turn:.3g} degrees in all")
-    images = check.images
-    frames = f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}"
-    shares = f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked"
-    yield model.Fact("brightness", f"{frames}, {shares}")
-    if lamp := check.lamp:
-        correlation = f"rank correlation {lamp.correlation:.2f} (median of {counted(lamp.frames, 'frame')})"
+    depth, path, lamp = check.depth, check.path, check.lamp
+    known = (
+        "median {median:.4g}, 1 % to 99 %: {nearest:.4g} to {farthest:.4g} {unit}; {invalid_share:.1%} unknown, of "
+        "which {clipped_share:.1%} clipped"
+    )
+    yield model.Fact("depth", known.format(**depth, unit=unit) if depth else "none")
+    if path:
+        steps = (
+            "steps {mean_step:.3g} (largest {largest_step:.3g} to {largest_step_at}), turns {turn:.3g} degrees in all"
+        )
+        yield model.Fact("trajectory", f"{path['length']:.4g} {unit} long, {steps.format(**path)}")
+    light = (
+        "mean {mean:.0f} of 255, frames {darkest_frame:.0f} to {brightest_frame:.0f}, {overexposed_share:.1%} white, "
+        "{masked_share:.1%} masked"
+    )
+    yield model.Fact("brightness", light.format(**check.images))
+    if lamp:
+        correlation = f"rank correlation {lamp['correlation']:.2f} (median of {counted(lamp['frames'], 'frame')})"
         yield model.Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
     yield model.Fact("initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}")
 

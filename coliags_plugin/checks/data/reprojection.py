@@ -57,16 +57,6 @@ _STRIDE = 8
 _MIN_SHARE = 0.2
 
 
-@dataclass(frozen=True)
-class ReprojectedPixels:
-    """Pixels of a source frame reprojected into a target frame."""
-
-    share: float  # share of the pixels that project into the target image, in front of its camera
-    depth_errors: Float[Tensor, "K"]  # |z - z_target| / z_target, of those that hit known depth. [K]
-    depth_differences: Float[Tensor, "K"]  # |z - z_target|, scene units. [K]
-    color_errors: Float[Tensor, "K"]  # mean absolute difference of the channels, grey levels, brightness matched. [K]
-
-
 class Pair:
     """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses."""
 
@@ -87,27 +77,23 @@ class Pair:
         """Whether there is depth to compare in both frames."""
         return bool(len(self._points) and torch.isfinite(self._depth_there).any())
 
-    def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> ReprojectedPixels:
-        """Reproject every n-th of the source's pixels, with both poses changed and both depths times ``scale``."""
-        points = self._points[::every] * scale
-        if not len(points):
-            nothing = torch.zeros(0, dtype=torch.float64)
-            return ReprojectedPixels(0.0, nothing, nothing, nothing)
+    def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> tuple[float, Tensor, Tensor, Tensor]:
+        """Reproject every n-th of the source's pixels, with both poses changed and both depths times ``scale``.
+
+        Returns the share of them that project into the target image, in front of its camera; the difference of z-depth,
+        relative and in scene units, where it is known [K]; and that of colour, grey levels. [L]
+        """
         pose = change(self._source.camera_to_world.double())
-        camera = _changed(self._target, change)
-        pixels, z = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+        camera = changed(self._target, change)
+        pixels, z = camera.project(self._points[::every] * scale @ pose[:3, :3].T + pose[:3, 3])
         column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
         lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         hit = row[lands] * camera.width + column[lands]
         there = self._depth_there[hit] * scale
         difference = (z[lands] - there).abs()
         known = torch.isfinite(difference)
-        return ReprojectedPixels(
-            float(lands.double().mean()),
-            (difference / there)[known],
-            difference[known],
-            _color_difference(self._colors[::every][lands], self._colors_there[hit]),
-        )
+        colors = _color_difference(self._colors[::every][lands], self._colors_there[hit])
+        return float(lands.double().mean()), (difference / there)[known], difference[known], colors
 
 
 @dataclass(frozen=True)
@@ -123,12 +109,8 @@ class Agreement:
 def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
     """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.reproject`."""
     reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
-    return Agreement(
-        _median([result.depth_errors for result in reprojected]),
-        _median([result.depth_differences for result in reprojected]),
-        _median([result.color_errors for result in reprojected]),
-        float(np.mean([result.share for result in reprojected])) if reprojected else 0.0,
-    )
+    shares, depths, lengths, colors = zip(*reprojected, strict=True)
+    return Agreement(_median(depths), _median(lengths), _median(colors), float(np.mean(shares)))
 
 
 @dataclass(frozen=True)
@@ -161,7 +143,7 @@ def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
 def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
     depth = _known_depth(target)
-    pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
+    pixels, z = changed(source.camera).project(changed(target.camera).unproject(depth).reshape(-1, 3))
     camera = source.camera
     grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
     image = source.image.permute(2, 0, 1)[None].double()
@@ -184,7 +166,8 @@ def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
     return torch.where(trusted, depth.double(), torch.nan)
 
 
-def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
+def changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
+    """The camera in double precision with its pose read in another way."""
     return replace(camera, camera_to_world=change(camera.camera_to_world.double()))
 
 
@@ -197,5 +180,5 @@ def _color_difference(colors: Tensor, colors_there: Tensor) -> Tensor:
 
 
 def _median(parts: Sequence[Tensor]) -> float | None:
-    values = torch.cat(list(parts)) if parts else torch.zeros(0)
+    values = torch.cat(tuple(parts))
     return float(values.median()) if len(values) else None

@@ -71,14 +71,14 @@ def track_points(
     Raises:
         InputError: A frame cannot be read.
     """
-    forward = _PointTracker(settings)
+    forward = PointTracker(settings)
     points = []
     for path in with_progress(images, "track points", progress):
         points.append(forward.advance(read_image(path), mask_of(path, masks)))
     stretches = _around([frame.followed for frame in points], settings)
     next_id = forward.next_id
     for stretch in with_progress(stretches, "track backwards", progress):
-        backward = _PointTracker(settings, next_id)
+        backward = PointTracker(settings, next_id)
         for index in reversed(stretch):
             found = backward.advance(read_image(images[index]), mask_of(images[index], masks))
             points[index] = points[index].with_points(found)
@@ -174,7 +174,7 @@ class PointFinder:
         return alike, moved[alike].astype(np.float32)
 
 
-class _PointTracker:
+class PointTracker:
     """State between frames: the last view, and views before frames in which most points were lost."""
 
     def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
