@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.datamanagers.reading.files import parallel_map
+from coliags_plugin.datamanagers.reading.files import parallel_map, required_file
 
 log = logging.getLogger(__name__)
 
@@ -84,8 +84,7 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def load_points(path: Path) -> PointCloud:
     """All points of a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``)."""
-    if not path.is_file():
-        raise InputError(f"no file {path}", "a PLY or NPZ file of points in the world of the poses", "Check the path")
+    required_file(path, "a PLY or NPZ file of points in the world of the poses", "Check the path")
     if path.suffix.lower() == ".npz":
         positions, colors = _read_npz(path)
     elif path.suffix.lower() == ".ply":

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
@@ -23,11 +24,12 @@ from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name, with_valid_seen_masks
-from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
+from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.datamanagers.units import FACTORS, Unit, read_unit
+from coliags_plugin.geometry.lenses.models import Lens
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +79,16 @@ class RecordedDataManager(DataManager):
         """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
         return self.settings.size or fitted(width, height, self._bounds)
 
+    def rectification_of(
+        self, lens: Lens, described_by: Path, shows: Bool[np.ndarray, "H W"] | None = None
+    ) -> Rectification:
+        """The rectification of images of one lens; arguments as for :func:`rectifications`."""
+        focal_scale = self.settings.focal_scale
+        rectification = rectifications({0: lens}, described_by, self.working_size, focal_scale, shows)[0]
+        if rectification.undistortion is not None:
+            rectification.undistortion()  # once, before images are read in parallel
+        return rectification
+
     def at_stored_size(self) -> DataManager:
         """See :class:`DataManager`."""
         changes = {"width": None, "height": None, "keep_pixels": False, "initial_points": "none"}
@@ -101,7 +113,7 @@ class RecordedDataManager(DataManager):
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
-            parallel_map(lambda frame: frame.image.numel(), [*video, *others], "read images", progress)
+            parallel_map(StoredFrame.read, [*video, *others], "read images", progress)
         points, described = self._initial_points(recording, path, train, progress)
         split = {
             "name": settings.split,
@@ -129,7 +141,8 @@ class RecordedDataManager(DataManager):
         }
         if self._is_told:
             self._tell(recording, path)
-        return Scene(path.resolve().name, train, test_sets, points, provenance, path.resolve()).scaled(FACTORS[unit])
+        tests: dict[str, list[Frame]] = {name: [*frames] for name, frames in test_sets.items()}
+        return Scene(path.resolve().name, [*train], tests, points, provenance, path.resolve()).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
         """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""
@@ -137,14 +150,14 @@ class RecordedDataManager(DataManager):
         for doubt in dict.fromkeys(rectification.doubt() for rectification in rectifications):
             if doubt is not None:
                 log.warning("%s", doubt)
-        stored = sizes_text((each.source_width, each.source_height) for each in rectifications)
+        stored = sizes_text((each.lens.width, each.lens.height) for each in rectifications)
         used = sizes_text((each.width, each.height) for each in rectifications)
         if used != stored and self.settings.size is None:
             change = "--set datamanager.width=W --set datamanager.height=H sets another size"
             log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
 
-    def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[Frame]:
+    def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[StoredFrame]:
         return [StoredFrame(shots[index], index, self.settings.keep_pixels) for index in indices]
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:

@@ -49,41 +49,11 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
 class Rectification:
     """Rectification of the stored images of one camera to its working images."""
 
-    source_width: int  # of the stored images, pixels
-    source_height: int
+    lens: Lens  # of the stored images
     pinhole: Intrinsics  # of the working images
     described_by: Path  # the file with the size of the stored images, for errors
-    lens: Lens | None = None  # of the stored images; None for pinhole images
-    undistortion: Callable[[], Undistortion] | None = None  # for a lens: makes it, or returns the one that is kept
+    undistortion: Callable[[], Undistortion] | None = None  # makes it, or returns the one that is kept; None: pinholes
     stored_content: Bool[np.ndarray, "H W"] | None = None  # stored pixels with image content; None where all have
-
-    @classmethod
-    def through(
-        cls,
-        lens: Lens,
-        described_by: Path,
-        size: tuple[int, int],
-        focal_scale: float = 1.0,
-        shows: Bool[np.ndarray, "H W"] | None = None,
-    ) -> Rectification:
-        """The rectification of images taken through a lens: undistorted to its nominal pinhole.
-
-        ``lens`` is at the size of the stored images, which ``described_by`` states; ``size`` is the working width and
-        height, pixels; ``focal_scale`` a factor on the nominal focal length; ``shows`` the pixels with image content.
-        """
-        pinhole = undistorted_camera(lens, size, focal_scale)
-        undistortion = Undistortion(lens, pinhole, shows)
-        return cls(lens.width, lens.height, pinhole, described_by, lens, lambda: undistortion, shows)
-
-    @classmethod
-    def of_pinhole(cls, pinhole: Intrinsics, described_by: Path, size: tuple[int, int]) -> Rectification:
-        """The rectification of images of a pinhole camera; ``size`` as for :meth:`through`."""
-        return cls(pinhole.width, pinhole.height, pinhole.resized(*size), described_by)
-
-    @property
-    def stored_lens(self) -> Lens:
-        """The lens of the stored images; a pinhole camera where they are not distorted."""
-        return self.lens or PinholeLens.of(self.pinhole.resized(self.source_width, self.source_height))
 
     @property
     def width(self) -> int:
@@ -127,15 +97,15 @@ class Rectification:
         if off <= FAR_FROM_MIDDLE:
             return None
         return (
-            f"{self.described_by}: the principal point is {off:.0%} of the image ({self.source_width} x "
-            f"{self.source_height}) from its middle: are the intrinsics those of another resolution?"
+            f"{self.described_by}: the principal point is {off:.0%} of the image ({self.lens.width} x "
+            f"{self.lens.height}) from its middle: are the intrinsics those of another resolution?"
         )
 
     def facts(self) -> dict[str, Any]:
         """For provenance: sizes, and intrinsics at the working size."""
         k = self.pinhole
         return {
-            "stored_size": [self.source_width, self.source_height],
+            "stored_size": [self.lens.width, self.lens.height],
             "size": [self.width, self.height],
             "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "pixel_centers": "integers + 0.5"},
         }
@@ -143,10 +113,9 @@ class Rectification:
     def checked(self, path: Path, image: np.ndarray) -> np.ndarray:
         """A stored image, unchanged, after a check of its size."""
         height, width = image.shape[:2]
-        if (width, height) != (self.source_width, self.source_height):
+        if (width, height) != (self.lens.width, self.lens.height):
             raise InputError(
-                f"{path} is {width} x {height}, but {self.described_by} says {self.source_width} x "
-                f"{self.source_height}",
+                f"{path} is {width} x {height}, but {self.described_by} says {self.lens.width} x {self.lens.height}",
                 "images of one size, that of their intrinsics",
                 "Write that image again, or correct the size in that file",
             )
@@ -157,29 +126,25 @@ def rectifications(
     lenses: Mapping[_Key, Lens],
     described_by: Path,
     working_size: Callable[[int, int], tuple[int, int]],
-    focal_scale: float,
+    focal_scale: float = 1.0,
+    shows: Bool[np.ndarray, "H W"] | None = None,
 ) -> dict[_Key, Rectification]:
     """Rectifications of images from many lenses, some of them pinholes, without keeping the maps of all.
 
-    Undistortion maps take some 10 MB each, and COLMAP models often have one camera per image.
+    Undistortion maps take some 10 MB each, and COLMAP models often have one camera per image. Lenses are at the size of
+    the stored images, which ``described_by`` states; others than pinholes are undistorted to their nominal pinhole, its
+    focal length times ``focal_scale``. ``shows`` are the stored pixels with image content.
     """
-    undistort = lru_cache(maxsize=_KEPT)(Undistortion)
+    undistort = lru_cache(maxsize=_KEPT)(lambda lens, pinhole: Undistortion(lens, pinhole, shows))
 
     def rectification(lens: Lens) -> Rectification:
-        size = working_size(lens.width, lens.height)
+        nominal = lens.resized(*working_size(lens.width, lens.height)).pinhole
         if isinstance(lens, PinholeLens):
-            return Rectification.of_pinhole(lens.pinhole, described_by, size)
-        pinhole = undistorted_camera(lens, size, focal_scale)
-        undistortion = partial(undistort, lens, pinhole)
-        return Rectification(lens.width, lens.height, pinhole, described_by, lens, undistortion)
+            return Rectification(lens, nominal, described_by)
+        pinhole = replace(nominal, fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
+        return Rectification(lens, pinhole, described_by, partial(undistort, lens, pinhole), shows)
 
     return {key: rectification(lens) for key, lens in lenses.items()}
-
-
-def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) -> Intrinsics:
-    """The camera that images of a lens are undistorted to; arguments as for :meth:`Rectification.through`."""
-    nominal = lens.resized(*size).pinhole
-    return replace(nominal, fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
 
 
 def whole_frame(lens: Lens, image: Path) -> Lens:

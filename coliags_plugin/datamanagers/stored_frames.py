@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -19,17 +20,6 @@ from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.recording import Shot
 
 
-@dataclass(frozen=True)
-class _Pixels:
-    """Image, depth, masks and confidence of the working size, in the stored data types."""
-
-    image: UInt8[np.ndarray, "H W 3"]
-    depth: Shaped[np.ndarray, "H W"] | None
-    mask: Bool[np.ndarray, "H W"] | None
-    seen: Bool[np.ndarray, "H W"] | None
-    confidence: UInt8[np.ndarray, "H W"] | None
-
-
 class StoredFrame(Frame):
     """A lazily read frame, cached in the stored data types: 5 bytes per pixel with 16-bit depth.
 
@@ -40,7 +30,7 @@ class StoredFrame(Frame):
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
         camera = shot.rectification.camera(shot.camera_to_world)
         values = {"name": shot.name, "index": index, "camera": camera, "sparse_depth": shot.sparse_depth}
-        for name, value in {**values, "_shot": shot, "_keep": keep, "_pixels": None, "_scale": 1.0}.items():
+        for name, value in {**values, "_shot": shot, "_kept": {} if keep else None, "_scale": 1.0}.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -62,70 +52,12 @@ class StoredFrame(Frame):
     @property
     def image(self) -> UInt8[Tensor, "H W 3"]:
         """See :class:`Frame`."""
-        return torch.from_numpy(self._read().image if self._keep else _image(self._shot))
+        return cast(Tensor, self._tensor("image"))
 
     @property
     def depth(self) -> Float[Tensor, "H W"] | None:
         """See :class:`Frame`; decoded each time."""
-        return self._z_depth(self._stored_depth())
-
-    @property
-    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
-        """See :class:`Frame`; decoded each time."""
-        return self._bound(self._stored_depth())
-
-    @property
-    def mask(self) -> Bool[Tensor, "H W"] | None:
-        """See :class:`Frame`."""
-        return _tensor(self._read().mask if self._keep else _mask(self._shot))
-
-    @property
-    def valid(self) -> Bool[Tensor, "H W"]:
-        """See :class:`Frame`."""
-        mask = self.mask
-        return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool) if mask is None else mask
-
-    @property
-    def seen(self) -> Bool[Tensor, "H W"] | None:
-        """See :class:`Frame`."""
-        return _tensor(self._read().seen if self._keep else _seen(self._shot))
-
-    @property
-    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
-        """See :class:`Frame`; decoded each time."""
-        return _share(self._read().confidence if self._keep else _confidence(self._shot))
-
-    def to(self, device: torch.device | str) -> Frame:
-        """Decoded frame on a device; files are read once."""
-        pixels = self._read()
-        tensors = {
-            "depth": self._z_depth(pixels.depth),
-            "mask": _tensor(pixels.mask),
-            "seen": _tensor(pixels.seen),
-            "depth_at_least": self._bound(pixels.depth),
-            "depth_confidence": _share(pixels.confidence),
-        }
-        image = torch.from_numpy(pixels.image)
-        return Frame(self.name, self.index, image, self.camera, sparse_depth=self.sparse_depth, **tensors).to(device)
-
-    def __repr__(self) -> str:
-        return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"
-
-    def _read(self) -> _Pixels:
-        # If two threads read at the same time, the second overwrites the cache with equal data.
-        if self._pixels is not None:
-            return self._pixels
-        shot, mask = self._shot, _mask(self._shot)
-        pixels = _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot), _confidence(shot))
-        if self._keep:
-            object.__setattr__(self, "_pixels", pixels)
-        return pixels
-
-    def _stored_depth(self) -> Shaped[np.ndarray, "H W"] | None:
-        return self._read().depth if self._keep else _depth(self._shot, _mask(self._shot))
-
-    def _z_depth(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
-        form = self._shot.depth_format
+        stored, form = self._stored("depth"), self._shot.depth_format
         if stored is None or form is None:
             return None
         depth = form.z_depth(stored) * np.float32(self._scale)
@@ -137,51 +69,106 @@ class StoredFrame(Frame):
             )
         return torch.from_numpy(depth)
 
-    def _bound(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
-        form = self._shot.depth_format
+    @property
+    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
+        """See :class:`Frame`; decoded each time."""
+        stored, form = self._stored("depth"), self._shot.depth_format
         bound = None if stored is None or form is None else form.clipped_at(stored)
-        return None if bound is None else _tensor(bound * np.float32(self._scale))
+        return None if bound is None else torch.from_numpy(bound * np.float32(self._scale))
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        """See :class:`Frame`."""
+        return self._tensor("mask")
+
+    @property
+    def valid(self) -> Bool[Tensor, "H W"]:
+        """See :class:`Frame`."""
+        mask = self.mask
+        return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool) if mask is None else mask
+
+    @property
+    def seen(self) -> Bool[Tensor, "H W"] | None:
+        """See :class:`Frame`."""
+        return self._tensor("seen")
+
+    @property
+    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
+        """See :class:`Frame`; 8-bit values in [0, 1], decoded each time."""
+        stored = self._stored("confidence")
+        return None if stored is None else torch.from_numpy(stored.astype(np.float32) / np.float32(255.0))
+
+    def to(self, device: torch.device | str) -> Frame:
+        """Decoded frame on a device; files are read once."""
+        frame = self if self._kept is not None else StoredFrame(self._shot, self.index).scaled(self._scale)
+        parts = ("image", "depth", "mask", "seen", "depth_at_least", "depth_confidence")
+        tensors = {part: getattr(frame, part) for part in parts}
+        return Frame(self.name, self.index, camera=self.camera, sparse_depth=self.sparse_depth, **tensors).to(device)
+
+    def read(self) -> None:
+        """Read all files, and keep what is in them if the frame keeps anything."""
+        for part in _READERS:
+            self._stored(part)
+
+    def __repr__(self) -> str:
+        return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"
+
+    def _stored(self, part: str) -> Shaped[np.ndarray, "H W ..."] | None:
+        """A part of the working size, in the stored data type."""
+        if self._kept is None:
+            return _READERS[part](self)
+        # If two threads read at the same time, the second overwrites the cache with equal data.
+        if part not in self._kept:
+            self._kept[part] = _READERS[part](self)
+        return self._kept[part]
+
+    def _tensor(self, part: str) -> Tensor | None:
+        stored = self._stored(part)
+        return None if stored is None else torch.from_numpy(stored)
 
     _shot: Shot
-    _keep: bool
-    _pixels: _Pixels | None
+    _kept: dict[str, np.ndarray | None] | None  # by part; None if nothing is kept
     _scale: float  # of the frame's lengths, relative to those of the shot
 
 
-def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:
+def _image(frame: StoredFrame) -> UInt8[np.ndarray, "H W 3"]:
+    shot = frame._shot
     return shot.rectification.image(shot.rectification.checked(shot.image, read_rgb(shot.image)))
 
 
-def _mask(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
-    valid = shot.rectification.valid
+def _mask(frame: StoredFrame) -> Bool[np.ndarray, "H W"] | None:
+    shot, valid = frame._shot, frame._shot.rectification.valid
     if shot.mask is None:
         return valid
     own = shot.rectification.sampled(shot.mask, read_mask(shot.mask))
     return own if valid is None else own & valid
 
 
-def _depth(shot: Shot, mask: Bool[np.ndarray, "H W"] | None) -> Shaped[np.ndarray, "H W"] | None:
+def _depth(frame: StoredFrame) -> Shaped[np.ndarray, "H W"] | None:
+    shot = frame._shot
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth))
+    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), frame._stored("mask")
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 
-def _seen(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
+def _seen(frame: StoredFrame) -> Bool[np.ndarray, "H W"] | None:
+    shot = frame._shot
     return None if shot.seen is None else shot.rectification.sampled(shot.seen, read_mask(shot.seen))
 
 
-def _confidence(shot: Shot) -> UInt8[np.ndarray, "H W"] | None:
+def _confidence(frame: StoredFrame) -> UInt8[np.ndarray, "H W"] | None:
+    shot = frame._shot
     if shot.confidence is None:
         return None
     stored = read_gray(shot.confidence, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
     return shot.rectification.sampled(shot.confidence, stored)
 
 
-def _share(stored: UInt8[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
-    """8-bit values in [0, 1], float32."""
-    return None if stored is None else torch.from_numpy(stored.astype(np.float32) / np.float32(255.0))
-
-
-def _tensor(array: np.ndarray | None) -> Tensor | None:
-    return None if array is None else torch.from_numpy(array)
+_READERS: dict[str, Callable[[StoredFrame], np.ndarray | None]] = {
+    "image": _image,
+    "depth": _depth,
+    "mask": _mask,
+    "seen": _seen,
+    "confidence": _confidence,
+}

@@ -533,8 +533,8 @@ depth of 8 bits | depth-16: <5>\.(png|tiff) is an image of 1 channel of uint8
 depth of 16 bits | params: <5>\.tiff is an image of 1 channel of uint16
 depth missing for a frame
   paired, by-order: 11 images and 10 depth files; frame 3 has only one of the two.*for every image
-  rotatecolon: depth_train has 10 depth files for 11 frames; frame 3 has none.*for every image
-  nerfstudio: transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png
+  rotatecolon: depth_train: 10 of 11 frames have a depth file; frame 3 has none.*for every frame
+  nerfstudio: no file \S*depth/frame_00004\.png\. .* of frame images/frame_00004\.png in \S*transforms\.json
   reim-nerf: names \S*distmaps/0003_color\.png, which does not exist
 no depth and no points
   c3vd, c3vd-raw, c3vd-v2, tum: neither depth files nor points3D\.ply.*points3D\.ply \(world of the poses\)
@@ -719,7 +719,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             (change_json("camera.json", depth_scale=scale), "depth reaches from .* scene units")
             for scale in (1e-7, 1e-320, 1e300)
         ),
-        (lambda folder: (folder / "confidence").mkdir(), r"confidence has no confidence for 1305031102\.\d+\.png"),
+        (lambda folder: (folder / "confidence").mkdir(), r"confidence: 0 of 11 frames have a confidence; 1305031102\.\d+\.png has none"),
     ],
     "rgbd-by-order": [
         (copy("rgb/*.png", "cover.png"), r"cover\.png: no number in its name"),
@@ -744,7 +744,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             ],
             r"calibration\.xml and other\.xml have different cameras",
         ),
-        (remove("mask/*.png", 3), r"mask has no mask for 0003\.png"),
+        (remove("mask/*.png", 3), r"mask: 10 of 11 frames have a mask; 0003\.png has none"),
     ],
     "nerfstudio": [
         (change_frames("transforms.json", fourth_without("depth_file_path")), "10 of 11 frames have a depth_file_path"),
@@ -787,7 +787,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
                 "transforms_*.json",
                 lambda index, entry: entry.pop("distmap_path") if "0005" in entry["file_path"] else None,
             ),
-            r"images/0005_color\.png has no distmap_path, but others have",
+            r"10 of 11 frames have a distmap_path; images/0005_color\.png has none",
         ),
         (remove("rgb_mask.png"), r"no file .*rgb_mask\.png.*mask=false"),
         (repaint("rgb_mask.png", 0, half_size), r"rgb_mask\.png is 20 x 16.*40 x 32"),

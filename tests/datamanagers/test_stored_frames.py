@@ -107,11 +107,12 @@ def test_to_a_device(folder, reads, keep):
 def test_what_is_kept_is_as_small_as_on_disk_and_goes_with_the_frame(folder):
     frame = frame_of(folder, 8)
     assert frame.depth.dtype == torch.float32
-    pixels = frame._pixels
-    assert pixels.depth.dtype == np.uint16 and pixels.mask is None
-    assert sum(part.nbytes for part in (pixels.image, pixels.depth, pixels.seen)) == WIDTH * HEIGHT * (3 + 2 + 1)
-    kept = weakref.ref(pixels.image)
-    del frame, pixels
+    frame.read()
+    parts = frame._kept
+    assert parts["depth"].dtype == np.uint16 and parts["mask"] is None
+    assert sum(parts[name].nbytes for name in ("image", "depth", "seen")) == WIDTH * HEIGHT * (3 + 2 + 1)
+    kept = weakref.ref(parts["image"])
+    del frame, parts
     gc.collect()
     assert kept() is None
 

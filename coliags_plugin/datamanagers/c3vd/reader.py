@@ -28,7 +28,7 @@ from coliags_plugin.datamanagers.recording import (
 )
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.geometry.lenses.models import LENSES, Lens, octagon_mask
+from coliags_plugin.geometry.lenses.models import LENSES, Lens, PinholeLens, octagon_mask
 
 LAYOUTS = (
     "the raw release (NNNN_color.png, NNNN_depth.tiff and pose.txt in one folder) "
@@ -87,8 +87,7 @@ class SequenceDataManager(RecordedDataManager):
         """The rectification of raw frames like ``image``, optionally masked outside the octagon."""
         lens = whole_frame(lens, image)
         shows = octagon_mask(lens.width, lens.height) if mask else None
-        size = self.working_size(lens.width, lens.height)
-        return Rectification.through(lens, image, size, self.settings.focal_scale, shows)
+        return self.rectification_of(lens, image, shows)
 
     def _shots(
         self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
@@ -178,7 +177,5 @@ class C3VDDataManager(SequenceDataManager):
             "mask": "octagon" if raw and settings.mask else None,
         }
         if files.camera is not None:
-            pinhole = read_intrinsics(files.camera)
-            size = self.working_size(pinhole.width, pinhole.height)
-            return Rectification.of_pinhole(pinhole, files.camera, size), facts
+            return self.rectification_of(PinholeLens.of(read_intrinsics(files.camera)), files.camera), facts
         return self.octagon_rectification(LENSES[settings.lens], files.images[0], settings.mask), facts

@@ -19,8 +19,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
-from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import (
@@ -35,6 +35,7 @@ from coliags_plugin.datamanagers.recording import (
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices, read_params
@@ -327,7 +328,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: correct org_width and org_height, or the intrinsics",
             )
-        return Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
+        return self.rectification_of(PinholeLens.of(pinhole), files.images[0])
 
     def _rotation(self, folder: Path, rectification: Rectification, poses: SequencePoses) -> list[Shot]:
         files = _find_sequence(folder, None)
@@ -384,7 +385,7 @@ def _recognised(folder: Path) -> str | None:
 
 def _scene_folder(path: Path) -> Path:
     """The sequence's folder: ``path`` itself, or the only scene of PR-Endo's release in it."""
-    require_folder(path, LAYOUT)
+    reading.require_folder(path, LAYOUT)
     scenes = [] if (path / "color").is_dir() else _release(path)
     if len(scenes) > 1:
         raise InputError(f"{path} holds several scenes", "one scene", f"Name one, for instance {sorted(scenes)[0]}")
@@ -397,13 +398,13 @@ def _find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
     ``params_file`` is EndoGSLAM's result, relative to the folder or absolute; None: search in the folder and in
     PR-Endo's release.
     """
-    images = numbered_images(folder / "color", "color", LAYOUT, "C3VD/cecum_t1_b")
-    depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES)
+    images = reading.numbered_images(folder / "color", "color", LAYOUT, "C3VD/cecum_t1_b")
+    depths = reading.numbered(folder / "depth", "depth", reading.TIFF_SUFFIXES)
     params = _params(folder, params_file)
     poses = folder / "pose.txt"
     return PreparedFiles(
         folder,
-        *paired(folder, images, depths),
+        *reading.paired(folder, images, depths),
         poses if poses.is_file() else None,
         params,
         None if params is None else _newest_cloud(params.parent),
@@ -412,9 +413,7 @@ def _find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
 
 def _params(folder: Path, params_file: str | None) -> Path | None:
     if params_file is not None:
-        if not (folder / params_file).is_file():
-            raise InputError(f"no file {folder / params_file}", "EndoGSLAM's params.npz", "Correct params_file")
-        return folder / params_file
+        return reading.required_file(folder / params_file, "EndoGSLAM's params.npz", "Correct params_file")
     here = folder.resolve()
     beside = here.parent.with_name(here.parent.name + OPTIMIZED) / here.name if here.parent.name else here
     return next((path / PARAMS for path in (folder, beside) if (path / PARAMS).is_file()), None)

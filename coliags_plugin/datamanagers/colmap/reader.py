@@ -17,14 +17,8 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.colmap.atlas import model_unit, read_atlas
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
-from coliags_plugin.datamanagers.reading.files import (
-    first_few,
-    named_file,
-    short_names,
-    unposed_images,
-    warn_of_unposed,
-)
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
@@ -255,12 +249,12 @@ class ColmapDataManager(RecordedDataManager):
             for number, lens in model.cameras.items()
         }
         rectification_of = rectifications(lenses, model.files[0], self.working_size, settings.focal_scale)
-        names = short_names([image.name for image in model.images])
-        others = unposed_images(paths, (*masks, *depths))
+        names = reading.short_names([image.name for image in model.images])
+        others = reading.unposed_images(paths, (*masks, *depths))
         atlas = read_atlas(path)
         unit = settings.unit or model_unit(path, model.folder, atlas)
         if atlas is None:  # else it says why images have no pose, or which other model has one
-            warn_of_unposed(model.files[1], others)
+            reading.warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
         shots, used, misplaced = [], 0, 0
         for index, image in enumerate(model.images):
@@ -372,10 +366,10 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
             "the images that the model was made from",
             "Name it with --set datamanager.images_folder=FOLDER",
         )
-    paths = [named_file(folder, image.name, str(model.folder), outside) for image in model.images]
+    paths = [reading.named_file(folder, image.name, str(model.folder), outside) for image in model.images]
     missing = [path for path in paths if not path.is_file()]
     if missing:
-        named = first_few([path.name for path in missing])
+        named = reading.first_few([path.name for path in missing])
         raise InputError(
             f"{len(missing)} of the {len(paths)} images of {model.folder} are not in {folder}: {named}",
             "every registered image, under the name the model has for it",
@@ -388,12 +382,5 @@ def _depths(folder: Path, model: SparseModel) -> list[Path | None]:
     """Depth files of all images, or of none."""
     if not folder.is_dir():
         return [None] * len(model.images)
-    depths = [sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
-    missing = [image.name for image, depth in zip(model.images, depths, strict=True) if depth is None]
-    if missing:
-        raise InputError(
-            f"{folder} has no file for {len(missing)} of {len(depths)} images, the first of them {missing[0]}",
-            f"NAME{', NAME'.join(_DEPTH_SUFFIXES)} for every image, or no such folder",
-            "Restore the missing files, or move the folder elsewhere",
-        )
-    return depths
+    found = {image.name: sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images}
+    return reading.for_all(found, folder, f"a file NAME{', NAME'.join(_DEPTH_SUFFIXES)}", or_none=False)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import posixpath
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,14 +17,8 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
-from coliags_plugin.datamanagers.reading.files import (
-    first_few,
-    named_file,
-    short_names,
-    unposed_images,
-    warn_of_unposed,
-)
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
@@ -53,65 +46,54 @@ _MODELS: Mapping[str, tuple[str, ...]] = {
 _BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-@dataclass(frozen=True)
-class FrameFiles:
-    """An entry of ``frames``: its existing files and its camera."""
-
-    name: str
-    image: Path
-    camera: Lens
-    depth: Path | None
-    mask: Path | None
-    confidence: Path | None
-
-
 class Transforms:
     """Contents of a ``transforms.json`` whose poses have been read before, so that its structure is valid.
 
-    ``outside`` tells whether it may name files outside of its folder.
+    ``names`` are those of its frames, in order; ``outside`` tells whether it may name files outside of its folder.
     """
 
-    def __init__(self, path: Path, outside: bool = False) -> None:
-        self.path, self._outside = path, outside
+    def __init__(self, path: Path, names: Sequence[str], outside: bool = False) -> None:
+        self.path, self.names, self._outside = path, names, outside
         self.content: dict[str, Any] = read_json(path, "a transforms.json")
-        self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
+        frames = {frame["file_path"]: frame for frame in self.content["frames"]}
+        self.frames: list[dict[str, Any]] = [frames[name] for name in names]
 
-    def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[FrameFiles]:
-        """Frame entries by name; depth and confidence are there for all frames or for none."""
-        images = self._images(names)
-        depths = self._for_all_or_none(names, "depth_file_path", "depth")
-        confidences = self._for_all_or_none(names, "confidence_file_path", "confidence")
-        if any(confidences) and not any(depths):
+    def images(self) -> list[Path]:
+        """The images of all frames."""
+        found = {}
+        for name in self.names:
+            candidates = (self._named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES))
+            found[name] = next((path for path in candidates if path.is_file()), None)
+        missing = [name for name, path in found.items() if path is None]
+        if missing:
+            folder, shown = self.path.parent, reading.first_few(missing)
             raise InputError(
-                f"{self.path}: the frames have a confidence_file_path, but no depth_file_path",
-                "confidence beside the depth that it is about",
-                "Add depth_file_path, or remove confidence_file_path",
+                f"{self.path}: {len(missing)} of {len(found)} frames have no image in {folder}: {shown}",
+                f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
+                "Restore them, or remove their frames",
             )
-        # Without a size in the file, all images must have the size of the first.
-        first_size = cache(lambda: size_of(images[0]))
-        return [
-            FrameFiles(
-                name,
-                image,
-                _camera_of(
-                    {**self.content, **self.frames[name]}, f"{self.path}, frame {name}", pixel_centers, first_size
-                ),
-                depth,
-                self._file(name, "mask_path"),
-                confidence,
-            )
-            for name, image, depth, confidence in zip(names, images, depths, confidences, strict=True)
-        ]
+        return [path for path in found.values() if path is not None]
+
+    def lenses(self, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]) -> list[Lens]:
+        """The cameras of all frames; arguments as for :func:`camera_of`."""
+        where = f"{self.path}, frame"
+        pairs = zip(self.names, self.frames, strict=True)
+        return [camera_of({**self.content, **frame}, f"{where} {n}", pixel_centers, stored_size) for n, frame in pairs]
+
+    def files(self, key: str, for_every: bool) -> list[Path | None]:
+        """The files that frames name under a key; if one does, all must where they are ``for_every`` frame."""
+        found = {}
+        for name, frame in zip(self.names, self.frames, strict=True):
+            path = None if frame.get(key) is None else self._named(str(frame[key]))
+            found[name] = path and reading.required_file(path, f"the file of {key} of frame {name} in {self.path}")
+        return reading.for_all(found, self.path, f"a {key}") if for_every else list(found.values())
 
     def points_file(self) -> Path | None:
         """The file of ``ply_file_path``; None if there is none."""
         name = self.content.get("ply_file_path")
         if name is None:
             return None
-        path = self._named(str(name))
-        if not path.is_file():
-            raise InputError(f"{self.path}: no file {path}", "the point cloud of ply_file_path", "Restore or remove it")
-        return path
+        return reading.required_file(self._named(str(name)), f"the point cloud of ply_file_path in {self.path}")
 
     def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
         """Transform points of the file into the world of its poses, :mod:`coliags_plugin.geometry.poses.nerfstudio`."""
@@ -119,8 +101,8 @@ class Transforms:
         unscaled = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
         return np.asarray(unscaled @ applied[:, :3])
 
-    def split(self, names: Sequence[str]) -> dict[str, list[int]] | None:
-        """Indices of training and test frames among ``names``; None if the file has no split.
+    def split(self) -> dict[str, list[int]] | None:
+        """Indices of training and test frames; None if the file has no split.
 
         Test frames are those of ``test_filenames`` or, if empty, of ``val_filenames``.
         """
@@ -129,18 +111,18 @@ class Transforms:
             return None
         test = "test" if listed["test"] else "val"
         chosen = {
-            "train": self._indices("train_filenames", listed["train"], names),
-            "test": self._indices(f"{test}_filenames", listed[test] or [], names),
+            "train": self._indices("train_filenames", listed["train"]),
+            "test": self._indices(f"{test}_filenames", listed[test] or []),
         }
         if both := set(chosen["train"]) & set(chosen["test"]):
-            name = names[min(both)]
+            name = self.names[min(both)]
             raise InputError(f"{self.path}: {name} is in train_filenames and {test}_filenames", "one of the two")
         return chosen
 
-    def made_from(self, names: Sequence[str]) -> dict[str, list[int]]:
-        """Indices among ``names`` of the frames that estimated depth was made from, if the file tells."""
+    def made_from(self) -> dict[str, list[int]]:
+        """Indices of the frames that estimated depth was made from, if the file tells."""
         listed = self.content.get(ESTIMATED_FROM)
-        return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed, names)}
+        return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed)}
 
     def depth_unit(self) -> float | None:
         """World units before applied_scale per stored depth unit; None if not given."""
@@ -148,8 +130,8 @@ class Transforms:
             return None
         return read_number(self.content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
 
-    def _indices(self, key: str, listed: Any, names: Sequence[str]) -> list[int]:
-        index_of = {posixpath.normpath(name): index for index, name in enumerate(names)}
+    def _indices(self, key: str, listed: Any) -> list[int]:
+        index_of = {posixpath.normpath(name): index for index, name in enumerate(self.names)}
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{self.path}: {key} is not a list of names", "file_paths of frames")
         unknown = [name for name in listed if posixpath.normpath(name) not in index_of]
@@ -158,46 +140,11 @@ class Transforms:
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
         return sorted({index_of[posixpath.normpath(name)] for name in listed})
 
-    def _images(self, names: Sequence[str]) -> list[Path]:
-        folder = self.path.parent
-        found: list[Path | None] = []
-        for name in names:
-            candidates = [self._named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES)]
-            found.append(next((path for path in candidates if path.is_file()), None))
-        missing = [name for name, path in zip(names, found, strict=True) if path is None]
-        if missing:
-            raise InputError(
-                f"{self.path}: {len(missing)} of {len(names)} frames have no image in {folder}: {first_few(missing)}",
-                f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
-                "Restore them, or remove their frames",
-            )
-        return cast(list[Path], found)
-
     def _named(self, name: str) -> Path:
-        return named_file(self.path.parent, name, str(self.path), self._outside)
-
-    def _for_all_or_none(self, names: Sequence[str], key: str, what: str) -> list[Path | None]:
-        files = [self._file(name, key) for name in names]
-        if None in files and any(files):
-            lone = names[files.index(None)]
-            raise InputError(
-                f"{self.path}: {sum(map(bool, files))} of {len(files)} frames have a {key}; {lone} has not",
-                f"{what} for every frame, or for none",
-                "Add the missing ones",
-            )
-        return files
-
-    def _file(self, name: str, key: str) -> Path | None:
-        value = self.frames[name].get(key)
-        if value is None:
-            return None
-        path = self._named(str(value))
-        if not path.is_file():
-            raise InputError(f"{self.path}, frame {name}: no file {path}", f"the file of {key}", "Restore it")
-        return path
+        return reading.named_file(self.path.parent, name, str(self.path), self._outside)
 
 
-def _camera_of(
+def camera_of(
     values: Mapping[str, Any], where: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
 ) -> Lens:
     """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
@@ -292,35 +239,43 @@ class NerfstudioDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings, file = self.settings, path / FILE
-        if not file.is_file():
-            raise InputError(f"no file {file}", "a folder with a transforms.json", "Check the path")
+        reading.required_file(file, "a folder with a transforms.json", "Check the path")
         trajectory = nerfstudio_poses.read(file)
-        transforms, names = Transforms(file, settings.outside_files), trajectory.names_or_numbers()
-        entries = transforms.entries(names, settings.pixel_centers)
+        transforms = Transforms(file, trajectory.names_or_numbers(), settings.outside_files)
+        images, masks = transforms.images(), transforms.files("mask_path", for_every=False)
+        depths, confidences = (transforms.files(f"{what}_file_path", True) for what in ("depth", "confidence"))
+        if any(confidences) and not any(depths):
+            raise InputError(
+                f"{file}: the frames have a confidence_file_path, but no depth_file_path",
+                "confidence beside the depth that it is about",
+                "Add depth_file_path, or remove confidence_file_path",
+            )
+        # Without a size in the file, all images must have the size of the first.
+        lenses = transforms.lenses(settings.pixel_centers, cache(lambda: size_of(images[0])))
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
         unit = self.stated_unit(path)
         depth_unit = self._depth_unit(transforms, unit)
-        lenses = {entry.camera: entry.camera for entry in entries}
-        rectification_of = rectifications(lenses, file, self.working_size, settings.focal_scale)
-        images = [entry.image for entry in entries]
-        others = [path for entry in entries for path in (entry.depth, entry.mask, entry.confidence)]
-        unposed = unposed_images(images, others)
-        warn_of_unposed(file, unposed)
+        rectification_of = rectifications(
+            {lens: lens for lens in lenses}, file, self.working_size, settings.focal_scale
+        )
+        others = [path for of_frame in zip(depths, masks, confidences, strict=True) for path in of_frame]
+        unposed = reading.unposed_images(images, others)
+        reading.warn_of_unposed(file, unposed)
         seen = find_seen_masks(path / "truth", len(images), complete=not unposed)
         shots = [
             Shot(
                 short,
-                entry.image,
-                rectification_of[entry.camera],
-                pose,
-                entry.depth,
-                None if entry.depth is None else depth_format(entry.depth, depth_unit),
-                entry.mask,
+                images[index],
+                rectification_of[lenses[index]],
+                camera_to_world[index],
+                depth,
+                None if depth is None else depth_format(depth, depth_unit),
+                masks[index],
                 seen.get(index),
-                confidence=entry.confidence,
+                confidence=confidences[index],
             )
-            for index, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
+            for index, (short, depth) in enumerate(zip(reading.short_names(transforms.names), depths, strict=True))
         ]
         kinds = sorted({type(lens).__name__ for lens in lenses})
         bent = not all(isinstance(lens, PinholeLens) for lens in lenses)
@@ -338,7 +293,7 @@ class NerfstudioDataManager(RecordedDataManager):
                 "stored_as": trajectory.stored_as,
                 "remarks": [remark for remark in trajectory.remarks if not remark.startswith("no intrinsics")],
             },
-            "masks": sum(entry.mask is not None for entry in entries),
+            "masks": sum(mask is not None for mask in masks),
         }
         own_points, source = self._own_points(path, transforms)
         return Recording(
@@ -346,8 +301,8 @@ class NerfstudioDataManager(RecordedDataManager):
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, [*images, *others], [file]),
-            own_split=transforms.split(names),
-            made_from=transforms.made_from(names),
+            own_split=transforms.split(),
+            made_from=transforms.made_from(),
             own_points=own_points,
             points_source=source,
         )

@@ -31,6 +31,28 @@ def require_folder(folder: Path, expected: str) -> None:
         raise InputError(f"no folder {folder}", expected, "Check the path")
 
 
+def required_file(path: Path, expected: str, do: str = "Restore it, or check the path") -> Path:
+    """The path of a file; InputError if it is missing."""
+    if not path.is_file():
+        raise InputError(f"no file {path}", expected, do)
+    return path
+
+
+def for_all(files: Mapping[str, Path | None], where: object, what: str, or_none: bool = True) -> list[Path | None]:
+    """Files by the name of their frame, of which there must be one for every frame or, unless ``or_none``, for none.
+
+    ``where`` they are missing and ``what`` they are is for the error.
+    """
+    missing = [name for name, path in files.items() if path is None]
+    if missing and not (or_none and len(missing) == len(files)):
+        raise InputError(
+            f"{where}: {len(files) - len(missing)} of {len(files)} frames have {what}; {missing[0]} has none",
+            f"{what} for every frame, or none at all",
+            "Restore the missing ones: incomplete archives are common",
+        )
+    return list(files.values())
+
+
 def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
     """Files ``<number>_<what>`` by number, padded or not, or ``<number>`` if ``what`` is empty; none without folder."""
     files: dict[int, Path] = {}

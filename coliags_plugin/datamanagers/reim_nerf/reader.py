@@ -15,23 +15,16 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.datamanagers.reading.files import (
-    inventory,
-    named_file,
-    require_folder,
-    unposed_images,
-    warn_of_unposed,
-)
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint, make_shots
-from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.geometry.poses.trajectory import natural_order, refuse_repeated
+from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
+from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order
 
 MASK_FILE = "rgb_mask.png"
 #: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
@@ -46,15 +39,8 @@ _SHARED = (
 )
 #: Digits tried of numbers in file names.
 _DIGITS = 6
-
-
-@dataclass(frozen=True)
-class FrameEntry:
-    """A frame of the JSON files: its image, its distance map, if any, and its pose, OpenCV axes, mm."""
-
-    image: Path
-    distances: Path | None
-    camera_to_world: Float[np.ndarray, "4 4"]
+#: An image, its distance map if there is any, and its pose with OpenCV axes, mm. [4, 4]
+_Frame = tuple[Path, Path | None, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,32 +111,36 @@ class ReimNerfDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        require_folder(path, EXPECTED)
+        reading.require_folder(path, EXPECTED)
         files = {part: file for part in PARTS if (file := path / f"transforms_{part}.json").is_file()}
         if "train" not in files:
-            raise InputError(f"{path} holds {inventory(path)}", EXPECTED, "Add transforms_train.json")
+            raise InputError(f"{path} holds {reading.inventory(path)}", EXPECTED, "Add transforms_train.json")
         if settings.split == "own" and "true_test" not in files:
             raise InputError(
                 f"{path} has no transforms_true_test.json",
                 "the test frames of split 'own'",
                 "Add it, or choose another split",
             )
-        contents = {part: _read(file) for part, file in files.items()}
+        contents: dict[str, Any] = {}
+        trajectories: dict[str, Trajectory | None] = {}
+        for part, file in files.items():
+            contents[part] = read_json(file, "a JSON object with frames")
+            # A short video may have no validation frames, but there must be training frames.
+            is_empty = part != "train" and isinstance(contents[part], dict) and contents[part].get("frames") == []
+            trajectories[part] = None if is_empty else read_transforms(file)
         file, first = files["train"], contents["train"]
         _refuse_different(files, contents)
         lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
         distmap_scale = read_number(
             {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
         )
-        frames: dict[str, FrameEntry] = {}
+        frames: dict[str, _Frame] = {}
         frames_of = {}
-        for part, content in contents.items():
-            frames_of[part] = _frames(path, files[part], content, scale, shift, settings.outside_files)
+        for part, trajectory in trajectories.items():
+            frames_of[part] = _frames(files[part], contents[part], trajectory, scale, shift, settings.outside_files)
             for name, frame in frames_of[part].items():
                 known = frames.setdefault(name, frame)
-                if known.distances != frame.distances or not np.allclose(
-                    known.camera_to_world, frame.camera_to_world, atol=1e-4
-                ):
+                if known[1] != frame[1] or not np.allclose(known[2], frame[2], atol=1e-4):
                     raise InputError(
                         f"{files[part]}: pose or distance map of {name} differs from another file's",
                         "the same values for a frame in all files",
@@ -158,20 +148,16 @@ class ReimNerfDataManager(RecordedDataManager):
                     )
         unordered = [*frames]
         names = [unordered[index] for index in natural_order(unordered)]
-        if len({frame.distances is None for frame in frames.values()}) > 1:
-            lone = next(name for name in names if frames[name].distances is None)
-            raise InputError(f"{path}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
+        distances = reading.for_all({name: frames[name][1] for name in names}, path, "a distmap_path")
         parts = {part: [index for index, name in enumerate(names) if name in own] for part, own in frames_of.items()}
         mask = path / MASK_FILE if settings.mask else None
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
-        size = self.working_size(lens.width, lens.height)
-        rectification = Rectification.through(lens, file, size, settings.focal_scale, shows)
+        rectification = self.rectification_of(lens, file, shows)
         form = RayDistance(distmap_scale / 65535.0 / scale, rectification.nearest(ray_cosines(lens)))
         seen = find_seen_masks(path / "truth", len(frames))
-        images, distances = ([getattr(frames[name], part) for name in names] for part in ("image", "distances"))
-        poses = np.stack([frames[name].camera_to_world for name in names])
+        images, poses = [frames[name][0] for name in names], np.stack([frames[name][2] for name in names])
         shots = make_shots(images, rectification, poses, distances, form, seen)
-        warn_of_unposed(path, unposed_images(images, distances))
+        reading.warn_of_unposed(path, reading.unposed_images(images, distances))
         large = [file for pair in zip(images, distances, strict=True) for file in pair]
         facts: dict[str, Any] = {
             "layout": "REIM-NeRF",
@@ -197,13 +183,8 @@ class ReimNerfDataManager(RecordedDataManager):
 
 def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
     """Valid stored pixels: the mask file is white where a pixel is ignored."""
-    if not mask.is_file():
-        raise InputError(
-            f"no file {mask}",
-            "the mask of pixels outside the lens's image circle",
-            "Restore it, or --set datamanager.mask=false",
-        )
-    ignored = read_mask(mask)
+    do = "Restore it, or --set datamanager.mask=false"
+    ignored = read_mask(reading.required_file(mask, "the mask of pixels outside the lens's image circle", do))
     if ignored.shape != (height, width):
         raise InputError(f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the images' size, {width} x {height}")
     return np.asarray(~ignored)
@@ -219,15 +200,6 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
     cosine = 1.0 / np.linalg.norm(rays, axis=1)
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    content = read_json(file, "a JSON object with frames")
-    frames = content.get("frames") if isinstance(content, dict) else None
-    # A short video may have no validation frames, but there must be training frames.
-    if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
-        raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
-    return content
 
 
 def _refuse_different(files: Mapping[str, Path], contents: Mapping[str, Mapping[str, Any]]) -> None:
@@ -258,39 +230,34 @@ def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
 
 def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float[np.ndarray, "3"]]:
     scale = read_number(content, "scene_scale", file, "a number above 0", above=0.0)
-    shift = _array(content.get("scene_T"))
-    if shift.shape != (4, 4) or not np.allclose(shift[:3, :3], np.eye(3)) or not np.allclose(shift[3], (0, 0, 0, 1)):
+    try:
+        shift = np.array(content.get("scene_T"), np.float64)
+    except (TypeError, ValueError, OverflowError):
+        shift = np.empty(0)
+    is_matrix = shift.shape == (4, 4) and np.isfinite(shift).all()
+    if not is_matrix or not np.allclose(shift[:, :3], np.eye(4)[:, :3]) or not np.isclose(shift[3, 3], 1.0):
         raise InputError(f"{file}: scene_T is not a translation", "a 4x4 matrix without rotation")
     return scale, shift[:3, 3]
 
 
 def _frames(
-    folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"], outside: bool
-) -> dict[str, FrameEntry]:
+    file: Path,
+    content: Mapping[str, Any],
+    trajectory: Trajectory | None,
+    scale: float,
+    shift: Float[np.ndarray, "3"],
+    outside: bool,
+) -> dict[str, _Frame]:
     """Frames of one file by the names of their images."""
-    result: dict[str, FrameEntry] = {}
-    names, matrices = [], []
-    for index, frame in enumerate(content["frames"]):
-        name = frame.get("file_path") if isinstance(frame, dict) else None
-        if not isinstance(name, str) or not name:
-            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's image")
-        matrix = _array(frame.get("transform_matrix"))
-        if matrix.shape != (4, 4):
-            raise InputError(
-                f"{file}, frame {index} ({name}): transform_matrix is missing or not a matrix",
-                "4 rows of 4 finite numbers",
-            )
-        names.append(name)
-        matrices.append(matrix)
-    refuse_repeated(names, str(file))
-    # Also with no frames: a short video may have no validation frames.
-    check_rigid(np.reshape(matrices, (-1, 4, 4)), lambda index: f"{file}, frame {index} ({names[index]})")
-    for name, matrix, frame in zip(names, matrices, content["frames"], strict=True):
-        camera_to_world = matrix @ FLIP_Y_AND_Z
-        camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
-        distances = frame.get("distmap_path")
+    result: dict[str, _Frame] = {}
+    entries = {entry["file_path"]: entry for entry in content["frames"]}
+    poses = dict(zip(trajectory.names_or_numbers(), trajectory.camera_to_world, strict=True)) if trajectory else {}
+    for name, pose in poses.items():
+        camera_to_world = pose.copy()
+        camera_to_world[:3, 3] = pose[:3, 3] / scale - shift
+        distances = entries[name].get("distmap_path")
         stated = [name, *([distances] if isinstance(distances, str) else [])]
-        named = [named_file(folder, text, str(file), outside) for text in stated]
+        named = [reading.named_file(file.parent, text, str(file), outside) for text in stated]
         paths = [_padded_otherwise(path) for path in named]
         for path, existing in zip(named, paths, strict=True):
             if not existing.is_file():
@@ -299,7 +266,7 @@ def _frames(
                     "every named file",
                     "Restore it",
                 )
-        result[name] = FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)
+        result[name] = (paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)
     return result
 
 
@@ -314,12 +281,3 @@ def _padded_otherwise(named: Path) -> Path:
     rest = named.name[number.end() :]
     others = (named.with_name(f"{int(number.group()):0{digits}d}{rest}") for digits in range(1, _DIGITS + 1))
     return next((path for path in others if path.is_file()), named)
-
-
-def _array(value: Any) -> np.ndarray:
-    """Array of finite numbers; empty for any other value."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
-    return array if np.all(np.isfinite(array)) else np.empty(0)

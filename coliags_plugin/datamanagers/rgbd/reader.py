@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
@@ -20,18 +18,11 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
-from coliags_plugin.datamanagers.reading.files import (
-    DEPTH_SUFFIXES,
-    IMAGE_SUFFIXES,
-    inventory,
-    read_intrinsics,
-    require_folder,
-)
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.units import printed_unit
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
@@ -61,13 +52,10 @@ _MIDDLE = (0.3, 0.7)
 _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class _CameraFile:
-    """Contents of a camera file; ``depth_scale`` in depth steps per scene unit, None if not given."""
-
-    path: Path
-    lens: Lens  # of the stored images
-    depth_scale: float | None = None
+#: A camera file, its lens of the stored images, and depth steps per scene unit if it gives them.
+_Camera = tuple[Path, Lens, float | None]
+#: An image, its depth file if there are any, and the index of its pose.
+_Row = tuple[Path, Path | None, int]
 
 
 class RGBDSettings(SceneSettings):
@@ -95,16 +83,6 @@ class RGBDSettings(SceneSettings):
     trajectory: str | None = Field(
         None, description="The trajectory file, if there are several; relative to the scene folder, or absolute."
     )
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Associated image files, depth files and pose indices, in video order."""
-
-    images: Sequence[Path]
-    depths: Sequence[Path | None]
-    poses: Sequence[int]
-    facts: dict[str, Any]
 
 
 class RGBDDataManager(RecordedDataManager):
@@ -135,21 +113,18 @@ class RGBDDataManager(RecordedDataManager):
         depths = _find_depths(path) if settings.depth == "metric" else []
         file = _find_trajectory(path, settings.trajectory)
         trajectory = tum.read(file)
-        by_time = self._by_time(images)
-        pair = self._paired_by_time if by_time else self._paired_by_order
-        frames = pair(images, depths, trajectory, file)
-        camera = _find_camera(path, frames.images[0])
-        scale = self._depth_scale(camera, path) if depths else None
+        pair = self._paired_by_time if self._is_by_time(images) else self._paired_by_order
+        rows, association = pair(images, depths, trajectory, file)
+        used = [image for image, _, _ in rows]
+        camera_file, lens, stated_scale = _find_camera(path, used[0])
+        scale = self._depth_scale(stated_scale, camera_file) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
-        (rectification,) = rectifications(
-            {0: camera.lens}, camera.path, self.working_size, settings.focal_scale
-        ).values()
-        complete = len(frames.images) == len(images) == len(trajectory)
-        seen = find_seen_masks(path / "truth", len(images), complete)
-        masks = _files_of_images(path, MASK_FOLDERS, frames.images, "mask")
+        rectification = self.rectification_of(lens, camera_file)
+        seen = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
+        masks = _files_of_images(path, MASK_FOLDERS, used, "mask")
         confidences: dict[str, Path] = {}
         if settings.depth == "metric":
-            confidences = _files_of_images(path, CONFIDENCE_FOLDERS, frames.images, "confidence")
+            confidences = _files_of_images(path, CONFIDENCE_FOLDERS, used, "confidence")
         if confidences and not depths:
             raise InputError(
                 f"{path} holds confidence/, but no depth",
@@ -168,16 +143,16 @@ class RGBDDataManager(RecordedDataManager):
                 seen=seen.get(index),
                 confidence=confidences.get(image.stem),
             )
-            for index, (image, depth, pose) in enumerate(zip(frames.images, frames.depths, frames.poses, strict=True))
+            for index, (image, depth, pose) in enumerate(rows)
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
             "trajectory": file.name,
-            "intrinsics_from": camera.path.name,
-            "lens": type(camera.lens).__name__,
-            "focal_scale": None if isinstance(camera.lens, PinholeLens) else settings.focal_scale,
+            "intrinsics_from": camera_file.name,
+            "lens": type(lens).__name__,
+            "focal_scale": None if isinstance(lens, PinholeLens) else settings.focal_scale,
             "depth_scale": scale,
-            "association": frames.facts,
+            "association": association,
             "masks": len(masks),
             "depth_is_estimated": bool(confidences),
             **rectification.facts(),
@@ -187,21 +162,21 @@ class RGBDDataManager(RecordedDataManager):
                 "summary": trajectory.summary(printed_unit(self.stated_unit(path))),
             },
         }
-        points = next((file for file in (path / POINTS_FILE, _find_mesh(path)) if file and file.is_file()), None)
+        meshes = list(path.glob("*.obj"))
+        points = next((file for file in (path / POINTS_FILE, *meshes[: len(meshes) == 1]) if file.is_file()), None)
+        large = (*used, *(depth for _, depth, _ in rows), *masks.values(), *confidences.values())
         return Recording(
-            kind=f"TUM RGB-D, associated by {frames.facts['by']}",
+            kind=f"TUM RGB-D, associated by {association['by']}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(
-                path, (*frames.images, *frames.depths, *masks.values(), *confidences.values()), (file, camera.path)
-            ),
+            fingerprint=fingerprint(path, large, (file, camera_file)),
             own_points=None
             if points is None
             else partial(_read_mesh_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
         )
 
-    def _by_time(self, images: Sequence[Path]) -> bool:
+    def _is_by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
             return self.settings.association == "time"
         timed = [_TIME.fullmatch(path.stem) is not None for path in images]
@@ -215,61 +190,51 @@ class RGBDDataManager(RecordedDataManager):
 
     def _paired_by_time(
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
-    ) -> _Frames:
+    ) -> tuple[list[_Row], dict[str, Any]]:
+        """Images with a pose, and depth if there is any, in order of time; and provenance."""
         tolerance = self.settings.max_time_difference
-        taken = _times(images)
-        order = np.argsort(taken, kind="stable")
-        images, taken = [images[index] for index in order], taken[order]
-        same = np.flatnonzero(np.diff(taken) == 0.0)
-        if len(same):
-            first = int(same[0])
-            raise InputError(f"{images[first]} and {images[first + 1].name} have the same timestamp", "one of them")
-        known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
         # Names are rounded to microseconds; pairs exactly at the tolerance must match.
         within = tolerance + 1e-6
+        images = sorted(images, key=_time)
+        taken = np.array([_time(image) for image in images])
+        for first in np.flatnonzero(np.diff(taken) == 0.0):
+            raise InputError(f"{images[first]} and {images[first + 1].name} have the same timestamp", "one of them")
+        known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
         pose = nearest_in_time(taken, known, within)
-        if not (pose >= 0).any():
+        posed = np.flatnonzero(pose >= 0)
+        if not len(posed):
             raise InputError(
                 f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
                 "timestamps of one clock in names and trajectory, in seconds",
                 "Shift the trajectory's timestamps, or --set datamanager.association=order if line n is image n's",
             )
-        posed = pose >= 0
-        depth = np.full(len(images), -1)
-        complete = posed.copy()
+        deep = np.zeros(len(posed), np.int64)
         if depths:
-            depth[posed] = nearest_in_time(taken[posed], _times(depths), within)
-            complete &= depth >= 0
-        if not complete.any():
+            deep = nearest_in_time(taken[posed], np.array([_time(depth) for depth in depths]), within)
+        kept = posed[deep >= 0]
+        if not len(kept):
             raise InputError(
                 f"no depth file within {tolerance:g} of an image that has a pose",
                 "depth files named by timestamps of the images' clock",
                 "Rename them, or --set datamanager.depth=none",
             )
-        kept = np.flatnonzero(complete)
-        dropped = {"without_pose": int((~posed).sum()), "without_depth": int((posed & ~complete).sum())}
-        if sum(dropped.values()):
-            log.warning(
-                "%s: of %d images %d have no pose and %d no depth within %g s; they are left out",
-                file.parent,
-                len(images),
-                *dropped.values(),
-                tolerance,
-            )
-        difference = np.abs(taken[kept] - known[pose[kept]]).max()
-        facts = {"by": "time", **dropped, "largest_difference_s": float(difference)}
-        return _Frames(
-            [images[index] for index in kept],
-            [depths[depth[index]] if depths else None for index in kept],
-            [int(pose[index]) for index in kept],
-            facts,
-        )
+        without = {"without_pose": len(images) - len(posed), "without_depth": len(posed) - len(kept)}
+        if any(without.values()):
+            said = "%s: of %d images %d have no pose and %d no depth within %g s; they are left out"
+            log.warning(said, file.parent, len(images), *without.values(), tolerance)
+        difference = float(np.abs(taken[kept] - known[pose[kept]]).max())
+        rows: list[_Row] = [
+            (images[index], depths[depth] if depths else None, int(pose[index]))
+            for index, depth in zip(kept, deep[deep >= 0], strict=True)
+        ]
+        return rows, {"by": "time", **without, "largest_difference_s": difference}
 
     def _paired_by_order(
         self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
-    ) -> _Frames:
-        numbered = _by_number(images)
+    ) -> tuple[list[_Row], dict[str, Any]]:
+        """Images in order of their numbers, each with its depth if there is any, and the pose of its place."""
+        numbered, deep = _by_number(images), _by_number(depths)
         if len(trajectory) != len(numbered):
             raise InputError(
                 f"{file} has {len(trajectory)} poses for {len(numbered)} images",
@@ -277,7 +242,6 @@ class RGBDDataManager(RecordedDataManager):
                 "Restore the missing ones, or --set datamanager.association=time if its timestamps name images",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
-        deep = _by_number(depths)
         if deep and deep.keys() != numbered.keys():
             lone = min(deep.keys() ^ numbered.keys())
             raise InputError(
@@ -286,9 +250,8 @@ class RGBDDataManager(RecordedDataManager):
                 "a depth file for every image, or none at all",
                 "Restore the missing files, or --set datamanager.depth=none",
             )
-        return _Frames(
-            list(numbered.values()), [deep.get(key) for key in numbered], range(len(numbered)), {"by": "order"}
-        )
+        rows: list[_Row] = [(image, deep.get(key), pose) for pose, (key, image) in enumerate(numbered.items())]
+        return rows, {"by": "order"}
 
     def _check_times_say_the_same(
         self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
@@ -307,18 +270,19 @@ class RGBDDataManager(RecordedDataManager):
                 "--set datamanager.association=time if the names are timestamps, or order if these mean nothing",
             )
 
-    def _depth_scale(self, camera: _CameraFile, path: Path) -> float:
-        said, given = camera.depth_scale, self.settings.depth_scale
+    def _depth_scale(self, said: float | None, file: Path) -> float:
+        """Depth steps per scene unit, as the camera's file and the option say."""
+        given = self.settings.depth_scale
         if said is not None and given is not None and said != given:
             raise InputError(
-                f"{camera.path}: depth_scale = {said:g}, but the option depth_scale is {given:g}",
+                f"{file}: depth_scale = {said:g}, but the option depth_scale is {given:g}",
                 "one depth_scale",
                 "Leave the option out, or correct the file",
             )
         scale = said if said is not None else given
         if scale is None:
             raise InputError(
-                f"{path} has depth files, but their number of steps per unit of the trajectory is not given",
+                f"{file.parent} has depth files, but their number of steps per unit of the trajectory is not given",
                 '"depth_scale" in camera.json, <depth_scale> in a calibration file, or the option depth_scale; TUM\'s '
                 "files have 5000 steps per metre",
                 "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
@@ -338,20 +302,22 @@ class EndoMapperDataManager(RGBDDataManager):
 
 def _find_images(folder: Path) -> list[Path]:
     """The colour images, unordered; there must be one folder of them."""
-    require_folder(folder, EXPECTED)
+    reading.require_folder(folder, EXPECTED)
     image_folder = _only(folder, IMAGE_FOLDERS)
     if image_folder is None:
-        raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Name the scene's own folder")
-    images = [path for path in image_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+        raise InputError(f"{folder} holds {reading.inventory(folder)}", EXPECTED, "Name the scene's own folder")
+    images = [path for path in image_folder.iterdir() if path.suffix.lower() in reading.IMAGE_SUFFIXES]
     if not images:
-        raise InputError(f"{image_folder} holds {inventory(image_folder)}", "PNG or JPEG images")
+        raise InputError(f"{image_folder} holds {reading.inventory(image_folder)}", "PNG or JPEG images")
     return images
 
 
 def _find_depths(folder: Path) -> list[Path]:
     """The depth files, unordered; empty without a folder of them."""
     depths = _only(folder, DEPTH_FOLDERS)
-    return [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
+    return (
+        [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in reading.DEPTH_SUFFIXES]
+    )
 
 
 def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
@@ -362,23 +328,17 @@ def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path
     file_folder = _only(folder, names)
     if file_folder is None:
         return {}
-    files = {path.stem: path for path in file_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
-    lone = next((image for image in images if image.stem not in files), None)
-    if lone is not None:
-        raise InputError(
-            f"{file_folder} has no {what} for {lone.name}",
-            f"a {what} of the same name for every image, or no such folder",
-            "Restore the missing ones, or move the folder away",
-        )
-    return {image.stem: files[image.stem] for image in images}
+    files = {path.stem: path for path in file_folder.iterdir() if path.suffix.lower() in reading.IMAGE_SUFFIXES}
+    found = {image.name: files.get(image.stem) for image in images}
+    return {
+        path.stem: path for path in reading.for_all(found, file_folder, f"a {what}", or_none=False) if path is not None
+    }
 
 
 def _find_trajectory(folder: Path, named: str | None) -> Path:
     """The trajectory file: the one the user names, relative to the folder or absolute, or the only one there is."""
     if named is not None:
-        if not (folder / named).is_file():
-            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Correct the option trajectory")
-        return folder / named
+        return reading.required_file(folder / named, "a TUM trajectory", "Correct the option trajectory")
     trajectories = _trajectories(folder)
     if not trajectories:
         raise InputError(
@@ -395,7 +355,7 @@ def _find_trajectory(folder: Path, named: str | None) -> Path:
     return trajectories[0]
 
 
-def _find_camera(folder: Path, image: Path) -> _CameraFile:
+def _find_camera(folder: Path, image: Path) -> _Camera:
     """The camera: of ``camera.json``, ``intrinsics.txt``, COLMAP's ``cameras.txt`` or a calibration file, the first.
 
     ``image`` is one of the scene's, for the size if the file has none.
@@ -407,13 +367,7 @@ def _find_camera(folder: Path, image: Path) -> _CameraFile:
     if calibration is None:
         seen = f"{folder} has images but no {', '.join(CAMERA_FILES)} or calibration file"
         raise InputError(seen, EXPECTED, "Add the camera")
-    return _CameraFile(calibration.path, calibration.lens, calibration.depth_scale)
-
-
-def _find_mesh(folder: Path) -> Path | None:
-    """The OBJ file of the folder; None if there is none or several."""
-    meshes = sorted(folder.glob("*.obj"))
-    return meshes[0] if len(meshes) == 1 else None
+    return calibration.path, calibration.lens, calibration.depth_scale
 
 
 def _read_mesh_points(path: Path) -> PointCloud:
@@ -434,16 +388,14 @@ def _trajectories(folder: Path) -> list[Path]:
     return sorted({path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file()})
 
 
-def _read_json(path: Path, image: Path) -> _CameraFile:
-    lens = PinholeLens.of(read_intrinsics(path))
-    content = read_json(path, "a JSON object")
-    if content.get("depth_scale") is None:
-        return _CameraFile(path, lens)
+def _read_json(path: Path, image: Path) -> _Camera:
+    lens, content = PinholeLens.of(reading.read_intrinsics(path)), read_json(path, "a JSON object")
     expected = "a number above 0: depth steps per scene unit"
-    return _CameraFile(path, lens, read_number(content, "depth_scale", path, expected, above=0.0))
+    given = content.get("depth_scale") is not None
+    return path, lens, read_number(content, "depth_scale", path, expected, above=0.0) if given else None
 
 
-def _read_intrinsics_txt(path: Path, image: Path) -> _CameraFile:
+def _read_intrinsics_txt(path: Path, image: Path) -> _Camera:
     words = [word for line in read_text(path, "numbers").splitlines() for word in line.replace(",", " ").split()]
     try:
         values = [float(word) for word in words]
@@ -465,22 +417,17 @@ def _read_intrinsics_txt(path: Path, image: Path) -> _CameraFile:
             "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
         )
     # OpenCV's K: pixel centres at integers.
-    return _CameraFile(path, PinholeLens(fx, fy, cx + 0.5, cy + 0.5, width, height))
+    return path, PinholeLens(fx, fy, cx + 0.5, cy + 0.5, width, height), None
 
 
-def _read_cameras_txt(path: Path, image: Path) -> _CameraFile:
+def _read_cameras_txt(path: Path, image: Path) -> _Camera:
     cameras = list(read_pinholes(path).values())
     if len(cameras) != 1:
         raise InputError(f"{path} has {len(cameras)} cameras", "one, PINHOLE or SIMPLE_PINHOLE")
     camera = cameras[0]
     if isinstance(camera, str):
         raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
-    return _CameraFile(path, PinholeLens.of(camera))
-
-
-def _times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:
-    """Timestamps from file names, seconds; integers are accepted too."""
-    return np.array([_time(path) for path in paths])
+    return path, PinholeLens.of(camera), None
 
 
 def _by_number(paths: Sequence[Path]) -> dict[tuple[int, ...], Path]:

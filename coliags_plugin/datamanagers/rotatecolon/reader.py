@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import io
 import logging
-import math
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float32, Shaped
 from pydantic import Field
 
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.json_files import read_json, read_number
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.nerfstudio.reader import camera_of
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.datamanagers.reading.files import inventory, numbered, require_folder
+from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder, required_file
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import ROTATION, Recording, Shot, find_seen_masks, fingerprint, make_shots
-from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
@@ -68,8 +66,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
     """Read a channel of an EXR file by its full name, from any part."""
     import OpenEXR
 
-    if not path.is_file():
-        raise InputError(f"no file {path}", "an OpenEXR file")
+    required_file(path, "an OpenEXR file")
     try:
         with (
             _ALONE,
@@ -82,7 +79,11 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
             if not channels:
                 raise ValueError("no channels")
     except (OSError, RuntimeError, ValueError) as error:
-        raise _damaged(path) from error
+        raise InputError(
+            f"{path} ({path.stat().st_size} bytes) cannot be decoded",
+            "a complete OpenEXR file",
+            "It is damaged or cut short: fetch it again",
+        ) from error
     if channel not in channels:
         raise InputError(
             f"{path} has the channels {', '.join(sorted(channels))}",
@@ -90,14 +91,6 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
             "Choose the one that holds depth with --set datamanager.depth_channel=NAME",
         )
     return np.asarray(channels[channel]).astype(np.float32)
-
-
-def _damaged(path: Path) -> InputError:
-    return InputError(
-        f"{path} ({path.stat().st_size} bytes) cannot be decoded",
-        "a complete OpenEXR file",
-        "It is damaged or cut short: fetch it again",
-    )
 
 
 _LAYOUT = "RotateColon's transforms.json, train_views/NNNN.png and perhaps depth_train/NNNN.exr"
@@ -108,22 +101,6 @@ POINTS = "init_point_cloud.ply"
 PINK = (188, 99, 76)
 #: Name of the split's test set, or of the dataset's test views if the split holds out none.
 _MAIN_SET = "test"
-
-
-@dataclass(frozen=True)
-class _ViewFiles:
-    """Images, in order of their numbers, depth files, if any, and poses of one JSON file.
-
-    Poses are rigid, with OpenCV axes, in the data's units; ``angle`` is the horizontal field of view, radians;
-    ``unposed`` the number of images without a pose.
-    """
-
-    transforms: Path
-    images: tuple[Path, ...]
-    depths: tuple[Path, ...] | None
-    camera_to_world: Float[np.ndarray, "N 4 4"]
-    angle: float
-    unposed: int
 
 
 class RotateColonSettings(SceneSettings):
@@ -166,105 +143,81 @@ class RotateColonDataManager(RecordedDataManager):
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
-        settings = self.settings
-        train, test = self._views(path)
-        shots, facts = self._shots(train)
-        holds_out = settings.split not in ("all-train", "own")
-        name = ROTATION if holds_out else _MAIN_SET
+        require_folder(path, _LAYOUT)
+        if self.recognise(path) is None:
+            raise InputError(f"{path} holds {inventory(path)}", _LAYOUT, "Name the scene's own folder")
+        parts = [self._views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)]
+        test = path / TEST
+        if test.is_file():
+            images = path / self.settings.test_folder
+            if not images.is_dir():
+                raise InputError(
+                    f"{path} has {TEST} but no folder {self.settings.test_folder}",
+                    "the images of the test views",
+                    "Name the folder they are in with --set datamanager.test_folder=FOLDER",
+                )
+            parts.append(self._views(test, images, None, "test-"))
+        (shots, facts), *others = parts
+        complete = not any(part["images_without_pose"] for _, part in parts)
         test_sets = {}
-        if test is not None:
-            seen = find_seen_masks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
-            test_sets[name], facts[name] = self._shots(test, seen, "test-")
+        for views, described in others:
+            name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
+            seen = find_seen_masks(path / "truth", len(views), complete)
+            test_sets[name] = [replace(shot, seen=seen.get(index)) for index, shot in enumerate(views)]
+            facts[name] = described
         points = path / POINTS
-        files = [part for part in (train, test) if part is not None]
+        known = points if points.is_file() else None
+        pixels = (file for views, _ in parts for file in (*[v.image for v in views], *[v.depth for v in views]))
         return Recording(
             kind="RotateColon layout",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(
-                path,
-                (
-                    points if points.is_file() else None,
-                    *(file for part in files for file in (*part.images, *(part.depths or ()))),
-                ),
-                (part.transforms for part in files),
-            ),
+            fingerprint=fingerprint(path, (known, *pixels), (path / TRAIN, test if others else None)),
             test_sets=test_sets,
             own_split={"train": range(len(shots)), "test": ()},
-            own_points=(lambda: _pink(load_points(points))) if points.is_file() else None,
+            own_points=None if known is None else lambda: _pink(load_points(points)),
             points_source=points,
         )
 
-    def _views(self, path: Path) -> tuple[_ViewFiles, _ViewFiles | None]:
-        """The training views, and the test views if there are any."""
-        require_folder(path, _LAYOUT)
-        if self.recognise(path) is None:
-            raise InputError(f"{path} holds {inventory(path)}", _LAYOUT, "Name the scene's own folder")
-        train = _find_views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)
-        if not (path / TEST).is_file():
-            return train, None
-        images = path / self.settings.test_folder
-        if not images.is_dir():
-            raise InputError(
-                f"{path} has {TEST} but no folder {self.settings.test_folder}",
-                "the images of the test views",
-                "Name the folder they are in with --set datamanager.test_folder=FOLDER",
-            )
-        return train, _find_views(path / TEST, images, None)
-
-    def _shots(
-        self, files: _ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
+    def _views(
+        self, transforms: Path, folder: Path, depth_folder: Path | None, prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
-        settings = self.settings
-        width, height = size_of(files.images[0])
-        focal = 0.5 * width / math.tan(0.5 * files.angle)
-        pinhole = Intrinsics(focal, focal, 0.5 * width, 0.5 * height, width, height)
-        rectification = Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
-        depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
-        shots = make_shots(
-            files.images, rectification, files.camera_to_world, files.depths, depth_format, seen or {}, prefix
-        )
+        """Frames of the poses in a JSON file, in order of their numbers, and their provenance.
+
+        There must be an image for every pose; others are counted. Either all frames have a depth file, or none.
+        """
+        settings, trajectory = self.settings, read_transforms(transforms)
+        stated = _numbers(transforms, trajectory.names_or_numbers())
+        order = sorted(range(len(stated)), key=stated.__getitem__)
+        numbers = [stated[index] for index in order]
+        files = numbered(folder, "", frozenset({".png"}))
+        for number in numbers:
+            if number not in files:
+                raise InputError(
+                    f"{transforms}: frame {number} has no image {folder / f'{number:04d}.png'}",
+                    "an image for every frame",
+                    "Restore it, or remove the frame",
+                )
+        unposed = len(files) - len(numbers)
+        if unposed:
+            log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, folder.name)
+        deep = {} if depth_folder is None else numbered(depth_folder, "", frozenset({".exr"}))
+        depths = for_all({f"frame {number}": deep.get(number) for number in numbers}, depth_folder, "a depth file")
+        images = [files[number] for number in numbers]
+        angle = {"camera_angle_x": read_json(transforms, "a transforms.json").get("camera_angle_x")}
+        lens = camera_of(angle, str(transforms), "half", lambda: size_of(images[0]))
+        rectification = self.rectification_of(lens, images[0])
+        form = ExrDepth(settings.depth_channel, settings.depth_divisor)
+        shots = make_shots(images, rectification, trajectory.camera_to_world[order], depths, form, {}, prefix)
         facts = {
             "layout": "rotatecolon",
-            "transforms": files.transforms.name,
-            "images_without_pose": files.unposed,
-            "depth_divisor": None if files.depths is None else settings.depth_divisor,
+            "transforms": transforms.name,
+            "images_without_pose": unposed,
+            "depth_divisor": settings.depth_divisor if any(depths) else None,
             **rectification.facts(),
             "pose_convention": "camera-to-world, OpenGL axes",
         }
         return shots, facts
-
-
-def _find_views(transforms: Path, images: Path, depth: Path | None) -> _ViewFiles:
-    """Find the images and depth files of the poses in a JSON file.
-
-    There must be an image for every pose; others are counted. Either all frames have a depth file, or none.
-    """
-    trajectory = read_transforms(transforms)
-    expected = "the horizontal field of view, radians, between 0 and pi"
-    content = read_json(transforms, "a transforms.json")
-    image_files = numbered(images, "", frozenset({".png"}))
-    stated = _numbers(transforms, trajectory.names_or_numbers())
-    order = sorted(range(len(stated)), key=stated.__getitem__)
-    numbers = [stated[index] for index in order]
-    for number in numbers:
-        if number not in image_files:
-            raise InputError(
-                f"{transforms}: frame {number} has no image {images / f'{number:04d}.png'}",
-                "an image for every frame",
-                "Restore it, or remove the frame",
-            )
-    unposed = len(image_files) - len(numbers)
-    if unposed:
-        log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, images.name)
-    return _ViewFiles(
-        transforms,
-        tuple(image_files[number] for number in numbers),
-        _depths(numbers, depth),
-        trajectory.camera_to_world[order],
-        read_number(content, "camera_angle_x", transforms, expected, above=0.0, below=math.pi),
-        unposed,
-    )
 
 
 def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
@@ -279,21 +232,6 @@ def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
             raise InputError(f"{transforms}: frame {number} is repeated", "one pose for each image")
         numbers.append(number)
     return numbers
-
-
-def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | None:
-    files = {} if folder is None else numbered(folder, "", frozenset({".exr"}))
-    lacking = [number for number in numbers if number not in files]
-    if folder is None or len(lacking) == len(numbers):
-        return None
-    if lacking:
-        raise InputError(
-            f"{folder} has {len(numbers) - len(lacking)} depth files for {len(numbers)} frames; frame {lacking[0]} has "
-            "none",
-            "a depth file for every image, or none at all",
-            "Restore the missing files: incomplete archives are common",
-        )
-    return tuple(files[number] for number in numbers)
 
 
 def _pink(points: PointCloud) -> PointCloud:

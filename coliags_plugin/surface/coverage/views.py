@@ -129,7 +129,7 @@ def _view(frame: Frame) -> CoverageView:
     return CoverageView(
         shot.name,
         pose,
-        rectification.stored_lens,
+        rectification.lens,
         content,
         lambda: rectification.checked(shot.image, read_rgb(shot.image)),
     )
