@@ -586,7 +586,7 @@ a rotation that is none
   json: <poses>, frame 1 \(.*\): not a rigid transform \(R\^T R is 3.*within 0\.001
   tum, colmap-text: <poses>, line \d+: a quaternion of length 2.*length 1
   colmap: images\.bin, image 4 \(0003\.png\): a quaternion of length 2.*length 1
-a quaternion of length 0 | colmap-text: is not a rotation
+a quaternion of length 0 | tum, colmap-text: line \d+: the quaternion .* is not a rotation
 a result of no rotation
   params: params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is not a rotation
 a left-handed pose
@@ -722,6 +722,10 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (lambda folder: (folder / "confidence").mkdir(), r"confidence: 0 of 11 frames have a confidence; 1305031102\."),
     ],
     "rgbd-by-order": [
+        (
+            lambda folder: shutil.copytree(folder / "depth", folder / "confidence"),
+            r"confidence/0\.png is an image of 1 channel of uint16.*255 = 1",
+        ),
         (copy("rgb/*.png", "cover.png"), r"cover\.png: no number in its name"),
         (
             lambda folder: (
@@ -734,6 +738,9 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             lambda folder: [shutil.copytree(folder / "depth", folder / "confidence"), shutil.rmtree(folder / "depth")],
             "holds confidence/, but no depth",
         ),
+    ],
+    "colmap-text": [
+        (write("sparse/0/points3D.txt", "1 hello world\n"), r"points3D\.txt, line 1: '1 hello world'"),
     ],
     "endomapper": [
         (edit("calibration.xml", "_kb4", "_fov"), r"calibration\.xml: the camera model 'calibu_fu_fv_u0_v0_fov'"),
@@ -750,6 +757,10 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (change_frames("transforms.json", fourth_without("depth_file_path")), "10 of 11 frames have a depth_file_path"),
         (confident(fourth_without("confidence_file_path")), r"10 of 11 frames have a confidence_file_path; images/f"),
         (confident(lambda index, entry: entry.pop("depth_file_path")), "confidence_file_path, but no depth_file_path"),
+        (
+            lambda folder: [confident()(folder), repaint("confidence/*.png", 2, half_size)(folder)],
+            r"confidence/frame_00003\.png is 20 x 16, but .* says 40 x 32",
+        ),
         (confident(dtype="uint16"), r"confidence/frame_00003\.png is an image of 1 channel of uint16.*255 = 1"),
         (change_json("transforms.json", camera_model="PANORAMA"), "camera_model is PANORAMA"),
         (change_json("transforms.json", k4=0.1), "OPENCV with k4 = 0.1"),

@@ -20,16 +20,13 @@ from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
 from coliags_plugin.datamanagers.c3vd_v2.reader import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
-from coliags_plugin.datamanagers.reading.files import read_intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.c3vd import depth_steps
 from tests.datamanagers.kinds import write
 from tests.datamanagers.wall_scenes import (
-    PINHOLE,
     colors,
     manager,
     names,
-    off_wall,
     video,
     worst_off_wall,
     write_undistorted,
@@ -299,8 +296,3 @@ def test_a_folder_of_something_else(tmp_path):
         write(f"{index}.txt", "")(tmp_path)
     with pytest.raises(InputError, match=r"holds 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 4 more"):
         load(tmp_path)
-
-
-def test_a_written_scene_is_read_back(undistorted):
-    assert read_intrinsics(undistorted / "camera.json") == PINHOLE
-    assert off_wall(load(undistorted).points.positions.numpy()).max() < 0.002

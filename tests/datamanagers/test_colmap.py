@@ -244,17 +244,6 @@ def test_points_are_initial_points_in_their_colours(wall, walls):
     assert written.compute_mean_reprojection_error() < 1e-3
 
 
-def test_text_is_binary(walls):
-    one, other = (read_model(walls(name) / "sparse/0") for name in ("colmap", "colmap-text"))
-    assert [image.name for image in one.images] == [image.name for image in other.images]
-    assert one.cameras == other.cameras
-    for name in ("camera_to_world", "positions", "colors", "track_lengths"):
-        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-12, atol=1e-12)
-    for first, second in zip(one.images, other.images, strict=True):
-        np.testing.assert_allclose(first.observed, second.observed, rtol=1e-12)
-        np.testing.assert_array_equal(first.points, second.points)
-
-
 def test_scale_makes_millimetres(tmp_path):
     write_colmap(tmp_path, unit=25.0)
     raw, metric = load(tmp_path), load(tmp_path, scale=25.0)
@@ -392,15 +381,6 @@ def test_binary_goes_before_text_and_images_may_be_elsewhere(mine, tmp_path):
 
 
 # What is refused besides
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_lines_of_rubbish_are_refused(tmp_path, name):
-    write_colmap(tmp_path, names=NAMES[:2], text=True)
-    with (tmp_path / f"sparse/0/{name}.txt").open("a") as file:
-        file.write("1 hello world\n")
-    with pytest.raises(InputError, match=r"sparse/0"):
-        opened(tmp_path)
 
 
 def test_cameras_that_are_none(mine, tmp_path):

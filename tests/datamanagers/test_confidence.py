@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, concatenate_targets
 from coliags_plugin.datamanagers.reading.images import resize_nearest
 from coliags_plugin.datamanagers.recognition import find_format
@@ -86,20 +85,6 @@ def test_initial_points_are_fused_from_trusted_depth(folder):
     known = {frame.index: torch.isfinite(frame.depth).numpy() for frame in scene.train}
     trusted = {index: pixels & (stored(index) >= 128) if index != 1 else pixels for index, pixels in known.items()}
     assert len(scene.points) == sum(pixels.sum() for pixels in trusted.values())
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8), r"confidence/\S*\.png is 20 x 16, but .* says 40 x 32"),
-        (np.zeros((HEIGHT, WIDTH), np.uint16), r"confidence/\S*\.png is an image of 1 channel of uint16.*255 = 1"),
-        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), r"confidence/\S*\.png is an image of 3 channels"),
-    ],
-)
-def test_another_size_or_kind_of_image(folder, values, said):
-    cv2.imwrite(str(files(folder, "confidence/*.png")[2]), values)
-    with pytest.raises(InputError, match=said):
-        load(folder)
 
 
 def test_targets_have_the_confidence_of_their_pixels():

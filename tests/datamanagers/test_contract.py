@@ -101,6 +101,10 @@ def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
         off = np.abs(frame.image.numpy().astype(int) - color)
         assert off.max() <= (14 if kind.is_undistorted else 0) and off.mean() < 1.2
         assert (frame.depth is not None) == bool(kind.depths)
+        assert (frame.sparse_depth is not None) == (kind.format == "colmap")
+        if frame.sparse_depth is not None:
+            column, row = frame.sparse_depth.pixels.floor().long().unbind(1)
+            np.testing.assert_allclose(frame.sparse_depth.depth, depth[row, column], atol=0.5)
         if frame.depth is not None:
             assert frame.depth.dtype == torch.float32
             difference = np.abs(frame.depth.numpy() - depth)

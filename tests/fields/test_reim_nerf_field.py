@@ -222,32 +222,6 @@ def test_without_the_lamp_the_method_is_nerf(tmp_path):
     assert math.isfinite(plain.take_step()["loss"])
 
 
-def test_a_run_resumes_to_the_bit_and_renders_alike_twice(tmp_path):
-    straight, broken = (trainer(tmp_path / name) for name in ("straight", "broken"))
-    for run in (straight, broken):
-        run.start()
-    rows = [straight.take_step() for _ in range(6)]
-    for _ in range(3):
-        broken.take_step()
-    broken.save()
-    resumed = trainer(tmp_path / "broken")
-    resumed.resume()
-    again = [resumed.take_step() for _ in range(3)]
-    assert again == rows[3:]
-    ours, theirs = straight.model.state_dict(), resumed.model.state_dict()
-    assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in ours)
-    camera = wall_scene().train[0].camera
-    with torch.no_grad():
-        first, second = (model.render(camera, ("depth_accumulated",)) for model in (straight.model, resumed.model))
-    assert torch.equal(first.rgb, second.rgb)
-    assert torch.equal(first["depth_accumulated"], second["depth_accumulated"])
-    # Chance comes in: another state of the generator, another step.
-    other = trainer(tmp_path / "broken")
-    other.resume()
-    other.generators["rendering"].manual_seed(5)
-    assert other.take_step()["loss"] != rows[3]["loss"]
-
-
 def test_noise_and_jitter_are_of_training_alone(tmp_path):
     even = ["renderer.jitter=false", "field.render_precision=float32"]
     run = trainer(tmp_path / "run", even)

@@ -103,18 +103,10 @@ def test_one_message_names_every_fault(tmp_path):
         assert fault in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* not a rotation"),
-        ({"gt_w2c_all_frames": 2.0 * winding(FRAMES).camera_to_world}, "gt_w2c_all_frames, frame 0: not a rigid"),
-        ({"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0)),
-          "gt_w2c_all_frames": np.ones((0, 4, 4))}, "no frames"),
-    ],
-)  # fmt: skip
-def test_poses_that_are_none(tmp_path, changes, message):
-    with pytest.raises(InputError, match=message):
-        endogslam.read_params(saved(tmp_path / "params.npz", **changes))
+def test_no_poses_at_all(tmp_path):
+    nothing = {"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0))}
+    with pytest.raises(InputError, match="no frames"):
+        endogslam.read_params(saved(tmp_path / "params.npz", **nothing, gt_w2c_all_frames=np.ones((0, 4, 4))))
 
 
 @pytest.mark.parametrize(

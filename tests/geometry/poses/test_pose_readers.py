@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -68,23 +67,6 @@ def test_tum_is_camera_to_world_with_w_last(tmp_path):
     np.testing.assert_allclose(read.rotations[0], QUARTER, atol=1e-15)
     np.testing.assert_array_equal(read.centers[0], [1, 2, 3])
     assert read.timestamps.tolist() == [3.5]
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is not a rotation"),
-        ([1, 1, 2, 3, 0, 0, 0, 1.01], "line 4: a quaternion of length 1.01. Expected length 1 within 0.001"),
-        ([1, 1, 2, 3, 0, 0, 1], "line 4: '1.0 1.0 2.0 3.0 0.0 0.0 1.0'. Expected 8 finite numbers"),
-        ([1, np.nan, 2, 3, 0, 0, 0, 1], "line 4: .*nan"),
-    ],
-)
-def test_tum_refusals_name_the_line(tmp_path, row, message):
-    path = tum_file(tmp_path / "poses", [[0, 1, 2, 3, 0, 0, 0, 1.0005], row])
-    with pytest.raises(InputError, match=f"{re.escape(str(path))}, {message}"):
-        tum.read(path)
-    with pytest.raises(InputError, match="holds no poses"):
-        tum.read(tum_file(path, []))
 
 
 def test_c3vd_is_written_column_by_column(tmp_path):
@@ -175,10 +157,9 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
     assert nerfstudio.read(path).remarks == ("no intrinsics: the images have 2 different cameras",)
 
 
-def frames(*matrices, names="abc", **content):
-    """The content of a file with frames of these names and matrices."""
-    rows = [{"file_path": name, "transform_matrix": matrix} for name, matrix in zip(names, matrices, strict=False)]
-    return {**content, "frames": rows}
+def frames(matrix, **content):
+    """The content of a file with a frame of this matrix."""
+    return {**content, "frames": [{"file_path": "a", "transform_matrix": matrix}]}
 
 
 IDENTITY = np.eye(4).tolist()
@@ -187,26 +168,18 @@ IDENTITY = np.eye(4).tolist()
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "is not JSON"),
         ([1], "holds a JSON list"),
-        ({}, "has no frames"),
-        (frames(), "has no frames"),
         ({"frames": [3]}, "frame 0: no file_path"),
-        ({"frames": [{"file_path": "a"}]}, r"frame 0 \(a\): transform_matrix is missing"),
         (frames([[1, 2], [3]]), "4 .or 3. rows of 4 finite numbers"),
-        (frames([[np.nan, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "is nan in row 0, column 0"),
-        (frames(IDENTITY, np.diag([1.1, 1, 1, 1]).tolist()), r"frame 1 \(b\): not a rigid transform"),
-        (frames(IDENTITY, IDENTITY, names="aa"), r"'a' is repeated \(poses 0 and 1\)"),
-        (frames(IDENTITY, applied_transform=np.diag([1, 2, 1, 1]).tolist()[:3]), "applied_transform: not a rigid"),
         (frames(IDENTITY, applied_transform="x"), "applied_transform is not a matrix"),
         (frames(IDENTITY, applied_scale=0), "applied_scale is 0"),
         (frames(IDENTITY, applied_scale=True), "applied_scale is True"),
-        (frames(IDENTITY, **{**PINHOLE, "fl_x": "long"}), "fl_x is 'long'"),
         (frames(IDENTITY, **{**PINHOLE, "w": 0}), "t.json: intrinsics .* image 0 x 48"),
     ],
 )
 def test_broken_transforms_are_refused(tmp_path, content, message):
-    (tmp_path / "t.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    """Besides those of :data:`tests.datamanagers.kinds.SAID`."""
+    (tmp_path / "t.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=message):
         nerfstudio.read(tmp_path / "t.json")
 
