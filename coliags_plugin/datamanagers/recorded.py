@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import shlex
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +24,7 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import parallel_map
-from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name, with_valid_seen_masks
+from coliags_plugin.datamanagers.recording import Recording, Shot, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.splits import Split, divide
@@ -105,11 +106,11 @@ class RecordedDataManager(DataManager):
         path, settings = Path(path), self.settings
         recording = self.open(path)
         train_indices, test_indices = self._split(recording, path)
-        recording = with_valid_seen_masks(recording, self.seen_split, train_indices, test_indices, path)
-        train = self._frames(recording.shots, train_indices)
-        test_sets = {"test": self._frames(recording.shots, test_indices)} if test_indices else {}
+        seen = self._valid_seen_masks(recording, train_indices, test_indices, path)
+        train = self._frames(recording.shots, train_indices, {})
+        test_sets = {"test": self._frames(recording.shots, test_indices, seen.get("video", {}))} if test_indices else {}
         for name, shots in recording.test_sets.items():
-            test_sets[name] = self._frames(shots, range(len(shots)))
+            test_sets[name] = self._frames(shots, range(len(shots)), seen.get(name, {}))
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
@@ -157,8 +158,25 @@ class RecordedDataManager(DataManager):
             log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
 
-    def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[StoredFrame]:
-        return [StoredFrame(shots[index], index, self.settings.keep_pixels) for index in indices]
+    def _valid_seen_masks(
+        self, recording: Recording, train: Sequence[int], test: Sequence[int], path: Path
+    ) -> Mapping[str, Mapping[int, Path]]:
+        """The seen masks if the run trains on the frames they were made for; none else."""
+        meant, _ = divide(self.seen_split, range(len(recording.shots)), recording.own_split)
+        if set(meant) == set(train):
+            return recording.seen
+        if (test or recording.test_sets) and any(recording.seen.values()):
+            log.warning(
+                "%s: seen masks are for split '%s' of all frames; this run trains on other frames, so metrics on seen "
+                "pixels are unavailable",
+                path,
+                self.seen_split,
+            )
+        return {}
+
+    def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen: Mapping[int, Path]) -> list[StoredFrame]:
+        keep = self.settings.keep_pixels
+        return [StoredFrame(replace(shots[index], seen=seen.get(index)), index, keep) for index in indices]
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
         """Indices of training frames and of test frames."""

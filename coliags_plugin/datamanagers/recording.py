@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.files import numbered
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 
 log = logging.getLogger(__name__)
@@ -35,7 +33,7 @@ class Shot:
     depth: Path | None = None
     depth_format: DepthFormat | None = None
     mask: Path | None = None  # black pixels are ignored
-    seen: Path | None = None  # not black where training frames see the same surface
+    seen: Path | None = None  # not black where training frames see the same surface; set where a scene is loaded
     sparse_depth: SparseDepth | None = None  # at single points of the working image
     confidence: Path | None = None  # 8-bit grey, of the depth file's size: how far depth can be trusted, 255 = 1
 
@@ -46,15 +44,12 @@ def make_shots(
     camera_to_world: Float[np.ndarray, "N 4 4"],
     depths: Sequence[Path | None] | None,
     depth_format: DepthFormat | None,
-    seen: Mapping[int, Path],
     prefix: str = "",
 ) -> list[Shot]:
-    """Frames of one camera, named by their image files behind ``prefix``; ``seen`` are seen masks by frame index."""
+    """Frames of one camera, named by their image files behind ``prefix``."""
     return [
-        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=seen.get(index))
-        for index, (image, pose, depth) in enumerate(
-            zip(images, camera_to_world, depths or (None,) * len(images), strict=True)
-        )
+        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format)
+        for image, pose, depth in zip(images, camera_to_world, depths or (None,) * len(images), strict=True)
     ]
 
 
@@ -70,12 +65,10 @@ class Recording:
     own_split: Mapping[str, Sequence[int]] | None = None  # the dataset's: "train" and "test" indices into ``shots``
     own_points: Callable[[], PointCloud] | None = None  # reads the dataset's initial points; None where there are none
     points_source: Path | None = None  # the file or folder of these points
+    #: Seen masks by frame index: of ``shots`` under "video", and of test sets by their names.
+    seen: Mapping[str, Mapping[int, Path]] = field(default_factory=dict)
     #: Indices into ``shots`` of the images that "depth", or "points" with their depth, were made from, where known.
     made_from: Mapping[str, Collection[int]] = field(default_factory=dict)
-
-
-#: Bytes read at once.
-_BLOCK = 1 << 20
 
 
 def portable_name(path: Path, folder: Path) -> str:
@@ -86,23 +79,17 @@ def portable_name(path: Path, folder: Path) -> str:
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
     """SHA-256 of the names and sizes of large files and the contents of small ones."""
     digest = hashlib.sha256()
-    for path in filter(None, large):
-        with _readable(path):
-            size = path.stat().st_size
-        digest.update(f"{portable_name(path, folder)} {size}\n".encode("utf-8", "surrogateescape"))
-    for path in filter(None, small):
-        with _readable(path), path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
-    return digest.hexdigest()
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
     try:
-        yield
+        for path in filter(None, large):
+            named = f"{portable_name(path, folder)} {path.stat().st_size}\n"
+            digest.update(named.encode("utf-8", "surrogateescape"))
+        for path in filter(None, small):
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable file", "Restore it") from error
+    return digest.hexdigest()
 
 
 def poses_of_images(file: Path, images: int) -> C3vdPoses:
@@ -122,7 +109,7 @@ ROTATION = "rotation"
 
 
 def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, Path]:
-    """Seen masks ``seen/NNNN_seen.png`` in ``path``, by frame index; :func:`with_valid_seen_masks` checks the split.
+    """Seen masks ``seen/NNNN_seen.png`` in ``path``, by frame index.
 
     ``complete`` tells whether the frames are all images of the dataset. Masks are numbered by image, so that they do
     not match frames where images are left out.
@@ -141,31 +128,3 @@ def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, 
             do = "Restore the missing frames, or remove the file"
             raise InputError(f"{mask}, but there are {count} frames", f"numbers below {count}", do)
     return masks
-
-
-def with_valid_seen_masks(
-    recording: Recording, split: Split, train: Collection[int], test: Collection[int], path: Path
-) -> Recording:
-    """Keep the seen masks of test frames if the run trains on the frames they were made for, else drop all.
-
-    ``split`` of all frames is what the masks refer to; ``train`` and ``test`` are indices of the run's frames.
-    """
-    meant, _ = divide(split, range(len(recording.shots)), recording.own_split)
-    trained = set(train)
-    if set(meant) == trained:
-        shots = [_without_seen(shot) if index in trained else shot for index, shot in enumerate(recording.shots)]
-        return replace(recording, shots=shots)
-    tested = bool(test or recording.test_sets)
-    if tested and any(shot.seen for shots in (recording.shots, *recording.test_sets.values()) for shot in shots):
-        log.warning(
-            "%s: seen masks are for split '%s' of all frames; this run trains on other frames, so metrics on seen "
-            "pixels are unavailable",
-            path,
-            split,
-        )
-    test_sets = {name: [*map(_without_seen, shots)] for name, shots in recording.test_sets.items()}
-    return replace(recording, shots=[*map(_without_seen, recording.shots)], test_sets=test_sets)
-
-
-def _without_seen(shot: Shot) -> Shot:
-    return shot if shot.seen is None else replace(shot, seen=None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,8 @@ def reads(monkeypatch):
 
 
 def frame_of(folder: Path, index: int, keep: bool = True) -> StoredFrame:
-    return StoredFrame(manager("c3vd").open(folder).shots[index], index, keep)
+    recording = manager("c3vd").open(folder)
+    return StoredFrame(replace(recording.shots[index], seen=recording.seen["video"].get(index)), index, keep)
 
 
 def load(folder: Path, **options) -> Scene:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -66,12 +65,12 @@ class SequenceDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         files = self.find(path)
-        shots, facts = self._shots(files, find_seen_masks(path / "truth", len(files.images)))
-        test_sets = {}
+        shots, facts = self._shots(files)
+        test_sets, seen = {}, {"video": find_seen_masks(path / "truth", len(shots))}
         if (path / ROTATION).is_dir():
             rotation = self.find(path / ROTATION)
-            seen = find_seen_masks(path / ROTATION, len(rotation.images))
-            test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, seen, f"{ROTATION}-")
+            test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, f"{ROTATION}-")
+            seen[ROTATION] = find_seen_masks(path / ROTATION, len(rotation.images))
         points = path / POINTS_FILE
         return Recording(
             kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
@@ -81,6 +80,7 @@ class SequenceDataManager(RecordedDataManager):
             test_sets=test_sets,
             own_points=(lambda: load_points(points)) if points.is_file() else None,
             points_source=points,
+            seen=seen,
         )
 
     def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
@@ -89,12 +89,10 @@ class SequenceDataManager(RecordedDataManager):
         shows = octagon_mask(lens.width, lens.height) if mask else None
         return self.rectification_of(lens, image, shows)
 
-    def _shots(
-        self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
-    ) -> tuple[list[Shot], dict[str, Any]]:
+    def _shots(self, files: SequenceFiles, prefix: str = "") -> tuple[list[Shot], dict[str, Any]]:
         poses = poses_of_images(files.poses, len(files.images))
         rectification, described = self.rectification(files)
-        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, C3VD_DEPTH, seen, prefix)
+        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, C3VD_DEPTH, prefix)
         facts: dict[str, Any] = {
             "layout": files.kind,
             **described,

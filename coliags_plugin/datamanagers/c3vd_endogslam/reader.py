@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -53,19 +53,15 @@ SAME_SEQUENCE = 0.05
 LOST = 0.2
 
 
-@dataclass(frozen=True)
-class PreparedFiles:
-    """The files of one sequence, frame 0 first.
-
-    ``params`` is EndoGSLAM's result, ``cloud`` the optimised Gaussians of PR-Endo's release.
-    """
+class PreparedFiles(NamedTuple):
+    """The files of one sequence, frame 0 first."""
 
     folder: Path
     images: tuple[Path, ...]
     depths: tuple[Path, ...] | None
     poses: Path | None
-    params: Path | None
-    cloud: Path | None
+    params: Path | None  # EndoGSLAM's result
+    cloud: Path | None  # the optimised Gaussians of PR-Endo's release
 
 
 @dataclass(frozen=True)
@@ -81,20 +77,6 @@ class SequencePoses:
     facts: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class _Slam:
-    """EndoGSLAM's trajectory aligned with the true one.
-
-    ``indices`` are the image indices of its F poses; ``from_true`` transforms from the true poses, relative to their
-    first camera, to EndoGSLAM's world.
-    """
-
-    params: EndoGslamParams
-    indices: Int[np.ndarray, "F"]
-    from_true: Float[np.ndarray, "4 4"]
-    facts: Mapping[str, Any]
-
-
 def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> SequencePoses:
     """Load the poses of a sequence's images; ``params`` are the contents of ``files.params``.
 
@@ -103,44 +85,51 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
     """
     count = len(files.images)
     file = None if files.poses is None else poses_of_images(files.poses, count)
-    slam = None if params is None else _align_slam(files, params, file)
+    indices, from_true, slam = (None, None, None) if params is None else _align_slam(files, params, file)
     facts: dict[str, Any] = {
         "poses": source,
         "pose_convention": None if file is None else {"order": file.convention, **file.evidence},
-        "slam": None if slam is None else slam.facts,
+        "slam": slam,
     }
-    if source == "slam" and slam is None:
+    if source == "slam" and params is None:
         raise InputError(
             f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
             "EndoGSLAM's result, for option poses: slam",
             "Name it with --set datamanager.params_file=FILE, or --set datamanager.poses=ground-truth",
         )
-    tracked = slam is not None and len(slam.indices) == count
-    if file is None and not tracked:
-        has = "" if slam is None else f", and {files.params} poses of {len(slam.indices)} of {count} images alone"
+    tracked = 0 if indices is None else len(indices)
+    if file is None and tracked != count:
+        has = f", and {files.params} poses of {tracked} of {count} images alone" if tracked else ""
         raise InputError(
             f"{files.folder} has no pose.txt{has}",
             "a pose for every image",
             "Put the sequence's pose.txt of C3VD's release there",
         )
-    if source == "slam" and slam is not None:
-        camera_to_world, from_file = slam.params.camera_to_world, None
+    if source == "slam" and params is not None:
+        camera_to_world, from_file = params.camera_to_world, None
         if file is not None:
-            from_file = slam.from_true @ _inverse(file.camera_to_world[0])
-            if not tracked:
+            from_file = from_true @ _inverse(file.camera_to_world[0])
+            if tracked != count:
                 camera_to_world = from_file @ file.camera_to_world
-                camera_to_world[slam.indices] = slam.params.camera_to_world
+                camera_to_world[indices] = params.camera_to_world
         return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
-    from_slam = None if slam is None else _inverse(slam.from_true)
+    from_slam = None if from_true is None else _inverse(from_true)
     if file is None:
-        assert slam is not None  # as tracked says
-        return SequencePoses(slam.params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
+        assert params is not None  # as tracked says
+        return SequencePoses(params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
     if from_slam is not None:
         from_slam = file.camera_to_world[0] @ from_slam
     return SequencePoses(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
 
 
-def _align_slam(files: PreparedFiles, params: EndoGslamParams, file: C3vdPoses | None) -> _Slam:
+def _align_slam(
+    files: PreparedFiles, params: EndoGslamParams, file: C3vdPoses | None
+) -> tuple[Int[np.ndarray, "F"], Float[np.ndarray, "4 4"], dict[str, Any]]:
+    """Align EndoGSLAM's trajectory with the true one.
+
+    Returns image indices of its poses, the transform to its world from that of the true poses, relative to their first
+    camera, and provenance.
+    """
     path, count, poses = files.params, len(files.images), len(params.camera_to_world)
     indices = image_indices(poses, count)
     if indices is None:
@@ -176,7 +165,7 @@ def _align_slam(files: PreparedFiles, params: EndoGslamParams, file: C3vdPoses |
         "ate_max_mm": float(errors.max()),
         "mean_rotation_error_deg": float(angles.mean()),
     }
-    return _Slam(params, indices, from_true, facts)
+    return indices, from_true, facts
 
 
 def _compared(
@@ -289,11 +278,11 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             "depth_step_mm": None if depth_format is None else depth_format.size,
             **rectification.facts(),
         }
-        seen = find_seen_masks(folder / "truth", len(files.images))
-        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, depth_format, seen)
-        test_sets = {}
+        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, depth_format)
+        test_sets, seen = {}, {"video": find_seen_masks(folder / "truth", len(shots))}
         if (folder / ROTATION).is_dir():
             test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, poses)
+            seen[ROTATION] = find_seen_masks(folder / ROTATION, len(test_sets[ROTATION]))
         points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
         return Recording(
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
@@ -305,6 +294,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             test_sets=test_sets,
             own_points=None if points_source is None else lambda: _map_points(files.cloud, params, poses),
             points_source=points_source or folder / PARAMS,
+            seen=seen,
         )
 
     def _rectification(self, files: PreparedFiles, params: EndoGslamParams | None) -> Rectification:
@@ -339,11 +329,8 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 f"Add it, or move {folder.name} away",
             )
         rotation = poses_of_images(files.poses, len(files.images)).camera_to_world
-        seen = find_seen_masks(folder, len(files.images))
-        camera_to_world, depth_format = poses.from_file @ rotation, _depth_format(files)
-        return make_shots(
-            files.images, rectification, camera_to_world, files.depths, depth_format, seen, f"{ROTATION}-"
-        )
+        camera_to_world, form = poses.from_file @ rotation, _depth_format(files)
+        return make_shots(files.images, rectification, camera_to_world, files.depths, form, f"{ROTATION}-")
 
 
 def _depth_format(files: PreparedFiles) -> DepthSteps | None:

@@ -273,8 +273,7 @@ class ColmapDataManager(RecordedDataManager):
                     depth,
                     None if depth is None else depth_format(depth, settings.depth_unit / FACTORS[unit]),
                     masks[index],
-                    seen.get(index),
-                    sparse,
+                    sparse_depth=sparse,
                 )
             )
         kinds = sorted({lens.model for lens in model.cameras.values()})
@@ -305,6 +304,7 @@ class ColmapDataManager(RecordedDataManager):
             fingerprint=fingerprint(path, [*paths, *masks, *depths], model.files),
             own_points=own_points if len(model.positions) else None,
             points_source=model.files[-1],
+            seen={"video": seen},
             made_from={"points": [index for index, image in enumerate(model.images) if len(image.points)]},
         )
 

@@ -272,7 +272,6 @@ class NerfstudioDataManager(RecordedDataManager):
                 depth,
                 None if depth is None else depth_format(depth, depth_unit),
                 masks[index],
-                seen.get(index),
                 confidence=confidences[index],
             )
             for index, (short, depth) in enumerate(zip(reading.short_names(transforms.names), depths, strict=True))
@@ -305,6 +304,7 @@ class NerfstudioDataManager(RecordedDataManager):
             made_from=transforms.made_from(),
             own_points=own_points,
             points_source=source,
+            seen={"video": seen},
         )
 
     def _depth_unit(self, transforms: Transforms, unit: Unit) -> float:

@@ -154,9 +154,8 @@ class ReimNerfDataManager(RecordedDataManager):
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
         rectification = self.rectification_of(lens, file, shows)
         form = RayDistance(distmap_scale / 65535.0 / scale, rectification.nearest(ray_cosines(lens)))
-        seen = find_seen_masks(path / "truth", len(frames))
         images, poses = [frames[name][0] for name in names], np.stack([frames[name][2] for name in names])
-        shots = make_shots(images, rectification, poses, distances, form, seen)
+        shots = make_shots(images, rectification, poses, distances, form)
         reading.warn_of_unposed(path, reading.unposed_images(images, distances))
         large = [file for pair in zip(images, distances, strict=True) for file in pair]
         facts: dict[str, Any] = {
@@ -178,6 +177,7 @@ class ReimNerfDataManager(RecordedDataManager):
             facts=facts,
             fingerprint=fingerprint(path, large, (*files.values(), mask)),
             own_split={"train": parts["train"], "test": parts.get("true_test", ())},
+            seen={"video": find_seen_masks(path / "truth", len(frames))},
         )
 
 

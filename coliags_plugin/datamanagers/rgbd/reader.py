@@ -140,10 +140,9 @@ class RGBDDataManager(RecordedDataManager):
                 depth,
                 form,
                 mask=masks.get(image.stem),
-                seen=seen.get(index),
                 confidence=confidences.get(image.stem),
             )
-            for index, (image, depth, pose) in enumerate(rows)
+            for image, depth, pose in rows
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
@@ -174,6 +173,7 @@ class RGBDDataManager(RecordedDataManager):
             if points is None
             else partial(_read_mesh_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
+            seen={"video": seen},
         )
 
     def _is_by_time(self, images: Sequence[Path]) -> bool:

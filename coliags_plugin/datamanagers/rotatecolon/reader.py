@@ -6,7 +6,7 @@ import io
 import logging
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -159,12 +159,10 @@ class RotateColonDataManager(RecordedDataManager):
             parts.append(self._views(test, images, None, "test-"))
         (shots, facts), *others = parts
         complete = not any(part["images_without_pose"] for _, part in parts)
-        test_sets = {}
-        for views, described in others:
-            name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
-            seen = find_seen_masks(path / "truth", len(views), complete)
-            test_sets[name] = [replace(shot, seen=seen.get(index)) for index, shot in enumerate(views)]
-            facts[name] = described
+        test_sets, seen = {}, {}
+        name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
+        for test_sets[name], facts[name] in others:
+            seen[name] = find_seen_masks(path / "truth", len(test_sets[name]), complete)
         points = path / POINTS
         known = points if points.is_file() else None
         pixels = (file for views, _ in parts for file in (*[v.image for v in views], *[v.depth for v in views]))
@@ -177,6 +175,7 @@ class RotateColonDataManager(RecordedDataManager):
             own_split={"train": range(len(shots)), "test": ()},
             own_points=None if known is None else lambda: _pink(load_points(points)),
             points_source=points,
+            seen=seen,
         )
 
     def _views(
@@ -208,7 +207,7 @@ class RotateColonDataManager(RecordedDataManager):
         lens = camera_of(angle, str(transforms), "half", lambda: size_of(images[0]))
         rectification = self.rectification_of(lens, images[0])
         form = ExrDepth(settings.depth_channel, settings.depth_divisor)
-        shots = make_shots(images, rectification, trajectory.camera_to_world[order], depths, form, {}, prefix)
+        shots = make_shots(images, rectification, trajectory.camera_to_world[order], depths, form, prefix)
         facts = {
             "layout": "rotatecolon",
             "transforms": transforms.name,
