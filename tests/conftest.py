@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 from collections.abc import Callable
@@ -23,6 +24,12 @@ from tests.scenes import write_wall
 torch.set_num_threads(1)  # as many processes run as there are CPUs, and the order of sums depends on it
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_collection_finish():
+    """Keep the modules and tests loaded by now out of garbage collections, which would visit a million objects each."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

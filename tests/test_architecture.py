@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -42,9 +43,15 @@ SOURCES = {
 }
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports(path: Path, top_level_only: bool = False) -> set[str]:
     """Every module that a file imports, absolute: at the top, within functions, and for type checkers alone."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     found = set()
     for node in tree.body if top_level_only else ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -58,11 +65,10 @@ def imports(path: Path, top_level_only: bool = False) -> set[str]:
     return found
 
 
+@cache
 def targets(path: Path) -> set[str]:
     """Modules of this package that a file names in strings, ``"module:Class"``, for them to be imported later."""
-    constants = (
-        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Constant)
-    )
+    constants = (node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Constant))
     texts = {node.value for node in constants if isinstance(node.value, str)}
     return {text.partition(":")[0] for text in texts if ":" in text} & set(SOURCES)
 
@@ -130,7 +136,7 @@ def test_habits():
     faults = []
     for name in components():
         text = SOURCES[name].read_text(encoding="utf-8")
-        nodes = list(ast.walk(ast.parse(text)))
+        nodes = list(ast.walk(tree_of(SOURCES[name])))
         calls = {node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
         bare = any(isinstance(node, ast.ExceptHandler) and node.type is None for node in nodes)
         seeded = "manual_seed(" in re.sub(r"Generator\([^)]*\)\.manual_seed\(", "", text)

@@ -398,8 +398,8 @@ class SurfelPipeline(Pipeline):
     constant_images: ClassVar[tuple[str, ...]] = ()
     first_channel: ClassVar[int] = surfel_layout.CHANNELS
     first_channel_sum: ClassVar[int] = surfel_layout.SUM_CHANNELS
-    feature_channels: ClassVar[int] = surfel_layout.ROW_CHANNELS
-    feature_images: ClassVar[tuple[str, ...]] = ("rgb", "normals")
+    feature_channels: ClassVar[int] = 3  # as colours alone, whose kernels serve
+    feature_images: ClassVar[tuple[str, ...]] = ("rgb",)
     feature_own: ClassVar[surfel_layout.Measures] = surfel_layout.NOTHING
 
     def _main_layer(self) -> Layer:

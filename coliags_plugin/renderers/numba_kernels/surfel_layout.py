@@ -54,7 +54,7 @@ SUM_CF = 8
 SUM_DX = 9
 SUM_DY = 10
 SUM_CHANNELS = 11
-#: Channels whose sums are among the sixteen; so many feature channels are composited at a time.
+#: Channels whose sums are among the sixteen.
 ROW_CHANNELS = layout.ROW - SUM_CHANNELS
 
 
@@ -71,5 +71,5 @@ class Measures(NamedTuple):
     distortion: tuple[object, ...]
 
 
-#: Of a sweep over feature channels.
+#: Measures of a sweep over feature channels.
 NOTHING = Measures((), (), (), ())
