@@ -196,7 +196,7 @@ def test_commands_parse(page, command, monkeypatch, capsys):
     ):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
-        overrides = [*format_of_page, *found.set]
+        overrides = [*format_of_page, *(found.settings if isinstance(found, TrainCommand) else found.set)]
         assert load_method(found.method, overrides).config
     if isinstance(found, PhantomCommand):
         made = []

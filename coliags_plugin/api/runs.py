@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.options import (
+    CoverageOptions,
+    EvaluateOptions,
+    ExportOptions,
+    MeshOptions,
+    PageOptions,
+    RenderOptions,
+    bytes_of,
+    takes,
+)
 from coliags_plugin.engine.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -17,7 +28,6 @@ if TYPE_CHECKING:
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
-    from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.export.baking.exporting import Exported
     from coliags_plugin.export.viewer.live import Viewer
@@ -119,17 +129,9 @@ class Run:
             self._loaded = kept = load_trained(self.path, device, self.data)
         return kept
 
-    def evaluate(
-        self, protocol: str | None = None, *, truth: str | Path | None = None, refine_poses: bool = False
-    ) -> Result:
+    @takes(EvaluateOptions)
+    def evaluate(self, options: EvaluateOptions) -> Result:
         """Evaluate the run on its held-out frames, writing ``eval/PROTOCOL/`` in its folder.
-
-        Args:
-            protocol: Name of a protocol; None: the method config's.
-            truth: Folder of a scene of the same frames and poses with true depth, to evaluate a run that was trained on
-                estimated depth; writes ``eval/PROTOCOL-truth/``.
-            refine_poses: Also measure views from poses refined on the held-out images themselves, as
-                ``psnr_pose_refined`` (docs/protocols.md).
 
         Raises:
             InputError: See :meth:`load`; the protocol is unknown, no frame is held out, the run was relit, or ``truth``
@@ -139,8 +141,9 @@ class Run:
         from coliags_plugin.results.reading import RESULT_FILE, read_result
 
         trained = self.load()
-        other = None if truth is None else _scene_of_size(Path(truth), trained.scene)
-        folder = evaluator.evaluate(trained, protocol or trained.config.protocol, other, refine_poses)
+        other = None if options.truth is None else _scene_of_size(options.truth, trained.scene)
+        protocol = options.protocol or trained.config.protocol
+        folder = evaluator.evaluate(trained, protocol, other, options.refine_poses)
         return read_result(folder / RESULT_FILE)
 
     def frame_names(self, frames: str = "test") -> list[str]:
@@ -173,67 +176,21 @@ class Run:
 
         return view_of(self.load(), frame, depth, outputs)
 
-    def write_renders(
-        self,
-        output: str | Path | None = None,
-        frames: str = "test",
-        *,
-        video: bool = True,
-        fps: float = 15.0,
-        channels: Sequence[str] = (),
-        depth_kind: DepthKind = "expected",
-        depth_tiff: bool = False,
-        along: str | Path | None = None,
-        overwrite: bool = False,
-    ) -> Path:
-        """Write colour, depth and error images of a set of frames, and a video along the trajectory.
-
-        Args:
-            output: Folder to make; None: in the run folder ``renders``, relit ``relit``, along a path ``path``.
-            frames: See :meth:`frame_names`.
-            video: Also write ``trajectory.mp4``, rgb beside depth.
-            fps: Frames per second of the video.
-            channels: Feature channels to write as images too.
-            depth_kind: ``accumulated``, ``expected`` or ``median`` (docs/conventions.md 3).
-            depth_tiff: Also write depth as float32 TIFF, scene units.
-            along: File of a camera path, as the browser view saves it (docs/viewer.md 6): its video alone is written.
-            overwrite: Replace the folder where it exists.
-
-        Returns:
-            The folder.
+    @takes(RenderOptions)
+    def write_renders(self, options: RenderOptions) -> Path:
+        """Write colour, depth and error images of a set of frames, and a video along the trajectory; their folder.
 
         Raises:
             InputError: See :meth:`load`; no such frames or channel; the file is no camera path; or the folder exists or
                 cannot be written.
         """
-        from coliags_plugin.engine.camera_path import CameraPath
         from coliags_plugin.engine.rendering import render_run
 
-        path = None if along is None else CameraPath.read(Path(along))
-        trained = self.load()
-        name = "path" if path is not None else "relit" if trained.relit else "renders"
-        folder = Path(output) if output is not None else self.path / name
-        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, path)
-        return folder
+        return render_run(self.load(), options)
 
-    def mesh(
-        self,
-        output: str | Path | None = None,
-        *,
-        settings: Mapping[str, Any] | None = None,
-        formats: Sequence[str] = ("ply", "obj", "glb"),
-        truth: str | Path | None = None,
-        overwrite: bool = False,
-    ) -> MeshedRun:
+    @takes(MeshOptions)
+    def mesh(self, options: MeshOptions) -> MeshedRun:
         """Fuse the depth rendered from the training poses into a triangle mesh, and write it.
-
-        Args:
-            output: Folder to make; None: ``mesh`` in the run folder.
-            settings: Options of meshing by name (docs/meshes.md 3), for instance ``{"voxel_size": 0.5}``.
-            formats: Of the files.
-            truth: True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with
-                one; None: that of the scene, where there is one.
-            overwrite: Replace the folder where it exists.
 
         Returns:
             The mesh, its folder, and the comparison with the true surface where there is one.
@@ -246,30 +203,21 @@ class Run:
         from coliags_plugin.surface.meshing.settings import MeshSettings
         from coliags_plugin.surface.meshing.writing import mesh_run
 
-        chosen = validated(MeshSettings, settings or {}, "mesh option")
-        folder = Path(output) if output is not None else self.path / "mesh"
-        against = None if truth is None else Path(truth)
-        return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
+        given: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
+        given |= parse_assignments(options.settings, "--set", "KEY=VALUE, for instance depth=median")
+        if options.voxel is not None:
+            given["voxel_size"] = options.voxel
+        chosen, folder = validated(MeshSettings, given, "mesh option"), options.output or self.path / "mesh"
+        return mesh_run(self.load(), folder, chosen, options.formats, options.truth, options.overwrite)
 
-    def export(
-        self,
-        output: str | Path | None = None,
-        *formats: str,
-        light: str = "mean",
-        seconds: float = 180.0,
-        measure: bool = True,
-        overwrite: bool = False,
-    ) -> list[Exported]:
+    def export(self, output: ExportOptions | str | Path | None = None, *formats: str, **options: Any) -> list[Exported]:
         """Write the run's Gaussians to files, and a JSON record of each to ``FILE.json`` beside it.
 
         Args:
             output: The file; of several formats, its suffix becomes that of each. None: ``export/SCENE.FORMAT`` in the
                 run folder.
-            formats: Of ``ply``, ``spz``, ``splat`` and ``glb``; none: ``ply``.
-            light: ``recorded``, ``mean`` or ``flattened``, of colours that depend on the lamp (docs/export.md 2).
-            seconds: Time for fitting baked Gaussians to what the run renders, at most, where baking loses much.
-            measure: Compare each file with the run on the held-out views, for the record.
-            overwrite: Replace files that are there.
+            formats: Of ``ply``, ``spz`` and ``glb``; none: ``ply``.
+            options: Others of :class:`~coliags_plugin.config.options.ExportOptions`.
 
         Raises:
             InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
@@ -277,55 +225,36 @@ class Run:
         """
         from coliags_plugin.export.baking.exporting import export_run
 
-        chosen = formats or ("ply",)
-        if output is None:
-            outputs = {form: self.path / "export" / f"{self.scene_name}.{form}" for form in chosen}
-        else:
-            file = Path(output)
-            outputs = {form: file.with_suffix(f".{form}") if len(chosen) > 1 else file for form in chosen}
-        return export_run(self.load(), outputs, light, measure, overwrite, seconds)
+        given: Any = {"output": output, "formats": formats or ("ply",), **options}
+        chosen = output if isinstance(output, ExportOptions) else ExportOptions(**given)
+        return export_run(self.load(), chosen)
 
-    def coverage(
-        self,
-        output: str | Path | None = None,
-        *,
-        settings: Mapping[str, Any] | None = None,
-        mesh: str | Path | None = None,
-        overwrite: bool = False,
-    ) -> MeasuredCoverage:
+    @takes(CoverageOptions)
+    def coverage(self, options: CoverageOptions) -> MeasuredCoverage:
         """Measure what the recording shows of the wall and what it misses, and write it. Research use only.
 
         Where no section of a lumen can be measured, ``coverage`` of the result is a ``PartialCoverage`` with the
         reason.
 
-        Args:
-            output: Folder to make; None: ``coverage`` in the run folder.
-            settings: What counts as seen, by name (docs/coverage.md 3), for instance ``{"far": 40.0}``.
-            mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses; None: ``mesh/mesh.ply`` in the run
-                folder, or else the fused depth of the run.
-            overwrite: Replace the folder where it exists.
-
         Raises:
             InputError: See :meth:`load`; an option is unknown or invalid, the mesh cannot be read or is not where the
                 cameras look, or the folder exists or cannot be written.
         """
-        from coliags_plugin.core.settings import validated
+        from coliags_plugin.api.scenes import coverage_settings
         from coliags_plugin.geometry.meshes.files import read_mesh
-        from coliags_plugin.surface.coverage.settings import CoverageSettings
         from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
 
-        chosen = validated(CoverageSettings, settings or {}, "coverage option")
-        folder = Path(output) if output is not None else self.path / "coverage"
-        check_free(folder, overwrite)
-        file = Path(mesh) if mesh is not None else self.path / "mesh" / "mesh.ply"
-        if mesh is not None or file.is_file():
+        chosen, folder = coverage_settings(options), options.output or self.path / "coverage"
+        check_free(folder, options.overwrite)
+        file = options.mesh or self.path / "mesh" / "mesh.ply"
+        if options.mesh is not None or file.is_file():
             wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)
         else:
             from coliags_plugin.surface.meshing.fusion import fuse_run
 
             trained = self.load()
             wall, scene = fuse_run(trained).mesh, trained.scene
-        return measure_scene(scene, wall, folder, chosen, overwrite)
+        return measure_scene(scene, wall, folder, chosen, options.overwrite)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the run to browsers (docs/viewer.md), until the viewer is closed.
@@ -342,19 +271,9 @@ class Run:
 
         return Viewer(self.load(), host, port)
 
-    def save_view(
-        self, output: str | Path, *, size: int = 5_000_000, light: str = "recorded", seconds: float = 180.0
-    ) -> ScenePage:
-        """Write the scene as a page that opens in a browser offline (docs/viewer.md 3).
-
-        Args:
-            output: The file; an existing one is replaced.
-            size: Of the page, bytes, at most.
-            light: ``recorded``, ``mean`` or ``flattened``, of colours that depend on the lamp (docs/export.md 2).
-            seconds: Time for fitting its Gaussians to what the run renders, at most.
-
-        Returns:
-            The page, and what it is and loses.
+    @takes(PageOptions)
+    def save_view(self, options: PageOptions) -> ScenePage:
+        """Write the scene as a page that opens in a browser offline (docs/viewer.md 3); what it is and loses.
 
         Raises:
             InputError: See :meth:`load`; the method has no Gaussians and the run no mesh, there is no such light, the
@@ -362,7 +281,8 @@ class Run:
         """
         from coliags_plugin.export.viewer.saving import save_page
 
-        return save_page(self.load(), Path(output), size, light, seconds)
+        size = bytes_of(str(options.size), "--size")
+        return save_page(self.load(), options.output or self.path / "scene.html", size, options.light, options.seconds)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.assignments import assignments
+from coliags_plugin.config.assignments import assignments, parse_assignments
+from coliags_plugin.config.options import CoverageOptions, takes
+from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.pipeline.procedure.run import FinishedProcedure
     from coliags_plugin.pipeline.stages import Record
+    from coliags_plugin.surface.coverage.settings import CoverageSettings
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
 
 
@@ -56,35 +59,34 @@ def make_phantom(output: str | Path, /, *, overwrite: bool = False, **settings: 
     return Path(output)
 
 
-def measure_scene_coverage(
-    data: str | Path,
-    mesh: str | Path,
-    output: str | Path,
-    *,
-    settings: Mapping[str, Any] | None = None,
-    overwrite: bool = False,
-) -> MeasuredCoverage:
+@takes(CoverageOptions)
+def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> MeasuredCoverage:
     """Measure what a scene's recording shows of a mesh of the wall, without a run. Research use only.
 
-    Args:
-        data: The scene's folder.
-        mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses.
-        output: Folder to make.
-        settings: What counts as seen, by name (docs/coverage.md 3).
-        overwrite: Replace the folder where it exists.
-
     Raises:
-        InputError: An option is unknown or invalid; the scene or the mesh cannot be read or do not belong together; or
-            the folder exists or cannot be written.
+        InputError: An option is unknown, missing or invalid; the scene or the mesh cannot be read or do not belong
+            together; or the folder exists or cannot be written.
     """
-    from coliags_plugin.core.settings import validated
     from coliags_plugin.geometry.meshes.files import read_mesh
-    from coliags_plugin.surface.coverage.settings import CoverageSettings
     from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
 
-    chosen, folder = validated(CoverageSettings, settings or {}, "coverage option"), Path(output)
-    check_free(folder, overwrite)
-    return measure_scene(open_recording(Path(data)), read_mesh(Path(mesh)), folder, chosen, overwrite)
+    if options.mesh is None or options.output is None:
+        raise InputError(
+            f"{data} is not a run folder", "a run folder, or a scene's folder with --mesh FILE and --output FOLDER"
+        )
+    chosen = coverage_settings(options)
+    check_free(options.output, options.overwrite)
+    recording, wall = open_recording(Path(data)), read_mesh(options.mesh)
+    return measure_scene(recording, wall, options.output, chosen, options.overwrite)
+
+
+def coverage_settings(options: CoverageOptions) -> CoverageSettings:
+    """What counts as seen."""
+    from coliags_plugin.core.settings import validated
+    from coliags_plugin.surface.coverage.settings import CoverageSettings
+
+    given = parse_assignments(options.settings, "--set", "KEY=VALUE, for instance region_diameter=10")
+    return validated(CoverageSettings, given, "coverage option")
 
 
 def reconstruct(

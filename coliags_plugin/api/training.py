@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.method_config import method_name
+from coliags_plugin.config.options import ImportOptions, TrainOptions, takes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
 
@@ -19,37 +18,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def train(
-    method: str,
-    data: str | Path,
-    output: str | Path | None = None,
-    *,
-    steps: int | None = None,
-    seed: int | None = None,
-    settings: Mapping[str, Any] | None = None,
-    renderer: str | None = None,
-    data_format: str | None = None,
-    device: str = "auto",
-    resume: bool = False,
-    overwrite: bool = False,
-    loggers: Sequence[str] = (),
-    view_port: int | None = None,
-) -> Run:
+@takes(TrainOptions)
+def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     """Train a method on a scene.
 
     Args:
-        method: Name of a method or path of a method config.
-        data: The scene's folder.
-        output: Run folder; None: ``runs/SCENE/METHOD/STAMP``, or the newest of these when resuming.
-        steps: Training steps, schedules being scaled to them; None: the method's, or those of the resumed run.
-        seed: Seed of all random generators; None: 0, or that of the resumed run.
-        settings: Changes of the method config by key path, for instance ``{"field.voxel_size": 1.0}``.
-        renderer: Name of a renderer; None: the method's.
-        data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
-        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
-        resume: Continue from the run's latest checkpoint.
-        overwrite: Replace an existing run folder.
-        loggers: What also gets the training log, by name: ``tensorboard``, ``wandb``, or of another package.
+        options: See below; settings by key path, for instance ``{"field.voxel_size": 1.0}``.
         view_port: Port at which browsers see the run while it is trained; None: they do not; 0: any free one.
 
     Raises:
@@ -60,21 +34,22 @@ def train(
     """
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.loggers import find_loggers
-    from coliags_plugin.engine.training import TrainingRequest, open_training
+    from coliags_plugin.engine.training import IfExists, TrainingRequest, open_training
 
-    if resume and overwrite:
+    if options.resume and options.overwrite:
         raise InputError("--resume and --overwrite together", "one of them")
-    data, on = Path(data), choose_device(device)
-    named = {"schedule.steps": steps, "renderer.name": renderer}
+    on = choose_device(options.device)
+    named = {"schedule.steps": options.steps, "renderer.name": options.renderer}
     chosen = {key: value for key, value in named.items() if value is not None}
-    request = TrainingRequest(method, data, (*assignments(settings), *assignments(chosen)), seed, data_format)
-    chosen_loggers = find_loggers(loggers)
+    overrides = (*options.settings, *assignments(chosen))
+    request = TrainingRequest(options.method, options.data, overrides, options.seed, options.data_format)
+    chosen_loggers = find_loggers(options.loggers)
     if view_port is not None:
         from coliags_plugin.export.viewer.serving import check_server
 
         check_server("127.0.0.1", view_port)
-    folder = _run_folder(method, data, output, resume)
-    if_exists: Literal["resume", "overwrite", "refuse"] = "resume" if resume else "overwrite" if overwrite else "refuse"
+    folder = _run_folder(options)
+    if_exists: IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
     with open_training(request, folder, on, if_exists) as trainer:
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
         config = trainer.method.config.model_dump()
@@ -86,34 +61,20 @@ def train(
             log.info("%s shows the run until training ends", live.viewer.url)
             followers.append(live)
         trainer.train(followers=followers)
-    return Run(folder.path, data=data, device=device)
+    return Run(folder.path, data=options.data, device=options.device)
 
 
-def _run_folder(method: str, data: Path, output: str | Path | None, resume: bool) -> RunFolder:
-    if output is not None:
-        return RunFolder(Path(output))
-    scene_name, short = data.resolve().name, method_name(method).rsplit("/", maxsplit=1)[-1]
-    return RunFolder.newest(scene_name, short) if resume else RunFolder.default(scene_name, short)
+def _run_folder(options: TrainOptions) -> RunFolder:
+    if options.output is not None:
+        return RunFolder(options.output)
+    scene_name = options.data.resolve().name
+    short = method_name(options.method).rsplit("/", maxsplit=1)[-1]
+    return RunFolder.newest(scene_name, short) if options.resume else RunFolder.default(scene_name, short)
 
 
-def import_splats(
-    file: str | Path,
-    data: str | Path,
-    output: str | Path | None = None,
-    *,
-    data_format: str | None = None,
-    device: str = "auto",
-    overwrite: bool = False,
-) -> Run:
+@takes(ImportOptions)
+def import_splats(options: ImportOptions) -> Run:
     """Make a run of a file of 3D Gaussians on a scene, at step 0, to evaluate, render and mesh.
-
-    Args:
-        file: PLY or SPZ, in the world frame and unit of the scene.
-        data: The scene's folder.
-        output: Run folder; None: ``runs/SCENE/imported/STAMP``.
-        data_format: Name of a data manager; None: the one that recognises the folder.
-        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
-        overwrite: Replace an existing run folder.
 
     Raises:
         InputError: The file is damaged, compressed or of another lineage, the scene cannot be read, or the folder
@@ -122,7 +83,8 @@ def import_splats(
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.export.baking.importing import import_run
 
-    scene = Path(data)
-    folder = RunFolder.default(scene.resolve().name, "imported") if output is None else RunFolder(Path(output))
-    import_run(Path(file), scene, folder, choose_device(device), data_format, overwrite)
-    return Run(folder.path, data=scene, device=device)
+    scene = options.data.resolve().name
+    folder = RunFolder.default(scene, "imported") if options.output is None else RunFolder(options.output)
+    device = choose_device(options.device)
+    import_run(options.file, options.data, folder, device, options.data_format, options.overwrite)
+    return Run(folder.path, data=options.data, device=options.device)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
-
-import tyro
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_overlap
@@ -18,45 +15,6 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="Settings")
 R = TypeVar("R")
-
-#: Of options whose help says what is done without them, or which are flags.
-_NO_DEFAULT = ""
-
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
-OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint=_NO_DEFAULT)]
-OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_NO_DEFAULT)]
-OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM", help_behavior_hint=_NO_DEFAULT)]
-#: What is done by default: ``--no-NAME``, which its help describes, leaves it out.
-DoneByDefault = Annotated[bool, tyro.conf.arg(help_behavior_hint=_NO_DEFAULT)]
-
-#: ``--output`` or ``-o``: the one spelling of where a command writes.
-Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
-OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
-#: ``--set key=value``, repeatable.
-Assignments = Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
-
-RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
-SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
-#: Name of a data manager; None: recognised from the files.
-DataFormat = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="NAME",
-        help="Dataset format (`coliags list datamanagers`); default: recognised from the files.",
-        help_behavior_hint=_NO_DEFAULT,
-    ),
-]
-MovedData = Annotated[
-    Path | None,
-    tyro.conf.arg(
-        metavar="PATH", help="The scene's folder, where it has moved since training.", help_behavior_hint=_NO_DEFAULT
-    ),
-]
-Device = Annotated[
-    str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
-]
-Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
-AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 
 
 class Runnable(Protocol):
@@ -112,16 +70,3 @@ def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
     refuse_overlap(output, source)
     if not overwrite and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
-
-
-#: Bytes of a unit.
-_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
-
-
-def bytes_of(text: str, option: str) -> int:
-    """A size such as ``20MB`` in bytes; units are powers of 1000."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
-    unit = found and found[2].lower()
-    if found is None or unit not in _UNITS:
-        raise InputError(f"{option} {text}", "a size in bytes, kB, MB or GB, for instance 20MB")
-    return int(float(found[1]) * _UNITS[unit])

@@ -9,65 +9,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
+from coliags_plugin.config import options
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.named_files import Variant
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparisonArguments:
-    """Scenes, options of the runs, and how they are carried out."""
+class ComparisonCommand(options.CompareOptions):
+    """Command that compares."""
 
-    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
-    """Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes."""
-    output: arguments.Output
-    """Folder of the comparison; one that is there is extended."""
-    seeds: int = 1
-    """Runs of every method on every scene, with the seeds 0, 1, ..."""
-    protocol: str = "paper"
-    """Evaluation protocol (`coliags list protocols`)."""
-    steps: arguments.OptionalInt = None
-    """Training steps of all runs; default: each method's own."""
-    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
-    """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
-    reference: arguments.OptionalText = None
-    """Reference method of the statistical tests in reports, fixed before the first run; only for a new folder."""
-    primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
-    """Metrics decided likewise; in reports, p-values of others are exploratory and have no stars."""
-    jobs: arguments.OptionalInt = None
-    """Runs at a time; default: one per CPU, or per GPU."""
-    threads: arguments.OptionalInt = None
-    """CPU threads of each run; default: the CPUs divided by the runs at a time."""
-    executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
-    """Where the runs are: processes on this machine, or on a Ray cluster (`pip install "coliags_plugin[sweep]"`)."""
-    ray_address: arguments.OptionalText = None
-    """HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine."""
-    retries: int = 2
-    """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
     """Only print what would be done: every cell with its state."""
-    set: arguments.Assignments = ()
-    """Change a value of every method config, as for train."""
-    data: arguments.OptionalPath = None
-    """Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there."""
-    device: arguments.Device = "auto"
-    json: arguments.AsJson = False
+    json: options.AsJson = False
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""
-        from coliags_plugin.comparison.compare import carry_out, dry_run, make_request
+        from coliags_plugin.api.comparing import compare, request_of
+        from coliags_plugin.comparison.compare import dry_run
         from coliags_plugin.comparison.folder import ComparisonFolder
-        from coliags_plugin.execution.executors import ExecutionOptions
 
-        request = arguments.call(make_request, self, methods=methods, overrides=self.set)
-        folder = ComparisonFolder(self.output)
         if self.dry_run:
-            planned = dry_run(request, folder)
+            planned = dry_run(request_of(methods, self), ComparisonFolder(self.output))
             print_summary(str(planned), {"cells": planned.rows}, as_json=self.json)
             return
-        done = carry_out(request, folder, arguments.call(ExecutionOptions, self))
+        done = compare(methods, self)
         table = done.table()
         facts = {
             "cells": len(done.cells),
@@ -82,7 +49,7 @@ class ComparisonArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareCommand(ComparisonArguments):
+class CompareCommand(ComparisonCommand):
     """Train and evaluate methods on scenes; what is done is kept, and what was interrupted goes on.
 
     The same command goes on after any interruption. Exit status 1 if a cell failed; the others are done all the same.
@@ -97,7 +64,7 @@ class CompareCommand(ComparisonArguments):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AblateCommand(ComparisonArguments):
+class AblateCommand(ComparisonCommand):
     """Train and evaluate the variants that a file names on scenes; otherwise as compare."""
 
     file: tyro.conf.Positional[str]

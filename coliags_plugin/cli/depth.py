@@ -11,6 +11,7 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import ESTIMATED_DEPTH_METHOD, print_summary, train_command
+from coliags_plugin.config import options
 
 _OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH")]
 
@@ -23,21 +24,21 @@ class DepthCommand:
     """What to do."""
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder. Depth that it has is ignored."""
-    output: arguments.Output
+    output: options.Output
     """Folder to create, in nerfstudio's layout."""
-    prior: arguments.OptionalPath = None
+    prior: options.OptionalPath = None
     """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
     near: _OptionalLength = None
     """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
     far: _OptionalLength = None
     """Farthest depth."""
-    jobs: arguments.OptionalInt = None
+    jobs: options.OptionalInt = None
     """Number of threads; default: one for each core."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
-    format: arguments.DataFormat = None
-    overwrite: arguments.Overwrite = False
-    json: arguments.AsJson = False
+    format: options.DataFormat = None
+    overwrite: options.Overwrite = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""

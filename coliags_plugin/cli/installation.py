@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.config import options
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class DoctorCommand:
 
     device: Annotated[str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N")] = "auto"
     """Device whose renderers are tried; auto: the first CUDA device, or none."""
-    json: arguments.AsJson = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Print the results; exit with status 1 where a requirement is missing or a renderer is wrong."""
@@ -46,9 +46,9 @@ class WeightsCommand:
     """Whose weights."""
     net: Literal["vgg", "alex", "squeeze", "all"] | None = None
     """Backbone: VGG's has 528 MiB, AlexNet's 233, SqueezeNet's 5; default: vgg and squeeze, for the protocol paper."""
-    folder: arguments.OptionalPath = None
+    folder: options.OptionalPath = None
     """Where to install them; default: torch's download cache, where LPIPS finds them."""
-    from_folder: Annotated[arguments.OptionalPath, tyro.conf.arg(name="from")] = None
+    from_folder: Annotated[options.OptionalPath, tyro.conf.arg(name="from")] = None
     """Copy the files from this folder instead of downloading them."""
 
     def run(self) -> None:

@@ -14,8 +14,8 @@ from typing import Literal
 
 import tyro
 
-from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.config import options
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ListCommand:
 
     kind: tyro.conf.Positional[str] = "all"
     """A kind (methods, benchmarks, ablations, datamanagers, fields, renderers, ...); default: all of them."""
-    json: arguments.AsJson = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Print names by kind, with the source of those that are not built in."""
@@ -64,7 +64,7 @@ class ConfigCommand:
     """Name of a method or path of a YAML file."""
     origin: bool = False
     """Also print the file and line, option or default that each value comes from."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """Change a value, as for train."""
 
     def run(self) -> None:
@@ -87,12 +87,12 @@ class CheckCommand:
     """Keep the folder with the phantom and the runs, and print its path."""
     traceback: bool = False
     """Print the whole traceback of every exception."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """Change a value of the method config, as for train."""
-    format: arguments.DataFormat = None
-    data: arguments.OptionalPath = None
+    format: options.DataFormat = None
+    data: options.OptionalPath = None
     """A scene's folder; default: a small phantom."""
-    json: arguments.AsJson = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Print one line per check, then a summary."""

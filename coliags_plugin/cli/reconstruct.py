@@ -10,6 +10,7 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary, view_command
+from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,47 +28,47 @@ class ReconstructCommand:
     video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
     """Video file, folder of one with its calibration, folder of images ordered by the numbers in their names, or folder
     of a scene with poses."""
-    output: arguments.Output
+    output: options.Output
     """Folder of the results."""
-    camera: arguments.OptionalText = None
+    camera: options.OptionalText = None
     """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
     file), or a camera model of COLMAP; default: of the calibration file in the folder, else found from the frames."""
-    params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    params: Annotated[options.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
-    diameter: arguments.OptionalFloat = None
+    diameter: options.OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
-    start: Annotated[arguments.OptionalText, tyro.conf.arg(name="from", metavar="[H:]M:SS")] = None
+    start: Annotated[options.OptionalText, tyro.conf.arg(name="from", metavar="[H:]M:SS")] = None
     """Time in the video of the first frame, for instance 3:20; default: the beginning."""
-    end: Annotated[arguments.OptionalText, tyro.conf.arg(name="to", metavar="[H:]M:SS")] = None
+    end: Annotated[options.OptionalText, tyro.conf.arg(name="to", metavar="[H:]M:SS")] = None
     """Time of the last frame; default: the end."""
-    every: arguments.OptionalInt = None
+    every: options.OptionalInt = None
     """Use the sharpest of every n frames; default: all."""
     frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
     """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate."""
-    mask: arguments.OptionalPath = None
+    mask: options.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
-    size: arguments.OptionalText = None
+    size: options.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
-    method: arguments.OptionalText = None
+    method: options.OptionalText = None
     """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
-    steps: arguments.OptionalInt = None
+    steps: options.OptionalInt = None
     """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
-    executor: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="local|ray")] = None
+    executor: Annotated[options.OptionalText, tyro.conf.arg(metavar="local|ray")] = None
     """Have sub-maps done at the same time, by processes of this machine or of a Ray cluster; default: one after the
     other, unless --jobs is given."""
-    jobs: arguments.OptionalInt = None
+    jobs: options.OptionalInt = None
     """Processes at a time; default: one per CPU, or per GPU."""
-    threads: arguments.OptionalInt = None
+    threads: options.OptionalInt = None
     """CPU threads of each process; default: the CPUs divided by the processes at a time."""
-    ray_address: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="HOST:PORT")] = None
+    ray_address: Annotated[options.OptionalText, tyro.conf.arg(metavar="HOST:PORT")] = None
     """Head of the Ray cluster; default: RAY_ADDRESS, or the cluster of this machine."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""
-    device: arguments.Device = "auto"
     overwrite: bool = False
     """Repeat the stages that were made with other options, and what follows them."""
-    json: arguments.AsJson = False
+    device: options.Device = "auto"
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""

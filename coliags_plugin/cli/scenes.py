@@ -11,13 +11,14 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, train_command
+from coliags_plugin.config import options
 
 
 @dataclass(frozen=True)
 class PhantomCommand:
     """Generate a synthetic, physically lit colon with exact ground truth, in the layout of a dataset."""
 
-    output: arguments.Output
+    output: options.Output
     """Folder to create."""
     seed: int = 0
     """Random seed of the whole phantom."""
@@ -28,24 +29,24 @@ class PhantomCommand:
     or one back and forth with fast turns."""
     frames: int | None = None
     """Frames of the sequence, 120 by default; every 8th is a test frame."""
-    size: arguments.OptionalText = None
+    size: options.OptionalText = None
     """Image size WxH, pixels; default: the layout's own, 338x270 for most."""
     light: Literal["c3vd", "strong"] | None = None
     """Preset of light and motion: c3vd is the fair default, strong the stress case."""
     gain: Literal["auto", "fixed"] | None = None
     """Exposure; default: the preset's."""
-    light_offset: arguments.OptionalText = None
+    light_offset: options.OptionalText = None
     """Lamp position X,Y,Z in camera axes, mm; default: the preset's."""
     polyps: int | None = None
     """Sessile polyps, 3 to 10 mm wide; 4 by default."""
     rotation_views: int | None = None
     """Extra test views, 12 by default, rotated by 15 to 30 degrees; none in layouts that cannot store them."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
     """Files and folders to write (`coliags list phantom_layouts`)."""
-    overwrite: arguments.Overwrite = False
-    json: arguments.AsJson = False
+    overwrite: options.Overwrite = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Generate the dataset."""
@@ -71,13 +72,13 @@ class DataCommand:
 
     action: tyro.conf.Positional[Literal["check"]]
     """What to do."""
-    scene: tyro.conf.Positional[arguments.SceneFolder]
-    html: arguments.OptionalPath = None
+    scene: tyro.conf.Positional[options.SceneFolder]
+    html: options.OptionalPath = None
     """Also write an HTML page with images and the trajectory."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """An option of the data manager, for instance split=block."""
-    format: arguments.DataFormat = None
-    json: arguments.AsJson = False
+    format: options.DataFormat = None
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Run the checks and print the results."""

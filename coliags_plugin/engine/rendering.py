@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.config.yaml_tree import dump
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -34,49 +34,39 @@ from coliags_plugin.outputs.video import write_video
 
 #: Upper limit of the colour error images, as a share of the colour range.
 RGB_ERROR_LIMIT = 0.2
-#: Kinds of depth that can be written, by the names that users give them.
-DepthKind = Literal["accumulated", "expected", "median"]
 #: Outputs of a view unless others are asked for.
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
-def render_run(
-    trained: TrainedRun,
-    output: Path,
-    frames: str,
-    video: bool,
-    fps: float,
-    overwrite: bool,
-    channels: Sequence[str] = (),
-    depth_kind: DepthKind = "expected",
-    depth_tiff: bool = False,
-    along: CameraPath | None = None,
-) -> None:
+def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     """Render colour, depth and error images of a set of frames, and a video along the trajectory.
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth, of one
     of the kinds of docs/conventions.md 3, is hatched where alpha is below 0.5, and has no errors where the scene's own
     is estimated; as float32 TIFF it has scene units and all pixels. Feature channels have one or three numbers, 1 is
     white. The video, ``trajectory.mp4``, has every frame's view in video order, rgb beside depth. With a camera path
-    to go ``along``, there are no images of frames, and the video is ``path.mp4``.
+    to go ``along``, there are no images of frames, and the video is ``path.mp4``. Returns the folder.
     """
-    chosen = [] if along is not None else choose_frames(trained.scene, frames)
+    along = None if options.along is None else CameraPath.read(options.along)
+    output = options.output or trained.run.path / ("path" if along else "relit" if trained.relit else "renders")
+    chosen = [] if along is not None else choose_frames(trained.scene, options.frames)
+    channels = options.channels
     _check_channels(trained, channels)
-    depth = f"depth_{depth_kind}"
+    depth = f"depth_{options.depth_kind}"
     wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
-    trained.model.check_outputs(wants, f"depth of kind '{depth_kind}'")
+    trained.model.check_outputs(wants, f"depth of kind '{options.depth_kind}'")
     path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
     if along is not None:
-        path = list(along.cameras(trained.scene.train[0].camera, fps))
+        path = list(along.cameras(trained.scene.train[0].camera, options.fps))
     limits = sampled_depth_limits(trained, chosen or path, depth)
     with (
-        atomic_folder(output, overwrite) as folder,
-        ProgressReport("render", len(chosen) + len(path) * video) as progress,
+        atomic_folder(output, options.overwrite) as folder,
+        ProgressReport("render", len(chosen) + len(path) * options.video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
             _write_frame(folder, frame, view, depth, limits, trained.relit)
-            if depth_tiff:
+            if options.depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
@@ -89,9 +79,10 @@ def render_run(
         for light in (trained.lamp, trained.held):
             if light is not None:
                 atomic_write(folder / "lamp.yaml", dump(light.described))
-        if video:
+        if options.video:
             name = "trajectory.mp4" if along is None else "path.mp4"
-            write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, fps)
+            write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / name, options.fps)
+    return output
 
 
 def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], depth: str) -> tuple[float, float]:

@@ -1,43 +1,59 @@
-"""Options that commands pass to functions by the names of their arguments."""
+"""Options, whose classes the command line, the Python API and the engine share."""
 
 from __future__ import annotations
 
 from dataclasses import fields
 from inspect import signature
+from pathlib import Path
 
 import pytest
 
-from coliags_plugin.api.comparing import report
-from coliags_plugin.api.runs import Run
+import coliags_plugin as cp
 from coliags_plugin.api.scenes import reconstruct
-from coliags_plugin.api.training import import_splats, train
+from coliags_plugin.cli import making_runs, results, run_outputs
 from coliags_plugin.cli.comparing import CompareCommand
-from coliags_plugin.cli.making_runs import ImportCommand, TrainCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
-from coliags_plugin.cli.results import ReportCommand
-from coliags_plugin.cli.run_outputs import CoverageCommand, MeshCommand, RenderCommand
-from coliags_plugin.comparison.compare import make_request
-from coliags_plugin.execution.executors import ExecutionOptions
+from coliags_plugin.config.options import Options, TrainOptions, takes
+
+
+def test_an_option_is_an_argument_of_the_function_or_handled_by_the_command():
+    """What is passed by names; other commands are themselves the options of what they call."""
+    handled = "camera params diameter start end every frames_per_second size method steps set json"
+    arguments = {*signature(reconstruct).parameters}
+    assert {field.name for field in fields(ReconstructCommand)} - arguments == set(handled.split())
 
 
 @pytest.mark.parametrize(
-    ("command", "functions", "handled"),
+    ("command", "function", "own"),
     [
-        (TrainCommand, [train], "set format logger view port json"),
-        (ImportCommand, [import_splats], "format json"),
-        (RenderCommand, [Run.write_renders], "path light flatten channel data device json"),
-        (CoverageCommand, [Run.coverage], "path set data device json"),
-        (MeshCommand, [Run.mesh], "path voxel color texture set format data device json"),
-        (ReportCommand, [report], "paths format json"),
-        (CompareCommand, [make_request, ExecutionOptions], "output dry_run set json"),
-        (
-            ReconstructCommand,
-            [reconstruct],
-            "camera params diameter start end every frames_per_second size method steps set json",
-        ),
+        (making_runs.TrainCommand, cp.train, "view port json"),
+        (making_runs.ImportCommand, cp.import_splats, "json"),
+        (run_outputs.EvaluateCommand, cp.Run.evaluate, "path data device json"),
+        (run_outputs.RenderCommand, cp.Run.write_renders, "path data device json light flatten"),
+        (run_outputs.CoverageCommand, cp.Run.coverage, "path data device json"),
+        (run_outputs.MeshCommand, cp.Run.mesh, "path data device json"),
+        (run_outputs.ViewCommand, cp.Run.save_view, "path data device json host port open"),
+        (CompareCommand, cp.compare, "dry_run json"),
+        (results.ReportCommand, cp.report, "paths json"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_an_option_is_an_argument_of_the_function_or_handled_by_the_command(command, functions, handled):
-    arguments = {name for function in functions for name in signature(function).parameters}
-    assert {field.name for field in fields(command)} - arguments == set(handled.split())
+def test_a_command_has_the_options_of_its_function_whose_help_tells_them(command, function, own):
+    shown = signature(function).parameters
+    (kind,) = [base for base in command.__mro__ if Options in base.__bases__]
+    assert {field.name for field in fields(command)} - {*shown} == set(own.split())
+    for name in {field.name for field in fields(kind)} - {"data", "data_format", "device", "overwrite"}:
+        assert name in shown and f"\n    {name}: " in function.__doc__
+
+
+def test_options_are_given_as_an_object_or_by_name_with_texts_and_mappings():
+    @takes(TrainOptions)
+    def told(first, options, *, last=0):
+        """What was given."""
+        return first, options, last
+
+    first, options, last = told(1, "coliags", "SCENE", settings={"a.b": None}, last=2)
+    assert (first, options.data, options.settings, last) == (1, Path("SCENE"), ("a.b=null",), 2)
+    assert told(1, options) == (1, options, 0)
+    with pytest.raises(TypeError, match="seeds"):
+        told(1, "coliags", "SCENE", seeds=1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine import training as training_module
@@ -119,7 +120,7 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
     bounds = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in meshes]
     np.testing.assert_allclose(factor * bounds[0], bounds[1], atol=1.0)
     assert factor**2 * meshes[0].areas.sum() == pytest.approx(meshes[1].areas.sum(), rel=0.05)
-    files = [export_run(run, {"ply": tmp_path / f"{n}.ply"}, "mean", seconds=0.0)[0] for n, run in enumerate(runs)]
+    files = [export_run(run, ExportOptions(tmp_path / f"{n}.ply", seconds=0.0))[0] for n, run in enumerate(runs)]
     clouds = [read_splats(file.file) for file in files]
     np.testing.assert_allclose(factor * clouds[0].means, clouds[1].means, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(factor * clouds[0].scales, clouds[1].scales, rtol=1e-2)

@@ -34,6 +34,7 @@ from coliags_plugin.checks.method.context import (
 from coliags_plugin.checks.results import CheckFailedError, CheckResult, CheckSkippedError, Status
 from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import load_method, method_tree
+from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.core.masked import masked_mean
@@ -568,7 +569,7 @@ def writes_images(context: CheckContext) -> str:
     trained = _few_frames(context)
     name, frames = next(iter(trained.scene.test_sets.items()))
     folder = context.folder / "renders"
-    render_run(trained, folder, name, video=False, fps=15.0, overwrite=True)
+    render_run(trained, RenderOptions(folder, name, video=False, overwrite=True))
     kinds = {"rgb", "depth", "rgb_error"} | ({"depth_error"} if frames[0].depth is not None else set())
     wanted = [folder / kind / f"{frame.name}.png" for kind in sorted(kinds) for frame in frames]
     missing = [path for path in wanted if not path.is_file() or not path.stat().st_size]

@@ -12,6 +12,7 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import depth_commands, print_summary
+from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,29 +27,29 @@ class PosesSfmCommand:
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
     """Video, folder of one with its calibration, or folder of images ordered by the numbers in their names."""
-    output: arguments.Output
+    output: options.Output
     """Folder to create, in COLMAP's layout."""
-    camera: arguments.OptionalText = None
+    camera: options.OptionalText = None
     """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
     file), or a camera model of COLMAP, for instance PINHOLE or OPENCV_FISHEYE; default: of the calibration file in the
     folder, else the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
-    params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    params: Annotated[options.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
-    diameter: arguments.OptionalFloat = None
+    diameter: options.OptionalFloat = None
     """The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown."""
-    distance: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
+    distance: Annotated[options.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
-    mask: arguments.OptionalPath = None
+    mask: options.OptionalPath = None
     """Mask image, black where pixels are ignored, or a folder with one per image; default: black surroundings and
     overlays are found, of images of one size."""
     every: int = 1
     """Use every n-th image."""
-    max_frames: arguments.OptionalInt = None
+    max_frames: options.OptionalInt = None
     """Use at most the first n images."""
-    set: arguments.Assignments = ()
+    set: options.Assignments = ()
     """An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000."""
-    overwrite: arguments.Overwrite = False
-    json: arguments.AsJson = False
+    overwrite: options.Overwrite = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""

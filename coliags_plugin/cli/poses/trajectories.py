@@ -11,6 +11,7 @@ import tyro
 
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,20 +61,20 @@ class PosesConvertCommand:
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """File with poses, or the folder of a COLMAP model."""
-    output: arguments.Output
+    output: options.Output
     """File to write; for COLMAP, folder to create."""
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT")]
     """Format to write."""
-    intrinsics: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
+    intrinsics: Annotated[options.OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
     """Pinhole intrinsics of all images, px, pixel centres at integers + 0.5; default: the input's."""
-    size: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="WxH")] = None
+    size: Annotated[options.OptionalText, tyro.conf.arg(metavar="WxH")] = None
     """Image size, px; with --intrinsics."""
-    images: arguments.OptionalPath = None
+    images: options.OptionalPath = None
     """Folder whose images, in natural order, give the poses their names; default: the input's names."""
     from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
     """Format of the input; default: recognised from its content."""
-    overwrite: arguments.Overwrite = False
-    json: arguments.AsJson = False
+    overwrite: options.Overwrite = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Convert the poses."""
@@ -137,13 +138,13 @@ class PosesAlignCommand:
     """How frames are matched; auto: by name, else by time, else by index."""
     tolerance: float = 0.02
     """Largest difference of matched timestamps, s."""
-    unit: arguments.OptionalText = None
+    unit: options.OptionalText = None
     """Name of the reference's unit of length; default: mm where its format is metric."""
     estimate_format: OptionalFormat = None
     """Format of the estimate; default: recognised from its content."""
     reference_format: OptionalFormat = None
     """Format of the reference; default: recognised from its content."""
-    json: arguments.AsJson = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Align, and print a table of the errors."""
@@ -204,13 +205,13 @@ class PosesExportCommand:
 
     procedure: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder that `coliags reconstruct` made of a long video."""
-    output: arguments.Output
+    output: options.Output
     """Folder to create."""
     link: bool = False
     """Do not copy images and depth, but give the files in OUT a second name, on the same disk: they take no space, and
     who changes one changes both."""
-    overwrite: arguments.Overwrite = False
-    json: arguments.AsJson = False
+    overwrite: options.Overwrite = False
+    json: options.AsJson = False
 
     def run(self) -> None:
         """Export, and print the sub-maps."""

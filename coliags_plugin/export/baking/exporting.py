@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
@@ -22,7 +23,7 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.baking import SECONDS, bake
+from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
 from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, write_splats
@@ -51,14 +52,7 @@ class Exported:
         return "; ".join([text, *cost_lines(record["cost"] or {})])
 
 
-def export_run(
-    trained: TrainedRun,
-    outputs: Mapping[str, Path],
-    light: str,
-    measure: bool = True,
-    overwrite: bool = False,
-    seconds: float = SECONDS,
-) -> list[Exported]:
+def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     """Write the Gaussians of a run to files by their formats, and ``FILE.json`` beside each.
 
     Explicit Gaussians are written as they are. Surfels, and Gaussians that a field decodes for each view, or lights,
@@ -66,20 +60,23 @@ def export_run(
     it has no effect where colours know no lamp. With ``measure``, each file is compared with the run on the held-out
     views.
     """
+    formats, light = options.formats, options.light
+    file = options.output or trained.run.path / "export" / f"{trained.provenance['scene']['name']}.{formats[0]}"
+    outputs = {form: file.with_suffix(f".{form}") if len(formats) > 1 else file for form in formats}
     for form, output in outputs.items():
         check_format(form)
         for target in (output, _record_file(output)):
-            if target.exists() and not overwrite:
+            if target.exists() and not options.overwrite:
                 raise InputError(
                     f"{target} already exists", "a new file", "Choose another --output, or pass --overwrite"
                 )
     field = _gaussian_field(trained)
     baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     held = baked_in if field.knows_lamp else None
-    cloud, facts = bake(trained, baked_in, seconds)
+    cloud, facts = bake(trained, baked_in, options.seconds)
     baking = {"light": light_facts(light, field, baked_in), **facts} if facts else None
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
-    return [_written(trained, cloud, form, output, baking, held, measure) for form, output in outputs.items()]
+    return [_written(trained, cloud, form, output, baking, held, options.measure) for form, output in outputs.items()]
 
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:

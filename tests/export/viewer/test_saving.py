@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import coliags_plugin as cp
-from coliags_plugin.cli.arguments import bytes_of
+from coliags_plugin.config.options import bytes_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.splats.cloud import SplatCloud

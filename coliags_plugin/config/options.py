@@ -1,0 +1,384 @@
+"""Options of operations, a class for each: the command line makes flags of their fields, the Python API keywords."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from inspect import getdoc, signature
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from coliags_plugin.config.assignments import assignments
+from coliags_plugin.core.errors import InputError
+
+R = TypeVar("R")
+
+#: Of options whose help says what is done without them, or which are flags.
+_NO_DEFAULT = ""
+
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint=_NO_DEFAULT)]
+OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_NO_DEFAULT)]
+OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM", help_behavior_hint=_NO_DEFAULT)]
+#: What is done by default: ``--no-NAME``, which its help describes, leaves it out.
+DoneByDefault = Annotated[bool, tyro.conf.arg(help_behavior_hint=_NO_DEFAULT)]
+#: Texts separated by commas.
+Names = Annotated[
+    tuple[str, ...],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TEXT",
+        instance_from_str=lambda texts: tuple(filter(None, (part.strip() for part in texts[0].split(",")))),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda names: [",".join(names)],
+    ),
+    tyro.conf.arg(help_behavior_hint=_NO_DEFAULT),
+]
+
+#: ``--output`` or ``-o``: the one spelling of where a command writes.
+Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
+OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
+#: ``--set key=value``, repeatable; in Python a mapping.
+Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+
+RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
+SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
+#: Name of a data manager; None: recognised from the files.
+DataFormat = Annotated[
+    str | None,
+    tyro.conf.arg(
+        name="format",
+        metavar="NAME",
+        help="Dataset format (`coliags list datamanagers`); default: recognised from the files.",
+        help_behavior_hint=_NO_DEFAULT,
+    ),
+]
+MovedData = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="PATH", help="The scene's folder, where it has moved since training.", help_behavior_hint=_NO_DEFAULT
+    ),
+]
+Device = Annotated[
+    str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
+]
+Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
+AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
+
+#: Light of Gaussians for all views.
+Light = Literal["recorded", "mean", "flattened"]
+
+#: Fields of options that are paths, which may be given as texts.
+_PATHS = ("file", "data", "output", "along", "mesh", "truth", "scene")
+
+
+def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Let a function of ``options`` be called with the fields of their class too, which its help shows."""
+
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        own = signature(function).parameters
+        before = list(own).index("options")
+
+        @wraps(function)
+        def call(*given: Any, **named: Any) -> R:
+            if len(given) > before and isinstance(given[before], kind):
+                return function(*given, **named)
+            others = {name: named.pop(name) for name in own if name in named}
+            return function(*given[:before], options=kind(*given[before:], **named), **others)
+
+        shown = [*own.values()]
+        shown[before : before + 1] = signature(kind).parameters.values()
+        vars(call)["__signature__"] = signature(function).replace(parameters=shown)
+        call.__doc__ = f"{getdoc(function)}\n\n{getdoc(kind)}"
+        return call
+
+    return decorate
+
+
+class Options:
+    """Base class of options: paths may be given as texts, and settings as a mapping."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in _PATHS and isinstance(value, str):
+                object.__setattr__(self, name, Path(value))
+            elif name == "settings" and not isinstance(value, tuple):
+                object.__setattr__(self, name, assignments(value))
+            elif name in ("scenes", "methods", "columns", "formats") and not isinstance(value, tuple):
+                object.__setattr__(self, name, (value,) if isinstance(value, (str, Path)) else tuple(value))
+
+
+@dataclass(frozen=True)
+class TrainOptions(Options):
+    """What to train on what, and how.
+
+    Args:
+        method: Name of a method (`coliags list methods`) or path of a YAML file.
+        output: Run folder; default runs/SCENE/METHOD/STAMP.
+        steps: Training steps; schedules are scaled to them. A resumed run keeps its own unless given.
+        seed: Seed of all random generators; default 0, for a resumed run its own.
+        renderer: Renderer by name (`coliags list renderers`); default: the method's.
+        resume: Continue from the run's latest checkpoint (without an output: the newest run of this method on this
+            scene).
+        loggers: Also log to tensorboard or wandb, into the run folder (extra `loggers`), repeatable.
+        settings: Change a value of the method config, for instance field.voxel_size=1.0.
+    """
+
+    method: tyro.conf.Positional[str]
+    data: SceneFolder
+    output: OptionalOutput = None
+    steps: OptionalInt = None
+    seed: OptionalInt = None
+    renderer: OptionalText = None
+    resume: bool = False
+    loggers: Annotated[tuple[str, ...], tyro.conf.arg(name="logger", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    settings: Assignments = ()
+    data_format: DataFormat = None
+    overwrite: Overwrite = False
+    device: Device = "auto"
+
+
+@dataclass(frozen=True)
+class ImportOptions(Options):
+    """What to import.
+
+    Args:
+        file: PLY (3DGS's attributes; 2DGS's, without scale_2) or SPZ, in the world frame and unit of the scene.
+        output: Run folder; default runs/SCENE/imported/STAMP.
+    """
+
+    file: tyro.conf.Positional[Path]
+    data: SceneFolder
+    output: OptionalOutput = None
+    data_format: DataFormat = None
+    overwrite: Overwrite = False
+    device: Device = "auto"
+
+
+@dataclass(frozen=True)
+class EvaluateOptions(Options):
+    """How to evaluate.
+
+    Args:
+        protocol: Protocol by name (`coliags list protocols`); default: the method config's.
+        truth: A scene of the same frames and poses with true depth, to evaluate against instead of the run's own, for
+            runs trained on estimated depth; results go into eval/PROTOCOL-truth.
+        refine_poses: Also measure views from poses refined on the held-out images themselves, as psnr_pose_refined
+            (docs/protocols.md); not comparable with psnr.
+    """
+
+    protocol: OptionalText = None
+    truth: OptionalPath = None
+    refine_poses: bool = False
+
+
+@dataclass(frozen=True)
+class RenderOptions(Options):
+    """What to render.
+
+    Args:
+        output: Folder to create; default RUN/renders, in another light RUN/relit, along a path RUN/path.
+        frames: Which frames: train, all, or the name of a test set.
+        along: Render only a video along this camera path, a file saved in `coliags view`.
+        video: Also write trajectory.mp4, rgb beside depth.
+        fps: Frames per second of the video.
+        depth_kind: Which depth: sum w z, the paper's; the same divided by alpha; or that of the Gaussian at which half
+            of the light is absorbed. Pictures are hatched where alpha is below 0.5.
+        depth_tiff: Also write depth as float32 TIFF, scene units: depth_tiff/.
+        channels: Also write a feature channel of the method's Gaussians, for instance albedo.
+    """
+
+    output: OptionalOutput = None
+    frames: str = "test"
+    along: Annotated[OptionalPath, tyro.conf.arg(name="path")] = None
+    video: Annotated[DoneByDefault, tyro.conf.arg(help="Do not write trajectory.mp4, rgb beside depth.")] = True
+    fps: float = 15.0
+    depth_kind: Literal["accumulated", "expected", "median"] = "expected"
+    depth_tiff: bool = False
+    channels: Annotated[tuple[str, ...], tyro.conf.arg(name="channel", metavar="NAME"), tyro.conf.UseAppendAction] = ()
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class MeshOptions(Options):
+    """How to make a mesh.
+
+    Args:
+        output: Folder to create; default RUN/mesh.
+        voxel: Edge of a voxel in scene units (mm); default: two training pixels on the surface.
+        color: Colours: as the views show them, each under its lamp; or under one distance and angle to the lamp
+            everywhere, the medians of what the training views see, for methods of Gaussians.
+        texture: OBJ, with MTL and PNG, and GLB with a texture in place of colours at vertices: four texels along the
+            edge of a voxel.
+        truth: True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with one;
+            default: that of the scene, where there is one.
+        settings: Another option of meshing (docs/meshes.md 3), for instance depth=median.
+        formats: Formats of the mesh.
+    """
+
+    output: OptionalOutput = None
+    voxel: OptionalFloat = None
+    color: Literal["plain", "flattened"] = "plain"
+    texture: bool = False
+    truth: OptionalPath = None
+    settings: Assignments = ()
+    formats: Annotated[tuple[Literal["ply", "obj", "glb"], ...], tyro.conf.arg(name="format")] = ("ply", "obj", "glb")
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class ExportOptions(Options):
+    """What to export, and how it is baked.
+
+    Args:
+        output: File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json. Of several formats, each has
+            its own suffix.
+        light: Light baked into colours that depend on the lamp. recorded: the lamp of each training camera, averaged;
+            mean: a lamp at the mean training camera; flattened: the same distance and angle everywhere.
+        seconds: Time limit, seconds, of the fit of baked Gaussians to the run's renderings, done where baking loses
+            much.
+        measure: Compare each file with the run on the held-out views, for the record and the terminal.
+        formats: Formats, all of one baking: PLY as 3DGS writes it, SPZ, glTF with KHR_gaussian_splatting. Lengths stay
+            those of the scene (mm).
+    """
+
+    output: OptionalOutput = None
+    light: Light = "mean"
+    seconds: float = 180.0
+    measure: Annotated[
+        DoneByDefault,
+        tyro.conf.arg(
+            help="Do not compare each file with the run on the held-out views, for the record and the terminal."
+        ),
+    ] = True
+    formats: Annotated[tuple[Literal["ply", "spz", "glb"], ...], tyro.conf.arg(name="format")] = ("ply",)
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class PageOptions(Options):
+    """What a page of a scene holds.
+
+    Args:
+        output: Write the scene to this file instead, as a self-contained HTML page, which opens offline.
+        size: Of the page, at most, for instance 20MB.
+        light: Of the page, as in `coliags export`.
+        seconds: Time limit, seconds, of the fit of the page's Gaussians to the run's renderings.
+    """
+
+    output: OptionalOutput = None
+    size: str = "5MB"
+    light: Light = "recorded"
+    seconds: float = 180.0
+
+
+@dataclass(frozen=True)
+class CoverageOptions(Options):
+    """How to measure coverage.
+
+    Args:
+        output: Folder to create; default RUN/coverage.
+        mesh: The wall, PLY, OBJ or GLB, in the world and unit of the poses; default: RUN/mesh/mesh.ply, or else the
+            fused depth of the run.
+        settings: An option, for instance region_diameter=10 (docs/coverage.md).
+    """
+
+    output: OptionalOutput = None
+    mesh: OptionalPath = None
+    settings: Assignments = ()
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
+class CompareOptions(Options):
+    """Scenes, options of the runs, and how they are carried out.
+
+    Args:
+        scenes: Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes.
+        output: Folder of the comparison; one that is there is extended.
+        seeds: Runs of every method on every scene, with the seeds 0, 1, ...
+        protocol: Evaluation protocol (`coliags list protocols`).
+        steps: Training steps of all runs; default: each method's own.
+        splits: Splits, each trained apart, for instance every-8th block; default: the scene's own.
+        reference: Reference method of the statistical tests in reports, fixed before the first run; only for a new
+            folder.
+        primary: Metrics decided likewise; in reports, p-values of others are exploratory and have no stars.
+        jobs: Runs at a time; default: one per CPU, or per GPU.
+        threads: CPU threads of each run; default: the CPUs divided by the runs at a time.
+        executor: Where the runs are: processes on this machine, or on a Ray cluster (`pip install
+            "coliags_plugin[sweep]"`).
+        ray_address: HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine.
+        retries: How often a run is resumed whose process was killed or crashed.
+        settings: Change a value of every method config, as for train.
+        data: Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there.
+    """
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
+    output: Output
+    seeds: int = 1
+    protocol: str = "paper"
+    steps: OptionalInt = None
+    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
+    reference: OptionalText = None
+    primary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METRIC...")] = ()
+    jobs: OptionalInt = None
+    threads: OptionalInt = None
+    executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
+    ray_address: OptionalText = None
+    retries: int = 2
+    settings: Assignments = ()
+    data: OptionalPath = None
+    device: Device = "auto"
+
+
+@dataclass(frozen=True)
+class ReportOptions(Options):
+    """What a report shows.
+
+    Args:
+        output: File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md,
+            ...
+        methods: Names of methods to show, in this order, separated by commas; default: all. Tests count the others too.
+        columns: Metrics to show, separated by commas, or `all`; default: psnr,psnr_gain_fitted,ssim,lpips,depth_mse,
+            depth_mse_inner,depth_median_error.
+        reference: Method that the others are compared with; default: coliags, or the best where it is not there.
+        protocol: Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`.
+        frames: Held-out frames to show per scene and test set; the worst ones are added.
+        title: Heading; default: methods and scenes.
+        note: A remark shown at the top.
+        scene: Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`.
+        formats: What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json
+            (tables), all.
+    """
+
+    output: OptionalOutput = None
+    methods: Names = ()
+    columns: Names = ()
+    reference: OptionalText = None
+    protocol: str = "paper"
+    frames: int = 4
+    title: OptionalText = None
+    note: OptionalText = None
+    scene: OptionalPath = None
+    formats: Annotated[
+        tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...],
+        tyro.conf.arg(name="format"),
+        tyro.conf.UseAppendAction,
+    ] = ()
+
+
+#: Bytes of a unit.
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+
+
+def bytes_of(text: str, option: str) -> int:
+    """A size such as ``20MB`` in bytes; units are powers of 1000."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
+    unit = found and found[2].lower()
+    if found is None or unit not in _UNITS:
+        raise InputError(f"{option} {text}", "a size in bytes, kB, MB or GB, for instance 20MB")
+    return int(float(found[1]) * _UNITS[unit])
