@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.settings import invalid_reported
 
 #: Names within the folder of a comparison.
 PLAN_FILE, RESULTS, RUNS, FAILURES = "plan.json", "results", "runs", "failures"
@@ -93,8 +93,5 @@ def read_plan(folder: Path) -> ComparisonPlan | None:
             f"version {VERSION} or older",
             "Update the package",
         )
-    try:
+    with invalid_reported(f"{file}: ", _EXPECTED):
         return ComparisonPlan.model_validate(content)
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{file}: {key}: {message}", _EXPECTED) from error

@@ -6,11 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import ValidationError
-
 from coliags_plugin.config.yaml_tree import Node, dump_inline, override_all, parse_value
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.core.settings import Settings, invalid_reported
 
 #: An assignment as messages explain it.
 EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
@@ -66,12 +64,9 @@ S = TypeVar("S", bound=Settings)
 def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
     """Settings from their defaults and ``key.path=value`` assignments; messages put the prefix before keys."""
     tree = override_all(Node({}, "options"), assignments)
-    try:
+    with invalid_reported(f"--set {prefix}"):
         # Merged with the defaults, as a nested part's defaults may differ from its class's.
         return kind.model_validate(deep_merge(kind().model_dump(), tree.plain()))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
 
 
 def deep_merge(base: object, over: object) -> object:

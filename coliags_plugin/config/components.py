@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer, PlainValidator, ValidationError
+from pydantic import PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config.registry import REGISTRIES, Resolver
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.core.settings import Settings, invalid_reported
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,10 @@ def named_component(kind: str, node: Mapping[str, object], asking: str) -> Compo
     ``asking`` is its origin, for the message.
     """
     try:
-        return make_component(kind, node)
+        with invalid_reported(f"{asking}: option of '{node['name']}' "):
+            return make_component(kind, node)
     except PydanticCustomError as error:
         raise InputError(f"{asking}: {error}") from error
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{asking}: option '{key}' of '{node['name']}': {message}") from error
 
 
 def is_auto(kind: str, name: object) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,28 +60,28 @@ class Settings(BaseModel):
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
 
 
-def validated(kind: type[Model], values: Mapping[str, object], what: str) -> Model:
-    """Settings of plain values by name; ``what`` is what messages call one of them, for instance ``mesh option``."""
+@contextmanager
+def invalid_reported(place: str, expected: str = "", do: str = "") -> Iterator[None]:
+    """Report the first problem that a validation in the block finds as an InputError, ``place`` before its key."""
     try:
-        return kind.model_validate(dict(values))
+        yield
     except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"{what} '{key}' = {value!r}: {message}") from error
+        first = error.errors()[0]
+        key, value = ".".join(map(str, first["loc"])), first["input"]
+        got = "" if isinstance(value, (dict, list, BaseModel)) else f" (got {value!r})"
+        raise InputError(f"{place}{key or 'content'}: {first['msg']}{got}", expected, do) from error
+
+
+def validated(kind: type[Model], values: Mapping[str, object], place: str, do: str = "") -> Model:
+    """Settings of plain values by name; ``place`` is what messages call one of them, for instance ``mesh option``."""
+    with invalid_reported(f"{place} ", do=do):
+        return kind.model_validate(dict(values))
 
 
 def read_validated(kind: type[Model], file: Path, expected: str) -> Model:
     """Read a JSON file as a model, strictly; InputError names the file and the key that is wrong."""
-    try:
+    with invalid_reported(f"{file}: ", expected):
         return kind.model_validate(read_json(file, expected), strict=True)
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{file}: {key or 'the file'}: {message}", expected) from error
-
-
-def first_error(error: ValidationError) -> tuple[str, str, object]:
-    """Dotted key, message and rejected value of the first problem that a validation found."""
-    first = error.errors()[0]
-    return ".".join(str(part) for part in first["loc"]), first["msg"], first["input"]
 
 
 def refuse_zero_ends(settings: Settings, start: str, end: str) -> None:

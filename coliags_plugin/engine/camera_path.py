@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from coliags_plugin.config.yaml_tree import tuples
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.core.settings import Settings, invalid_reported
 from coliags_plugin.outputs.video import check_rate
 
 _EXPECTED = "a camera path as `coliags view` saves it (docs/viewer.md 6)"
@@ -65,12 +63,8 @@ class CameraPath(Settings):
     @classmethod
     def read(cls, file: Path) -> CameraPath:
         """Read a path; InputError where the file is none."""
-        found: Any = read_json(file, _EXPECTED, finite=True)
-        try:
-            return cls.model_validate(tuples(found))
-        except ValidationError as error:
-            key, message, _ = first_error(error)
-            raise InputError(f"{file}: {key or 'content'}: {message}", _EXPECTED) from error
+        with invalid_reported(f"{file}: ", _EXPECTED):
+            return cls.model_validate(tuples(read_json(file, _EXPECTED, finite=True)))
 
     def cameras(self, like: Camera, fps: float) -> Iterator[Camera]:
         """Cameras of a video at a rate, of the size and near plane of a camera, with the principal point in the middle.

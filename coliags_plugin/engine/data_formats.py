@@ -8,17 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-from pydantic_core import PydanticCustomError
-
-from coliags_plugin.config.components import Component, is_auto, make_component, resolved
+from coliags_plugin.config.components import Component, is_auto, named_component, resolved
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import first_error
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.engine.progress import progress_callback
@@ -115,12 +110,6 @@ def open_scene(
 def _manager(name: str, options: Sequence[str], **more: str) -> DataManager:
     own = [option.removeprefix("datamanager.") for option in options]
     given = override_all(Node({}, "options"), own).plain()
-    try:
-        component = make_component("datamanagers", {**given, **more, "name": name})
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"--set {key}: {message}", f"an option of the format {name}") from error
-    except PydanticCustomError as error:
-        raise InputError(error.message()) from error
+    component = named_component("datamanagers", {**given, **more, "name": name}, "scene")
     manager: DataManager = component.target(component.settings)
     return manager

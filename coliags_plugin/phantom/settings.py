@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import (
     AfterValidator,
     Field,
-    ValidationError,
     field_validator,
     model_validator,
 )
@@ -18,8 +17,7 @@ from typing_extensions import Self
 
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.config.yaml_tree import tuples
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.core.settings import Settings, validated
 
 #: A colour matrix that changes nothing.
 SAME_COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -284,11 +282,4 @@ class PhantomSettings(Settings):
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
     """Validate plain options; an error names the first that is unknown, of the wrong type or out of range."""
     plain: dict[str, Any] = {name: tuples(value) for name, value in options.items()}
-    try:
-        return PhantomSettings(**plain)
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(
-            f"phantom setting {key or 'options'}: {message} (got {value!r})",
-            do="docs/phantom.md lists every setting with its unit and range",
-        ) from error
+    return validated(PhantomSettings, plain, "phantom setting", "docs/phantom.md lists all with their units and ranges")

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import (
@@ -24,7 +24,7 @@ from coliags_plugin.core.errors import (
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
-from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.reporting.numbers import duration
 
@@ -172,10 +172,10 @@ def read_record(file: Path, validate: Callable[[str, Any], T], do: str = "") -> 
                 f"format {FORMAT}, of version {__version__}",
                 "Choose another --output, or go on with that version",
             )
-        return validate(text, content)
+        with invalid_reported(f"cannot read {file}: ", "what `coliags reconstruct` wrote", do):
+            return validate(text, content)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        told = ": ".join(first_error(error)[:2]) if isinstance(error, ValidationError) else error
-        raise InputError(f"cannot read {file}: {told}", "what `coliags reconstruct` wrote", do) from error
+        raise InputError(f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", do) from error
 
 
 def _is_ours(path: Path) -> bool:

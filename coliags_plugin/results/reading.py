@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
-from coliags_plugin.core.settings import first_error
+from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import FORMAT, VERSION, Result
 
@@ -47,11 +45,8 @@ def read_result(path: Path) -> Result:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}", _EXPECTED) from error
     _check_version(_parsed(text, path), path)
-    try:
+    with invalid_reported(f"{path}: ", _EXPECTED, _AGAIN):
         result = Result.model_validate_json(text, strict=True)
-    except ValidationError as error:
-        key, message, _ = first_error(error)
-        raise InputError(f"{path}: {key or 'the file'}: {message}", _EXPECTED, _AGAIN) from error
     if metrics_sha256(result.sets) != result.metrics_sha256:
         raise InputError(
             f"{path}: the values do not have the hash metrics_sha256; the file was changed or damaged",

@@ -40,7 +40,7 @@ def test_an_unavailable_metric_keeps_its_reason(monkeypatch):
     ("metrics", "message"),
     [
         ({"sharpness": ("sharpnes", {})}, "protocol 'mine', metric 'sharpness': no metric 'sharpnes'"),
-        ({"psnr": ("psnr", {"peek": 1.0})}, "protocol 'mine', metric 'psnr': option 'peek' of 'psnr'"),
+        ({"psnr": ("psnr", {"peek": 1.0})}, "protocol 'mine', metric 'psnr': option of 'psnr' peek"),
     ],
 )
 def test_metrics_of_a_protocol_that_are_not_valid_are_named(metrics, message, monkeypatch):
