@@ -18,6 +18,7 @@ from coliags_plugin.config.options import (
     bytes_of,
     takes,
 )
+from coliags_plugin.core.files import refuse_existing
 from coliags_plugin.engine.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -242,10 +243,10 @@ class Run:
         """
         from coliags_plugin.api.scenes import coverage_settings
         from coliags_plugin.geometry.meshes.files import read_mesh
-        from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
+        from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
 
         chosen, folder = coverage_settings(options), options.output or self.path / "coverage"
-        check_free(folder, options.overwrite)
+        refuse_existing(folder, options.overwrite)
         file = options.mesh or self.path / "mesh" / "mesh.ply"
         if options.mesh is not None or file.is_file():
             wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.assignments import assignments, parse_assignments
 from coliags_plugin.config.options import CoverageOptions, takes
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_existing
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
@@ -68,14 +69,14 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
             together; or the folder exists or cannot be written.
     """
     from coliags_plugin.geometry.meshes.files import read_mesh
-    from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
+    from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
 
     if options.mesh is None or options.output is None:
         raise InputError(
             f"{data} is not a run folder", "a run folder, or a scene's folder with --mesh FILE and --output FOLDER"
         )
     chosen = coverage_settings(options)
-    check_free(options.output, options.overwrite)
+    refuse_existing(options.output, options.overwrite)
     recording, wall = open_recording(Path(data)), read_mesh(options.mesh)
     return measure_scene(recording, wall, options.output, chosen, options.overwrite)
 

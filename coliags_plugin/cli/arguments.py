@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import refuse_overlap
+from coliags_plugin.core.files import refuse_existing, refuse_overlap
 
 if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
@@ -68,5 +68,4 @@ def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tu
 def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
     """Refuse, before work starts, an output that is, contains or is in the input, or is there without ``overwrite``."""
     refuse_overlap(output, source)
-    if not overwrite and output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(f"{output} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+    refuse_existing(output, overwrite)

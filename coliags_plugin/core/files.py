@@ -46,15 +46,18 @@ def refuse_overlap(output: Path, source: Path) -> None:
         )
 
 
+def refuse_existing(target: Path, overwrite: bool, expected: str = "a new or empty folder") -> None:
+    """Refuse an output that is there, unless it is an empty folder or may be overwritten."""
+    if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target} already exists", expected, "Choose another, or pass --overwrite")
+
+
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     """Scratch folder that becomes ``target`` when the block ends without an error."""
     with _scratch(target) as path:
         with reporting_unwritable(target.parent):
-            if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
-                raise InputError(
-                    f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite"
-                )
+            refuse_existing(target, overwrite)
             os.mkdir(path)
         with reporting_unwritable(target.parent, only_full=True):
             yield path

@@ -120,12 +120,6 @@ def checkpoint_folder(folder: Path, step: int) -> Path:
     return folder / f"step-{step:06d}"
 
 
-def newest_checkpoint(folder: Path) -> Path | None:
-    """The checkpoint of the highest step; None where there is none."""
-    found = checkpoints_in_order(folder)
-    return found[-1] if found else None
-
-
 def keep_newest(folder: Path, count: int) -> None:
     """Remove all checkpoints but so many of the highest steps."""
     for path in checkpoints_in_order(folder)[:-count]:
@@ -134,7 +128,7 @@ def keep_newest(folder: Path, count: int) -> None:
 
 def take_newest(folder: Path, method: str, device: torch.device) -> Checkpoint | None:
     """The newest whole checkpoint, to go on from; None without one. Damaged ones are renamed to ``damaged-*``."""
-    while (newest := newest_checkpoint(folder)) is not None:
+    for newest in reversed(checkpoints_in_order(folder)):
         try:
             return read_checkpoint(newest, method, device)
         except DamagedCheckpointError as error:
@@ -142,14 +136,6 @@ def take_newest(folder: Path, method: str, device: torch.device) -> Checkpoint |
             logger.warning("%s; set aside as %s", error.seen, aside.name)
             newest.rename(aside)
     return None
-
-
-def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint of the highest step; refused where there is none."""
-    found = newest_checkpoint(folder)
-    if found is None:
-        raise InputError(f"no checkpoint in {folder}", "at least one step-* folder", "Train first: `coliags train`")
-    return found
 
 
 def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint:
@@ -186,41 +172,33 @@ def _fitting(what: str) -> Iterator[None]:
         raise InputError(f"{what}: {error}", "one of this run") from error
 
 
-def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:
-    """The model of a checkpoint; the scene is that of the run, for view modules with parameters per frame."""
+def restore_model(
+    checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer, scale: float = 1.0
+) -> Model:
+    """The model of a checkpoint, which trained on a scene at a scale; view modules have parameters of its frames."""
     with _fitting(f"the checkpoint does not fit field '{config.field.name}'"):
         field = config.field.target.from_state(checkpoint.part("field"), config.field.settings)
-    modules = make_view_modules(config, scene, torch.Generator())
+    modules = make_view_modules(config, scene.scaled(scale), torch.Generator())
     for name, module in modules.items():
         with _fitting(f"the checkpoint's module '{name}' does not fit"):
             module.load_state_dict(checkpoint.part(f"modules/{name}"))
-    return Model(field, renderer, modules, config.near_plane)
+    return Model(field, renderer, modules, config.near_plane, scale)
 
 
-def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> None:
-    """Load a strategy's counters."""
-    try:
-        strategy.load_state_dict(checkpoint.part("strategy"))
-    except KeyError as error:
-        raise InputError(
-            f"the checkpoint has no counter {error} of strategy '{name}'",
-            "one written by this version of the strategy",
-            "Train again with --overwrite",
-        ) from error
-
-
-def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
-    """Load Adam's moments."""
+def restore_training(
+    checkpoint: Checkpoint,
+    optimizers: Optimizers,
+    sampler: Sampler,
+    generators: Mapping[str, torch.Generator],
+    strategy: Strategy,
+) -> None:
+    """Load Adam's moments, the frames that were planned, the states of the random generators, a strategy's counters."""
     with _fitting("the checkpoint's moments are of another optimizer"):
         for key, value in checkpoint.part("optimizer").items():
             group, index, name = key.split("/")
             adam = optimizers.adam[group]
             adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
         optimizers.check_moments()
-
-
-def restore_sampling(checkpoint: Checkpoint, sampler: Sampler, generators: Mapping[str, torch.Generator]) -> None:
-    """Load the frames that were planned, and the states of the random generators."""
     queue, count = list(checkpoint.frame_queue), len(sampler.sizes)
     if any(frame >= count for frame in queue):
         raise InputError(f"the checkpoint plans frame {max(queue)}", f"one of {count} frames")
@@ -231,6 +209,8 @@ def restore_sampling(checkpoint: Checkpoint, sampler: Sampler, generators: Mappi
             raise KeyError(f"generators {', '.join(states)}")
         for name, state in states.items():
             generators[name].set_state(state)
+    with _fitting("the checkpoint lacks a counter of the strategy"):
+        strategy.load_state_dict(checkpoint.part("strategy"))
 
 
 def _damaged(path: Path, reason: str) -> DamagedCheckpointError:

@@ -1,4 +1,4 @@
-"""Evaluation of a run's held-out views under one protocol."""
+"""Evaluation of a run's held-out views under one protocol, and the result that is composed of it."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ import torch
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.engine.costs import RenderMeter
+from coliags_plugin.engine.checkpoints import checkpoint_folder
+from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_psnr
+from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.model import Model
-from coliags_plugin.engine.pose_refinement import refined_scores
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.run_result import EvaluatedSet, run_result
-from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.engine.truth import match_truth
+from coliags_plugin.engine.truth import Truth, match_truth
 from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
@@ -30,12 +32,23 @@ from coliags_plugin.outputs.colormaps import (
     common_limits,
 )
 from coliags_plugin.outputs.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
+from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
 from coliags_plugin.results.reading import RESULT_FILE, write_result
+from coliags_plugin.results.record import (
+    REFINED_SUFFIXES,
+    CostRecord,
+    MetricRecord,
+    ProtocolRecord,
+    Result,
+    SceneRecord,
+)
 from coliags_plugin.results.summaries import means_summary
 from coliags_plugin.results.tables import per_frame_table
 
 logger = logging.getLogger(__name__)
 
+#: Keys of the provenance of a run and of its scene that a result has in another place.
+_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "fingerprint", "held_out_used")
 #: Folder of an evaluation's expected depth, NaN where pixels are nearly transparent.
 EXPECTED_DEPTH = "expected_depth"
 
@@ -70,10 +83,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 placed = frame.to(trained.device)
                 output = meter.render(partial(scorer.render, trained.model, placed))
                 comparison = scorer.protocol.compare(output, placed)
-                evaluated[set_name].add(placed, comparison, output.alpha)
-                if refine_poses:
-                    for suffix, scores in refined_scores(trained.model, placed, scorer).items():
-                        evaluated[set_name].add_scores(frame.name, scores, suffix)
+                refined = scorer.refined(trained.model, placed) if refine_poses else ()
+                evaluated[set_name].add(placed, comparison, output.alpha, *refined)
                 _write_images(scratch, set_name, frame, comparison)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
@@ -127,3 +138,117 @@ def _write_depth_pictures(evaluation: Path, unit: str) -> None:
         picture = evaluation / "depth_pictures" / file.parent.name / f"{file.stem}.png"
         write_png(picture, colorize_depth(read_depth_tiff(file), limits, hatched=True))
     write_png(evaluation / "depth_pictures" / "scale.png", color_bar(limits, unit, "depth"))
+
+
+def run_result(
+    trained: TrainedRun,
+    scorer: Scorer,
+    evaluated: Mapping[str, EvaluatedSet],
+    meter: RenderMeter,
+    truth: Truth | None = None,
+) -> Result:
+    """Compose the result of a run from its test sets, at least one, and what rendering them cost.
+
+    ``truth`` is what it was evaluated against, if not its own scene.
+    """
+    protocol, provenance = scorer.protocol, trained.provenance
+    config = plain_config(trained.config.model_dump())
+    data = trained.scene if truth is None else truth.scene
+    sets = {name: part.record() for name, part in evaluated.items()}
+    scored = {name for part in evaluated.values() for name in part.scored}
+    metrics = scorer.metrics | {name: each for name, each in scorer.further_metrics.items() if name in scored}
+    deviations = _deviations(trained.step, config["schedule"]["steps"], provenance)
+    if truth is not None:
+        deviations["truth"] = data.provenance.get("fingerprint")
+    if any(name.endswith(REFINED_SUFFIXES) for name in scored):
+        deviations["refined"] = list(REFINED_SUFFIXES)
+    return Result(
+        key=result_key(
+            config,
+            str(trained.scene.provenance.get("fingerprint", "")),
+            trained.seed,
+            code_key(),
+            protocol.name,
+            protocol.version,
+            deviations,
+        ),
+        method=trained.method,
+        scene=_scene_record(data),
+        protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
+        seed=trained.seed,
+        steps=trained.step,
+        metrics={
+            name: MetricRecord(
+                unit=metric.unit.replace("mm", data.length_unit),
+                direction="higher" if metric.higher_is_better else "lower",
+            )
+            for name, metric in metrics.items()
+        },
+        sets=sets,
+        metrics_sha256=metrics_sha256(sets),
+        cost=_cost(trained, meter),
+        config=config,
+        software=software(),
+        provenance={
+            "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
+            "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
+            "scene": {name: value for name, value in data.provenance.items() if name not in _LEFT_OUT},
+            **({"held_out_used": used} if (used := trained.scene.provenance.get("held_out_used")) else {}),
+            **({"learned": learned} if (learned := trained.model.learned) else {}),
+            **({} if truth is None else {"truth": _described(truth, trained.scene)}),
+        },
+    )
+
+
+def _described(truth: Truth, own: Scene) -> JsonObject:
+    trained_on = {"name": own.name, **{key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")}}
+    return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
+
+
+def _scene_record(scene: Scene) -> SceneRecord:
+    """The record of a scene that has a test frame."""
+    split = scene.provenance.get("split", "")
+    camera = next(frame for frames in scene.test_sets.values() for frame in frames).camera
+    return SceneRecord(
+        name=scene.name,
+        fingerprint=str(scene.provenance.get("fingerprint", "")),
+        split=str(split.get("name", "") if isinstance(split, Mapping) else split),
+        train=tuple(frame.name for frame in scene.train),
+        size=(camera.width, camera.height),
+    )
+
+
+def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
+    rows = trained.run.log_rows(trained.step)
+    training = trained.cost or TrainingCost(device=str(trained.provenance["device"]))  # of a run that was imported
+    checkpoint = checkpoint_folder(trained.run.checkpoints, trained.step)
+    return CostRecord(
+        device=training.device,
+        threads=training.threads,
+        train_seconds=training.seconds,
+        processor_seconds=training.processor_seconds,
+        peak_memory_mib=training.peak_memory_mib,
+        render_fps=meter.fps,
+        render_device=device_name(trained.device),
+        render_threads=torch.get_num_threads(),
+        gaussians=meter.gaussians,
+        checkpoint_bytes=sum(file.stat().st_size for file in checkpoint.glob("*")) or None,
+        seconds_to_psnr=seconds_to_psnr(rows, len(trained.scene.train)),
+    )
+
+
+def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> JsonObject:
+    """How a run differs from one that goes through as configured, with this code; empty where it does not."""
+    lengths = ("steps", "written_for")
+    jumps = [
+        change
+        for change in provenance.get("schedule_changes", [])
+        if any(change["from"][name] != change["to"][name] for name in lengths)
+    ]
+    trained_with = provenance.get("code", code_key())
+    return {
+        **({} if step == configured else {"step": step}),
+        **({"schedule_changes": jumps} if jumps else {}),
+        **({} if trained_with == code_key() else {"trained_with": trained_with}),
+        **({"code_changes": provenance["code_changes"]} if "code_changes" in provenance else {}),
+    }

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import OPAQUE_ALPHA
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.rectification import fitted
 from coliags_plugin.engine.model import Model
-from coliags_plugin.engine.scoring import Scorer, Scores
-from coliags_plugin.results.record import REFINED_METRICS, REFINED_SUFFIXES
 
 #: Adam steps on each view; the first and last of their lengths, in pixels of the image that is rendered in them.
 STEPS, FIRST_STEP, LAST_STEP = 40, 0.5, 0.05
 #: Size that this image is within, pixels.
 _WITHIN = (192, 192)
-
-
-def refined_scores(model: Model, frame: Frame, scorer: Scorer) -> Mapping[str, Scores]:
-    """PSNR and SSIM of a held-out view, on the model's device, from its refined pose, by suffix."""
-    placed = replace(frame, camera=refined_camera(model, frame))
-    comparison = scorer.protocol.compare(scorer.render(model, placed), placed)
-    refined = dict(zip(REFINED_SUFFIXES, (comparison, _colors_fitted(comparison)), strict=True))
-    return {suffix: scorer.score(one, REFINED_METRICS) for suffix, one in refined.items()}
 
 
 def refined_camera(model: Model, frame: Frame) -> Camera:
@@ -64,7 +52,7 @@ def refined_camera(model: Model, frame: Frame) -> Camera:
         for _ in range(STEPS):
             turn, shift = pixel * motion[:3], pixel * depth * motion[3:]
             rgb = model.render(camera.moved(turn, shift, depth), ("rgb", "alpha"), view).rgb
-            error = masked_mean((rgb * _factors(rgb, image, valid) - image).abs(), valid)
+            error = masked_mean((rgb * color_factors(rgb, image, valid) - image).abs(), valid)
             if error.item() < least:
                 least, best = error.item(), motion.detach().clone()
             optimizer.zero_grad()
@@ -97,14 +85,8 @@ def _area_mean(values: Float[Tensor, "H W C"], camera: Camera) -> Float[Tensor, 
     return small[0].permute(1, 2, 0)
 
 
-def _colors_fitted(comparison: Comparison) -> Comparison:
-    """The comparison with each rendered colour multiplied by its best factor."""
-    factors = _factors(comparison.rgb, comparison.true_rgb, comparison.valid)
-    return replace(comparison, rgb=(comparison.rgb * factors).clamp(0.0, 1.0))
-
-
 @torch.no_grad()
-def _factors(
+def color_factors(
     rgb: Float[Tensor, "H W 3"], true: Float[Tensor, "H W 3"], valid: Bool[Tensor, "H W"]
 ) -> Float[Tensor, "3"]:
     """The factor on each colour of least squared difference over the valid pixels."""

@@ -96,8 +96,17 @@ class RunFolder:
     @property
     def step(self) -> int:
         """Steps taken until the newest checkpoint; 0 without one."""
+        return max(map(checkpoint_step, checkpoints_in_order(self.checkpoints)), default=0)
+
+    @property
+    def newest_checkpoint(self) -> Path:
+        """The checkpoint of the highest step; refused where there is none."""
         found = checkpoints_in_order(self.checkpoints)
-        return checkpoint_step(found[-1]) if found else 0
+        if not found:
+            raise InputError(
+                f"no checkpoint in {self.checkpoints}", "at least one step-* folder", "Train first: `coliags train`"
+            )
+        return found[-1]
 
     @classmethod
     def default(cls, scene: str, method: str) -> RunFolder:

@@ -1,21 +1,28 @@
-"""Scores of single views under a protocol."""
+"""Scores of views under a protocol: of single ones, and those of a test set."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.pose_refinement import color_factors, refined_camera
+from coliags_plugin.results.hashing import ArraysHash
+from coliags_plugin.results.profiles import ErrorProfiles
+from coliags_plugin.results.record import REFINED_METRICS, REFINED_SUFFIXES, SEEN_SUFFIX, SetRecord
 
 
 @dataclass(frozen=True)
@@ -24,6 +31,10 @@ class Scores:
 
     values: dict[str, float] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
+
+
+#: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
+SEEN_METRICS = ("psnr", "psnr_gain_fitted", "ssim", "depth_mse", "depth_median_error")
 
 
 class Scorer:
@@ -81,6 +92,87 @@ class Scorer:
             else:
                 scores.reasons[name] = f"the metric is {value}"
         return scores
+
+    def refined(self, model: Model, frame: Frame) -> tuple[Comparison, Comparison]:
+        """A frame, on the model's device, from its refined pose, as it is rendered, and with its colours fitted."""
+        found = replace(frame, camera=refined_camera(model, frame))
+        view = self.compare(model, found, frame.image.device)
+        factors = color_factors(view.rgb, view.true_rgb, view.valid)
+        return view, replace(view, rgb=(view.rgb * factors).clamp(0.0, 1.0))
+
+    @property
+    def further_metrics(self) -> dict[str, Metric]:
+        """Metrics that only some frames have: optional ones, those over seen pixels, and those from refined poses."""
+        known = self.metrics | self.optional_metrics
+        named = {name + SEEN_SUFFIX: name for name in SEEN_METRICS}
+        named |= {name + suffix: name for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS)}
+        return self.optional_metrics | {name: known[base] for name, base in named.items() if base in known}
+
+
+class EvaluatedSet:
+    """Scores, error profiles and hashes of one test set of a scene, whose unit of length is printed as ``unit``."""
+
+    def __init__(self, unit: str, scorer: Scorer) -> None:
+        self._scorer = scorer
+        self._rows: dict[str, dict[str, float]] = {}
+        self._reasons: dict[str, str] = {}
+        self._predictions, self._truth = ArraysHash(), ArraysHash()
+        self._profiles = ErrorProfiles(unit)
+        self._pixels = self._transparent = 0
+
+    def add(self, frame: Frame, comparison: Comparison, alpha: Float[Tensor, "H W"], *refined: Comparison) -> None:
+        """Score a frame under its protocol and take it up, with its rendered alpha, and views from a refined pose."""
+        self._pixels += int(frame.valid.sum())
+        self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
+        self._add_scores(frame.name, self._scorer.score(comparison))
+        if frame.seen is not None:
+            self._add_scores(frame.name, self._scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
+        for suffix, view in zip(REFINED_SUFFIXES, refined, strict=False):
+            self._add_scores(frame.name, self._scorer.score(view, REFINED_METRICS), suffix)
+        _hash(self._predictions, frame.name, rgb=comparison.rgb, depth=comparison.depth)
+        _hash(
+            self._truth,
+            frame.name,
+            rgb=comparison.true_rgb,
+            valid=comparison.valid,
+            depth=comparison.true_depth,
+            depth_valid=comparison.depth_valid,
+            seen=frame.seen,
+        )
+        self._profiles.add(comparison, frame)
+
+    def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
+        """Take up scores of a frame, under names with a suffix."""
+        row = self._rows.setdefault(frame, {})
+        row.update({name + suffix: value for name, value in scores.values.items()})
+        for name, reason in scores.reasons.items():
+            self._reasons.setdefault(name + suffix, reason)
+
+    @property
+    def scored(self) -> set[str]:
+        """Names of the metrics that some frame has."""
+        return {name for row in self._rows.values() for name in row}
+
+    def record(self) -> SetRecord:
+        """The set's record; the protocol's metrics are listed even where no frame has one."""
+        rows, scored = self._rows.values(), self.scored
+        names = [*self._scorer.metrics, *(name for name in self._scorer.further_metrics if name in scored)]
+        lacking = self._scorer.optional_metrics.keys() - scored
+        return SetRecord(
+            frames=tuple(self._rows),
+            values={name: tuple(row.get(name) for row in rows) for name in names},
+            reasons={name: reason for name, reason in self._reasons.items() if name not in lacking},
+            predictions_sha256=self._predictions.hexdigest(),
+            truth_sha256=self._truth.hexdigest(),
+            profiles=self._profiles.records(),
+            transparent=self._transparent / self._pixels if self._pixels else None,
+        )
+
+
+def _hash(target: ArraysHash, frame: str, **parts: Tensor | None) -> None:
+    for name, values in parts.items():
+        if values is not None:
+            target.add(frame, name, values.detach().cpu().numpy())
 
 
 def within_seen(comparison: Comparison, frame: Frame) -> Comparison:

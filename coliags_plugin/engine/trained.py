@@ -13,13 +13,7 @@ import torch
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine.checkpoints import (
-    checkpoint_folder,
-    latest_checkpoint,
-    newest_checkpoint,
-    read_checkpoint,
-    restore_model,
-)
+from coliags_plugin.engine.checkpoints import read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.data_formats import load_scene, recorded_scale
 from coliags_plugin.engine.model import Model
@@ -72,7 +66,7 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     config = run.method().config
     identity, provenance = run.identity(), run.provenance()
     method, folder = identity.method, data or identity.scene_path
-    saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
+    saved = read_checkpoint(run.newest_checkpoint, method, device)
     scale = recorded_scale(provenance["scene"]["provenance"])
     scene = load_scene(config, folder).with_near_plane(config.near_plane / scale)
     if scene.provenance.get("fingerprint") != identity.fingerprint:
@@ -80,18 +74,14 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
             f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
         )
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
-    model = restore_model(saved, config, scene.scaled(scale), renderer).to(device).eval()
-    model.scale = scale
+    model = restore_model(saved, config, scene, renderer, scale).to(device).eval()
     return TrainedRun(run, config, method, scene, model, saved.step, device, identity.seed, provenance, saved.cost)
 
 
 def load_newer(trained: TrainedRun) -> TrainedRun | None:
     """The run at a checkpoint that was written since it was loaded; None where there is none."""
-    newest = newest_checkpoint(trained.run.checkpoints)
-    if newest is None or newest == checkpoint_folder(trained.run.checkpoints, trained.step):
+    if trained.run.step in (0, trained.step):
         return None
-    saved, scale = read_checkpoint(newest, trained.method, trained.device), trained.model.scale
-    model = restore_model(saved, trained.config, trained.scene.scaled(scale), trained.model.renderer)
-    model = model.to(trained.device).eval()
-    model.scale = scale
+    saved, old = read_checkpoint(trained.run.newest_checkpoint, trained.method, trained.device), trained.model
+    model = restore_model(saved, trained.config, trained.scene, old.renderer, old.scale).to(trained.device).eval()
     return replace(trained, model=model, step=saved.step, cost=saved.cost)

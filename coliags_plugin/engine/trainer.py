@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from coliags_plugin.config.method_config import LoadedMethod
-from coliags_plugin.contracts import Draw, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
+from coliags_plugin.contracts import Draw, Field, Follower, Loss, Sampler, Schedule, Strategy, TrainingStep
 from coliags_plugin.core.errors import DeviceMemoryError, InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
@@ -51,13 +51,20 @@ MAX_PSNR = 100.0
 
 
 class Trainer:
-    """Trains one method on one scene into one run folder.
+    """Trains one method on one scene into one run folder, from a field of its own unless one is given.
 
-    Whether the components fit each other and the scene is found out before anything is written.
+    Components that fit neither each other nor the scene are refused before anything is written.
     """
 
     def __init__(
-        self, method: LoadedMethod, scene: Scene, scene_path: str, run: RunFolder, seed: int, device: torch.device
+        self,
+        method: LoadedMethod,
+        scene: Scene,
+        scene_path: str,
+        run: RunFolder,
+        seed: int,
+        device: torch.device,
+        field: Field | None = None,
     ) -> None:
         config = method.config
         scene = scene.with_near_plane(config.near_plane)
@@ -74,7 +81,8 @@ class Trainer:
             config.strategy.settings, self.generators["densification"], self.schedule, scene.extent
         )
         check_components(config, self.chosen, scene, self.losses, self.schedule)
-        field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
+        if field is None:
+            field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
         modules = make_view_modules(config, scene, self.generators["initialisation"])
         for module in modules.values():
             module.prepare(scene)
@@ -117,9 +125,7 @@ class Trainer:
         self.model = checkpoints.restore_model(saved, self.method.config, self.scene, self.chosen.renderer)
         self.model.to(self.device)
         self.optimizers = self._optimizers()
-        checkpoints.restore_optimizers(saved, self.optimizers)
-        checkpoints.restore_sampling(saved, self.sampler, self.generators)
-        checkpoints.restore_strategy(saved, self.strategy, self.method.config.strategy.name)
+        checkpoints.restore_training(saved, self.optimizers, self.sampler, self.generators, self.strategy)
         self.step = saved.step
         return saved.cost
 

@@ -181,7 +181,7 @@ def test_a_checkpoint_without_a_counter_of_the_strategy_is_refused(tmp_path, mon
     trainer.save()
     later = start(tmp_path / "run")
     monkeypatch.setattr(type(later.strategy), "counters", (*later.strategy.counters, "born"))
-    with pytest.raises(InputError, match="no counter 'born' of strategy 'anchor-growth'"):
+    with pytest.raises(InputError, match="lacks a counter of the strategy: 'born'"):
         later.resume()
 
 

@@ -11,7 +11,7 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.checkpoints import read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
@@ -193,13 +193,13 @@ def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):
         scorer = Scorer("paper", only=("psnr",))
         compared = scorer.compare(trainer.model, trainer.scene.test_sets["test"][0], CUDA)
         assert scorer.score(compared).values["psnr"] > 0
-        last = latest_checkpoint(trainer.run.checkpoints)
+        last = trainer.run.newest_checkpoint
         first = read_checkpoint(last, method, torch.device("cpu"))
         shutil.rmtree(last)
         again = make_trainer(tmp_path / "run", method)
         again.resume()
         again.train()
-    second = read_checkpoint(latest_checkpoint(again.run.checkpoints), method, torch.device("cpu"))
+    second = read_checkpoint(again.run.newest_checkpoint, method, torch.device("cpu"))
     assert all(torch.equal(tensor, second.tensors[name]) for name, tensor in first.tensors.items())
 
 

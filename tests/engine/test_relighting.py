@@ -14,7 +14,7 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.checkpoints import read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.lighting.lamps import Lamp
@@ -125,7 +125,7 @@ def test_resume_is_bit_exact_with_noise_and_growth(tmp_path):
     resumed = resumable(tmp_path / "cut")
     resumed.resume()
     resumed.train()
-    states = [read_checkpoint(latest_checkpoint(each.run.checkpoints), "pr-endo", CPU) for each in (whole, resumed)]
+    states = [read_checkpoint(each.run.newest_checkpoint, "pr-endo", CPU) for each in (whole, resumed)]
     assert states[0].step == states[1].step == 14
     assert len(states[0].tensors["field/means"]) > len(wall_scene().points)
     assert states[0].tensors.keys() == states[1].tensors.keys()

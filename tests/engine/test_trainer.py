@@ -18,8 +18,6 @@ from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFinit
 from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,
-    latest_checkpoint,
-    newest_checkpoint,
     read_checkpoint,
     take_newest,
 )
@@ -58,7 +56,7 @@ def train(path, **options):
 
 
 def final_state(trainer):
-    return read_checkpoint(latest_checkpoint(trainer.run.checkpoints), trainer.method.name, CPU)
+    return read_checkpoint(trainer.run.newest_checkpoint, trainer.method.name, CPU)
 
 
 def assert_same(first, second):
@@ -280,7 +278,7 @@ def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):
     with pytest.raises(NotFiniteError, match=r"field/geometry_head\.opacity_mlp\.0\.weight"):
         trainer.save()
     assert [path.name for path in trainer.run.checkpoints.iterdir()] == ["step-000001"]
-    assert latest_checkpoint(trainer.run.checkpoints).name == "step-000001"
+    assert trainer.run.newest_checkpoint.name == "step-000001"
 
 
 def test_checkpoints_by_the_clock_and_how_many_are_kept(tmp_path):
@@ -308,7 +306,7 @@ def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
     resumed.resume()
     assert resumed.step == 2
     assert "step-000006 is damaged: state.safetensors is not what was written; set aside as damaged-" in caplog.text
-    assert newest_checkpoint(folder).name == "step-000002"
+    assert trainer.run.newest_checkpoint.name == "step-000002"
     assert sorted(path.name.rsplit("-", 1)[0] for path in folder.glob("damaged-*")) == [
         "damaged-step-000004",
         "damaged-step-000006",
@@ -327,7 +325,7 @@ def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
 )
 def test_planned_frames_that_are_none_are_refused(tmp_path, frames, message):
     trainer = train(tmp_path / "run", steps=2)
-    checkpoint = latest_checkpoint(trainer.run.checkpoints)
+    checkpoint = trainer.run.newest_checkpoint
     state = json.loads((checkpoint / "state.json").read_text())
     (checkpoint / "state.json").write_text(json.dumps({**state, "frame_queue": frames}))
     write_checksums(checkpoint)
@@ -337,7 +335,7 @@ def test_planned_frames_that_are_none_are_refused(tmp_path, frames, message):
 
 def test_moments_and_random_states_of_another_run_are_refused(tmp_path):
     trainer = train(tmp_path / "run", steps=2)
-    whole = read_checkpoint(latest_checkpoint(trainer.run.checkpoints), "coliags", CPU)
+    whole = read_checkpoint(trainer.run.newest_checkpoint, "coliags", CPU)
     for name in ("optimizer/none/0/exp_avg", "optimizer/anchors", "generator/none", "generator/frame_order"):
         with pytest.raises(InputError, match=r"moments are of another optimizer|random state does not fit"):
             trainer._restore(replace(whole, tensors={**whole.tensors, name: torch.zeros(3)}))
@@ -351,7 +349,7 @@ def test_moments_and_random_states_of_another_run_are_refused(tmp_path):
 
 
 def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):
-    checkpoint = latest_checkpoint(train(tmp_path / "run", steps=1).run.checkpoints)
+    checkpoint = train(tmp_path / "run", steps=1).run.newest_checkpoint
     assert subprocess.run(["sha256sum", "--check", "--quiet", CHECKSUMS], cwd=checkpoint, check=False).returncode == 0
     generator = np.random.default_rng(0)
     for file in sorted(checkpoint.iterdir()):
@@ -368,7 +366,7 @@ def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):
 
 @pytest.mark.parametrize("change", [{"format": 99}, {"method": "other"}])
 def test_a_checkpoint_of_something_else_is_not_set_aside(tmp_path, change):
-    checkpoint = latest_checkpoint(train(tmp_path / "run", steps=1).run.checkpoints)
+    checkpoint = train(tmp_path / "run", steps=1).run.newest_checkpoint
     state = checkpoint / "state.json"
     state.write_text(json.dumps({**json.loads(state.read_text()), **change}))
     write_checksums(checkpoint)

@@ -15,7 +15,7 @@ from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import write_json
+from coliags_plugin.core.files import refuse_existing, write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.model import Model
@@ -66,10 +66,7 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     for form, output in outputs.items():
         check_format(form)
         for target in (output, _record_file(output)):
-            if target.exists() and not options.overwrite:
-                raise InputError(
-                    f"{target} already exists", "a new file", "Choose another --output, or pass --overwrite"
-                )
+            refuse_existing(target, options.overwrite, "a new file")
     field = _gaussian_field(trained)
     baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     held = baked_in if field.knows_lamp else None

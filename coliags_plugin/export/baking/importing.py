@@ -7,19 +7,13 @@ from pathlib import Path
 
 import torch
 
-from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine.checkpoints import save_checkpoint
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
-from coliags_plugin.engine.model import Model, make_view_modules
-from coliags_plugin.engine.optimizers import Optimizers
-from coliags_plugin.engine.provenance import run_provenance
-from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.splats.cloud import SplatCloud, load_cloud
 from coliags_plugin.export.splats.files import read_splats
-from coliags_plugin.renderers.choice import choose_renderer
 
 log = logging.getLogger(__name__)
 
@@ -48,31 +42,16 @@ def import_run(
     config = method.config
     scene = load_scene(config, data)
     _warn_of_another_frame(scene, cloud, file)
-    chosen = choose_renderer(config.renderer, config.field.target.primitive, device)
     field = config.field.target(config.field.settings, len(cloud))
     load_cloud(field, cloud)
-    streams = generators(0)
-    modules = make_view_modules(config, scene, streams["initialisation"])
-    model = Model(field, chosen.renderer, modules)
-    schedule = Schedule(config.schedule.steps, config.schedule.written_for)
-    sizes = [(frame.camera.width, frame.camera.height) for frame in scene.train]
-    provenance = {
-        **run_provenance(method, scene, output.relative(data), 0, device, chosen, model),
-        "imported": {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree},
-    }
+    trainer = Trainer(method, scene, str(data.resolve()), output, 0, device, field)
+    provenance = trainer.provenance()
+    del provenance["plan"]
+    provenance["imported"] = {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree}
     with atomic_folder(output.path, overwrite=True) as scratch:
-        run = RunFolder(scratch)
-        run.rewrite(config.to_yaml(), provenance)
-        save_checkpoint(
-            run.checkpoints,
-            0,
-            method.name,
-            model,
-            Optimizers(model, config.optimizers, schedule.steps, scene.extent),
-            config.strategy.target(config.strategy.settings, streams["densification"], schedule, scene.extent),
-            streams,
-            config.sampler.target(config.sampler.settings, sizes, streams["frame_order"]),
-        )
+        trainer.run = RunFolder(scratch)
+        trainer.run.rewrite(config.to_yaml(), provenance)
+        trainer.save()
 
 
 def _warn_of_another_frame(scene: Scene, cloud: SplatCloud, file: Path) -> None:

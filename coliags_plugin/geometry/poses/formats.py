@@ -12,6 +12,7 @@ import numpy as np
 
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_existing
 from coliags_plugin.core.text_files import text_lines
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
@@ -80,8 +81,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: b
             f"{path} is a {'folder' if path.is_dir() else 'file'}",
             f"a new {'folder' if known.folder else 'file'}, as {name} poses are one",
         )
-    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError(f"{path} already exists", "a new path", "Choose another, or pass --overwrite")
+    refuse_existing(path, overwrite, "a new path")
     known.write(path, trajectory)
 
 

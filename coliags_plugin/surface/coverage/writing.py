@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_write, refuse_existing, write_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import progress_callback
@@ -50,7 +49,7 @@ def measure_scene(
 
     Where no section of a lumen can be measured, what was seen of the wall is written alone, and why.
     """
-    check_free(output, overwrite)
+    refuse_existing(output, overwrite)
     views = recorded_views(scene)
     with progress_callback() as progress:
         coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)
@@ -69,12 +68,6 @@ def measure_scene(
 def open_recording(path: Path) -> Scene:
     """A scene without initial points, whose images are read when they are used."""
     return open_scene(path, None, ("initial_points=none", "keep_pixels=false"))
-
-
-def check_free(folder: Path, overwrite: bool) -> None:
-    """Refuse an output folder that exists, before any work is done."""
-    if not overwrite and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
 
 
 def colored_mesh(coverage: SeenWall) -> TriangleMesh:

@@ -139,7 +139,7 @@ def test_input_that_cannot_be_measured_is_refused():
         facing_cameras(mesh, [])
     with pytest.raises(InputError, match="without triangles"):
         see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))])
-    with pytest.raises(InputError, match="coverage option far: .*got -3.0"):
+    with pytest.raises(InputError, match=r"coverage option far: .*got -3\.0"):
         validated(CoverageSettings, {"far": -3.0}, "coverage option")
 
 
