@@ -46,15 +46,19 @@ class Run:
         data: The scene's folder, where it has moved since training.
         device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
 
+    Attributes ``path``, ``method``, ``scene_name`` and ``seed`` (of all its random generators) tell what it is.
+
     Raises:
         InputError: This is no run folder, or a file of it is damaged.
     """
 
     def __init__(self, path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> None:
         self.folder = RunFolder.existing(Path(path))
+        self.path = self.folder.path
         self.data = None if data is None else Path(data)
         self.device = device
-        self._identity = self.folder.identity()
+        self._identity = identity = self.folder.identity()
+        self.method, self.scene_name, self.seed = identity.method, identity.scene_name, identity.seed
         self._loaded: TrainedRun | None = None
 
     def __repr__(self) -> str:
@@ -62,26 +66,6 @@ class Run:
         relit = ", relit" if self._loaded is not None and self._loaded.relit else ""
         steps = f"step {self.step} of {self._identity.steps}"
         return f"{self.method} on {self.scene_name}, seed {self.seed}, {steps}{relit}: {self.path}"
-
-    @property
-    def path(self) -> Path:
-        """The run folder."""
-        return self.folder.path
-
-    @property
-    def method(self) -> str:
-        """Name of its method."""
-        return self._identity.method
-
-    @property
-    def scene_name(self) -> str:
-        """Name of its scene."""
-        return self._identity.scene_name
-
-    @property
-    def seed(self) -> int:
-        """Of all its random generators."""
-        return self._identity.seed
 
     @property
     def step(self) -> int:
@@ -299,9 +283,7 @@ class Run:
         from coliags_plugin.lighting.lamps import Lamp
 
         made = validated(Lamp, lamp, "lamp option")
-        relit = Run(self.path, data=self.data, device=self.device)
-        relit._loaded = relight(self.load(), made)
-        return relit
+        return self._relit(relight(self.load(), made))
 
     def flatten(self) -> Run:
         """The run in the same light everywhere, without gain, for rendering; it shares the parameters.
@@ -313,9 +295,12 @@ class Run:
         """
         from coliags_plugin.engine.held_light import flatten
 
-        flat = Run(self.path, data=self.data, device=self.device)
-        flat._loaded = flatten(self.load())
-        return flat
+        return self._relit(flatten(self.load()))
+
+    def _relit(self, trained: TrainedRun) -> Run:
+        relit = Run(self.path, data=self.data, device=self.device)
+        relit._loaded = trained
+        return relit
 
 
 def _scene_of_size(path: Path, like: Scene) -> Scene:
@@ -325,10 +310,4 @@ def _scene_of_size(path: Path, like: Scene) -> Scene:
     return open_scene(path, options=[f"width={camera.width}", f"height={camera.height}"])
 
 
-def load_run(path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> Run:
-    """Handle of a run that is there; see :class:`Run` for the arguments.
-
-    Raises:
-        InputError: This is no run folder.
-    """
-    return Run(path, data=data, device=device)
+load_run = Run

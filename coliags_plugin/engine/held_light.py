@@ -10,7 +10,7 @@ import torch
 from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import GaussianField, LitField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
@@ -63,8 +63,7 @@ LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight | None]] = {
 
 def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight | None:
     """The light of a name in :data:`LIGHTS`, for a model of Gaussians and its training cameras."""
-    if name not in LIGHTS:
-        raise InputError(f"no light '{name}'", f"one of {', '.join(LIGHTS)}", did_you_mean(name, LIGHTS))
+    check_name("light", name, LIGHTS)
     return LIGHTS[name](model, cameras)
 
 

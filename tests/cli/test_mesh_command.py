@@ -17,8 +17,7 @@ from tests.surface.meshing.exact import exact_run
 def run_folder(tmp_path, monkeypatch):
     """A run whose depth is exact; ``Run`` finds it whatever folder it is given."""
     folder = tmp_path / "run"
-    monkeypatch.setattr(Run, "__init__", lambda self, path, **_: setattr(self, "folder", None))
-    monkeypatch.setattr(Run, "path", folder)
+    monkeypatch.setattr(Run, "__init__", lambda self, path, **_: setattr(self, "path", folder))
     monkeypatch.setattr(Run, "load", lambda self: exact_run(frames=9))
     return folder
 

@@ -11,21 +11,18 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError, NothingDrawnError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.compatibility import _check_data, _check_sampler
-from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.losses.photometric import L1Loss
 from coliags_plugin.modules.gain import FrameGain
 from coliags_plugin.renderers.choice import ChosenRenderer
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer
-from tests.scenes import SMALL, wall_scene
+from tests.engine.test_trainer import MODULES, make_trainer
+from tests.scenes import wall_scene
 
 LOSSES = ("l1", "d-ssim", "scale-volume")
 
 
 def start(folder, overrides=(), method="scaffold-gs", scene=None):
-    small = [change for change in SMALL if "voxel" not in change or "scaffold" in method]
-    loaded = load_method(method, [*small, "schedule.steps=20", *overrides])
-    return Trainer(loaded, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
+    return make_trainer(folder, method, 20, scene, overrides=overrides)
 
 
 def test_what_was_made_from_held_out_images_is_warned_of(tmp_path, caplog):
@@ -135,35 +132,9 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     assert "estimated" not in caplog.text
 
 
-def test_a_run_with_modules_resumes_to_the_bit(tmp_path):
-    modules = [
-        "modules.exposure=gain",
-        'optimizers."exposure.gain"={lr: 0.01}',
-        "modules.poses=pose-correction",
-        'optimizers."poses.rotation"={lr: 0.001}',
-        'optimizers."poses.translation"={lr: 0.01}',
-    ]
-    straight, broken = (start(tmp_path / name, modules) for name in ("straight", "broken"))
-    for trainer in (straight, broken):
-        trainer.start()
-    for _ in range(6):
-        straight.take_step()
-    for _ in range(3):
-        broken.take_step()
-    broken.save()
-    resumed = start(tmp_path / "broken", modules)
-    resumed.resume()
-    for _ in range(3):
-        resumed.take_step()
-    ours, theirs = straight.model.state_dict(), resumed.model.state_dict()
-    assert ours.keys() == theirs.keys() and any("log_gain" in name for name in ours)
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-    assert straight.provenance()["untrained_views"].keys() == {"exposure", "poses"}
-
-
 def test_a_checkpoint_of_other_modules_is_refused(tmp_path):
-    modules = ["modules.exposure=gain", 'optimizers."exposure.gain"={lr: 0.01}']
-    trainer = start(tmp_path / "run", modules)
+    trainer = start(tmp_path / "run", MODULES)
+    assert trainer.provenance()["untrained_views"].keys() == {"exposure", "poses"}
     trainer.start()
     trainer.take_step()
     trainer.save()
@@ -171,7 +142,7 @@ def test_a_checkpoint_of_other_modules_is_refused(tmp_path):
         start(tmp_path / "run").resume()
     fewer = replace(wall_scene(), train=wall_scene().train[:3])
     with pytest.raises(InputError, match="module 'exposure' does not fit"):
-        start(tmp_path / "run", modules, scene=fewer).resume()
+        start(tmp_path / "run", MODULES, scene=fewer).resume()
 
 
 def test_a_checkpoint_without_a_counter_of_the_strategy_is_refused(tmp_path, monkeypatch):

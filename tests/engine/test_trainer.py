@@ -43,9 +43,44 @@ EARLY_GROWTH = (
 )
 
 
-def make_trainer(path, method="coliags", steps=6, scene=None, seed=0, overrides=()):
-    overrides = [*SMALL, f"schedule.steps={steps}", *overrides]
-    return Trainer(load_method(method, overrides), scene or wall_scene(), "wall", RunFolder(path), seed, CPU)
+MODULES = (
+    "modules.exposure=gain",
+    'optimizers."exposure.gain"={lr: 0.01}',
+    "modules.poses=pose-correction",
+    'optimizers."poses.rotation"={lr: 0.001}',
+    'optimizers."poses.translation"={lr: 0.01}',
+)
+#: Growth and both regularization losses of surfels within a few steps.
+SURFELS = (
+    "renderer=torch",
+    "schedule.written_for=14",
+    "losses.distortion.from_step=3",
+    "losses.normals.from_step=5",
+    "strategy.densify_from=1",
+    "strategy.until=12",
+    "strategy.every=4",
+    "strategy.reset_every=9",
+    "strategy.gradient_threshold=1e-4",
+    "strategy.min_opacity=0.09",
+)
+#: Noise and growth of Gaussians that are lit.
+LIT = (
+    "schedule.written_for=14",
+    "field.network_from=3",
+    "field.normal_neighbours=10",
+    "strategy.densify_from=2",
+    "strategy.until=12",
+    "strategy.every=4",
+    "strategy.gradient_threshold=1e-7",
+    "strategy.prune_above=0",
+    "losses.diffuse-factor={from_step: 3, until_step: 12}",
+)
+
+
+def make_trainer(path, method="coliags", steps=6, scene=None, seed=0, overrides=(), device=CPU):
+    small = SMALL if load_method(method).config.field.name == "anchors" else (SMALL[0], SMALL[2])
+    loaded = load_method(method, [*small, f"schedule.steps={steps}", *overrides])
+    return Trainer(loaded, scene or wall_scene(), "wall", RunFolder(path), seed, device)
 
 
 def train(path, **options):
@@ -88,25 +123,46 @@ def test_another_seed_is_another_run(tmp_path):
     assert not torch.equal(final_state(first).tensors["field/features"], final_state(other).tensors["field/features"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_resumes_to_the_bit(tmp_path, number, request):
+@pytest.mark.parametrize(
+    ("method", "steps", "cut", "overrides", "number"),
+    [
+        ("coliags", 16, 7, EARLY_GROWTH, signal.SIGINT),
+        ("scaffold-gs", 6, 3, MODULES, signal.SIGTERM),
+        ("scaffold-gs", 6, 3, MODULES, signal.SIGHUP),
+        pytest.param("2dgs", 14, 6, SURFELS, signal.SIGINT, marks=pytest.mark.thorough),
+        pytest.param("pr-endo", 14, 6, LIT, signal.SIGINT, marks=pytest.mark.thorough),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_interrupted_run_resumes_to_the_bit(tmp_path, request, method, steps, cut, overrides, number):
     """Interrupted in the middle of a round, resumed by a fresh trainer: the same bits as never interrupted."""
     before = signal.signal(number, signal.default_int_handler)  # nohup and background jobs ignore some of them
     request.addfinalizer(lambda: signal.signal(number, before))
-    whole = train(tmp_path / "whole", steps=16, overrides=EARLY_GROWTH)
-    cut = make_trainer(tmp_path / "cut", steps=16, overrides=EARLY_GROWTH)
-    cut.start()
-    _stop_after(cut, 7, number)
-    with pytest.raises(InterruptedRunError, match="stopped after step 7"):
-        cut.train()
-    resumed = make_trainer(tmp_path / "cut", steps=16, overrides=EARLY_GROWTH)
+    options = {"method": method, "steps": steps, "overrides": overrides}
+    whole, broken = train(tmp_path / "whole", **options), make_trainer(tmp_path / "cut", **options)
+    broken.start()
+    _stop_after(broken, cut, number)
+    with pytest.raises(InterruptedRunError, match=f"stopped after step {cut}"):
+        broken.train()
+    resumed = make_trainer(tmp_path / "cut", **options)
     resumed.resume()
-    assert resumed.step == 7
+    assert resumed.step == cut
     resumed.train()
     assert_same(final_state(whole), final_state(resumed))
     assert without_clock(log_rows(whole)) == without_clock(log_rows(resumed))
-    assert sum(row.get("grown", 0) for row in log_rows(resumed)) > 0
-    assert sum(row.get("pruned", 0) for row in log_rows(resumed)) > 0
+    changes = {name: sum(row.get(name, 0) for row in log_rows(resumed)) for name in ("grown", "pruned")}
+    assert changes["grown"] > 0 or overrides is MODULES
+    assert changes["pruned"] > 0 or overrides in (MODULES, LIT)
+
+
+@pytest.mark.thorough
+def test_losses_of_surfels_begin_one_after_the_other(tmp_path):
+    rows = log_rows(train(tmp_path / "run", method="2dgs", steps=14, overrides=SURFELS))
+    for row in rows:
+        later = {"distortion": row["step"] > 3, "normals": row["step"] > 5}
+        assert set(row["terms"]) == {"l1", "d-ssim", *(name for name, begun in later.items() if begun)}
+    assert 0 < rows[-1]["terms"]["normals"] < 2 and rows[-1]["terms"]["distortion"] > 0
+    assert rows[8]["loss"] < rows[0]["loss"]  # the last before opacities are reset
 
 
 def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
@@ -211,16 +267,17 @@ def test_overwrite_spares_folders_that_are_no_runs(tmp_path):
         make_trainer(tmp_path / "precious").start(overwrite=True)
 
 
-def test_resume_with_other_settings_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"overrides": ["field.features=16"]}, "other settings of field"),
+        ({"scene": wall_scene(frames=12)}, "not the data"),
+    ],
+)
+def test_resuming_another_run_is_refused(tmp_path, changed, message):
     train(tmp_path / "run", steps=1)
-    with pytest.raises(InputError, match="other settings of field"):
-        make_trainer(tmp_path / "run", overrides=["field.features=16"]).resume()
-
-
-def test_resume_on_other_data_is_refused(tmp_path):
-    train(tmp_path / "run", steps=1)
-    with pytest.raises(InputError, match="not the data"):
-        make_trainer(tmp_path / "run", scene=wall_scene(frames=12)).resume()
+    with pytest.raises(InputError, match=message):
+        make_trainer(tmp_path / "run", **changed).resume()
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):

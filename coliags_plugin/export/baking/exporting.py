@@ -14,7 +14,7 @@ import torch
 from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import refuse_existing, write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import held_light, render_held
@@ -26,7 +26,7 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
-from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, write_splats
+from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, write_splats
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.reporting.numbers import counted
 
@@ -64,7 +64,7 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     file = options.output or trained.run.path / "export" / f"{trained.provenance['scene']['name']}.{formats[0]}"
     outputs = {form: file.with_suffix(f".{form}") if len(formats) > 1 else file for form in formats}
     for form, output in outputs.items():
-        check_format(form)
+        check_name("format", form, FORMATS)
         for target in (output, _record_file(output)):
             refuse_existing(target, options.overwrite, "a new file")
     field = _gaussian_field(trained)

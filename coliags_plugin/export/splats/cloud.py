@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float32
 
 from coliags_plugin.core import bounds
-from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
@@ -65,14 +64,6 @@ class SplatCloud:
         inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
         return np.log(inside / (1.0 - inside)).astype(np.float32)
 
-    @classmethod
-    def of(cls, gaussians: Gaussians) -> SplatCloud:
-        """Finite Gaussians of a view, or of none in particular, of any device, with harmonics of degree 0."""
-        parts = (gaussians.means, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors)
-        means, quats, scales, opacities, colors = (part.detach().cpu().float().numpy() for part in parts)
-        cloud = cls(means, quats, scales, opacities, harmonics_of_colors(colors))
-        return cloud.part(cloud._finite())
-
     def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
         """Some of the Gaussians."""
         return SplatCloud(**{name: values[kept] for name, values in self._arrays().items()})
@@ -87,20 +78,13 @@ class SplatCloud:
         """The arrays that it has, by the names of their fields."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
-    def _finite(self) -> Bool[np.ndarray, "N"]:
-        """Which have a rotation and finite numbers only. [N]"""
-        finite = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in self._arrays().values()]
-        with np.errstate(over="ignore", invalid="ignore"):
-            turned = np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24
-        return np.all([*finite, turned], axis=0)
-
     def usable(self) -> Bool[np.ndarray, "N"]:
         """Which Gaussians are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
-        usable = self._finite()
-        with np.errstate(invalid="ignore"):
-            for lengths in (self.means, self.scales):
-                usable &= (np.abs(lengths) <= bounds.LENGTH).all(axis=1)
-        return usable
+        parts = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in self._arrays().values()]
+        with np.errstate(over="ignore", invalid="ignore"):
+            parts.append(np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
+            parts += [(np.abs(lengths) <= bounds.LENGTH).all(axis=1) for lengths in (self.means, self.scales)]
+        return np.all(parts, axis=0)
 
     def with_thickness(self, share: float) -> SplatCloud:
         """Surfels as flat Gaussians, their third scale a share of the smaller other one; Gaussians unchanged."""
@@ -113,11 +97,6 @@ class SplatCloud:
 def sigmoid(logits: Float32[np.ndarray, "N"]) -> Float32[np.ndarray, "N"]:
     """Opacities of logits. [N]"""
     return (0.5 * (1.0 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.float32)
-
-
-def harmonics_of_colors(colors: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:
-    """Coefficients of degree 0 of colours in [0, 1] that do not depend on the direction. [N, 1, 3]"""
-    return ((colors - 0.5) / Y0)[:, None].astype(np.float32)
 
 
 def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:

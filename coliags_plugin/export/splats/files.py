@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
@@ -94,15 +94,9 @@ FORMATS: Mapping[str, tuple[Callable[[Path, SplatCloud, str], None], Callable[[P
 }
 
 
-def check_format(name: str) -> None:
-    """Refuse a name of no format."""
-    if name not in FORMATS:
-        raise InputError(f"no format '{name}'", f"one of {', '.join(FORMATS)}", did_you_mean(name, FORMATS))
-
-
 def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") -> None:
     """Write at least one Gaussian, all finite, in a named format; surfels become flat Gaussians."""
-    check_format(name)
+    check_name("format", name, FORMATS)
     if not len(cloud):
         raise InputError("no Gaussian to write", "at least one")
     write, _ = FORMATS[name]

@@ -17,13 +17,13 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
+from coliags_plugin.export.splats.cloud import field_of_cloud
 from coliags_plugin.export.splats.spz import read_splat_spz
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
-from tests.export.viewer.made import some_gaussians
+from tests.export.splats.clouds import random_cloud
 
 CUBE = TriangleMesh(
     np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (8, 10)], np.float32),
@@ -45,10 +45,11 @@ FRAMES = [frame(0), frame(1, (0.3, -0.2, 0.1), (4.0, 2.0, -18.0)), frame(2, (-0.
 
 
 def cloud_of(count, degree, seed=0):
-    cloud = SplatCloud.of(some_gaussians(count, seed=seed))
-    generator = np.random.default_rng(seed)
-    higher = generator.uniform(-0.4, 0.4, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
-    return replace(cloud, harmonics=np.concatenate([cloud.harmonics, higher], axis=1))
+    """Within 10 mm of the origin."""
+    random, cloud = np.random.default_rng(seed), random_cloud(count, degree, seed=seed)
+    cloud.means[:], cloud.scales[:] = random.uniform(-10.0, 10.0, (count, 3)), random.uniform(0.1, 1.0, (count, 3))
+    cloud.harmonics[:, 0] = random.uniform(-0.5, 0.5, (count, 3)) / Y0
+    return cloud
 
 
 def attenuated(cloud):

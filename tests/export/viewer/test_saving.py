@@ -8,19 +8,17 @@ from html import unescape
 
 import numpy as np
 import pytest
-import torch
 
 import coliags_plugin as cp
 from coliags_plugin.config.options import bytes_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.baking import distillation
-from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.saving import most_visible, scene_page
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.visibility import Level
 from tests.commands import refused, run
-from tests.export.viewer.made import some_gaussians
+from tests.export.splats.clouds import random_cloud
 
 
 @pytest.fixture(autouse=True)
@@ -122,10 +120,9 @@ def test_maps_of_coverage_have_a_legend_of_the_colours_that_they_have(run_of):
 
 
 def test_the_most_visible_are_the_opaque_and_large_ones():
-    gaussians = some_gaussians(4)
-    gaussians.scales[:] = torch.tensor([[1.0, 2.0, 0.1], [1.0, 1.0, 0.9], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]])
-    gaussians.opacities[:] = torch.tensor([0.5, 0.9, 0.1, 0.8])  # they cover 1, 0.9, 0.6 and 0.8
-    splats = SplatCloud.of(gaussians)
+    splats = random_cloud(4, 0)
+    splats.scales[:] = [[1.0, 2.0, 0.1], [1.0, 1.0, 0.9], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]]
+    splats.opacities[:] = [0.5, 0.9, 0.1, 0.8]  # they cover 1, 0.9, 0.6 and 0.8
     np.testing.assert_array_equal(most_visible(splats, 2).means, splats.means[:2])
     np.testing.assert_array_equal(most_visible(splats, 3).means, splats.means[[0, 1, 3]])
     assert len(most_visible(splats, 9)) == 4
