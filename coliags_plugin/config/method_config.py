@@ -37,7 +37,7 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
-#: Of the run, neither its start nor its end.
+#: A share of the run, strictly between its start and its end.
 Share = Annotated[float, Field(gt=0, lt=1)]
 
 

@@ -23,7 +23,7 @@ PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
 
 
 class Resolver:
-    """What the name ``auto`` stands for; its options, ``"module:Class"``, are common to what it may be resolved to."""
+    """The component that the name ``auto`` stands for; its options, ``"module:Class"``, are common to all."""
 
     def __init__(self, options: str, description: str) -> None:
         self._options = options
@@ -70,7 +70,7 @@ class Registry:
         return sorted(self._targets)
 
     def source(self, name: str) -> str:
-        """Where the component of this name comes from."""
+        """Origin of the component of this name: this package, or the plugin that registers it."""
         self._discover()
         return self._sources[name]
 

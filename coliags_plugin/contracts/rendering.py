@@ -36,7 +36,7 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
 
     Settings: ClassVar[type[Settings]]
     primitives: ClassVar[frozenset[str]]
-    #: Of every primitive; :meth:`outputs_of` says which of one.
+    #: Outputs of any primitive; :meth:`outputs_of` says which of one.
     outputs: ClassVar[frozenset[str]]
     #: torch device types
     devices: ClassVar[frozenset[str]]

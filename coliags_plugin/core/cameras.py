@@ -126,6 +126,6 @@ class Camera(Intrinsics):
         return replace(self, camera_to_world=pose, near_plane=factor * self.near_plane)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The same camera with its pose on another device or of another dtype."""
+        """Return the camera with its pose on another device or of another dtype."""
         pose = self.camera_to_world if device is None else sent(self.camera_to_world, device)
         return replace(self, camera_to_world=pose.to(dtype=dtype))

@@ -56,7 +56,7 @@ class Intrinsics:
         return max(across, max(abs(self.cy), abs(self.height - self.cy)) / self.fy)
 
     def resized(self, width: int, height: int) -> Self:
-        """The same view sampled at another size, pixels; the image's edges stay where they are."""
+        """Intrinsics of the view sampled at another size, pixels; the image's edges stay where they are."""
         x, y = width / self.width, height / self.height
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
 

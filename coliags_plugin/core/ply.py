@@ -88,7 +88,7 @@ def _columns(path: Path, found: dict[str, Any], needed: tuple[str, ...] = ("x", 
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What trimesh makes of a file: faces, and every element as it is stored."""
+    """Faces of a file as trimesh reads them, and every element as it is stored."""
     from trimesh.exchange.ply import load_ply
 
     try:

@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import InputError
 
 #: Positions whose neighbours are in memory at once.
 _CHUNK = 4096
-#: Of the points, the share that a wall's normal is estimated from, and the fewest.
+#: A wall's normal is estimated from one in so many of the points, and from no fewer than so many.
 _SHARE, _FEWEST = 500, 20
 
 

@@ -33,11 +33,11 @@ class SparseDepth:
     depth: Float[Tensor, "K"]
 
     def scaled(self, factor: float) -> SparseDepth:
-        """The same points in a world whose lengths are ``factor`` times as large."""
+        """Return the points in a world whose lengths are ``factor`` times as large."""
         return replace(self, depth=factor * self.depth)
 
     def to(self, device: torch.device | str) -> SparseDepth:
-        """The same points on another device."""
+        """Return the points on another device."""
         return SparseDepth(sent(self.pixels, device), sent(self.depth, device))
 
 
@@ -171,13 +171,13 @@ class Frame(_MaskedImage):
         return self.depth if self.depth_confidence is None else None
 
     def with_near_plane(self, near_plane: float) -> Frame:
-        """The same frame, read as lazily as before, with another near plane of its camera, scene units."""
+        """Return the frame with another near plane of its camera, scene units; images are read as lazily as before."""
         frame = copy(self)
         object.__setattr__(frame, "camera", replace(self.camera, near_plane=near_plane))
         return frame
 
     def scaled(self, factor: float) -> Frame:
-        """The same frame, read as lazily as before, in a world whose lengths are ``factor`` times as large."""
+        """Return the frame in a world whose lengths are ``factor`` times as large; images are read lazily as before."""
         sparse, depths = self.sparse_depth, {"depth": self.depth, "depth_at_least": self.depth_at_least}
         scaled: dict[str, Any] = {name: None if depth is None else factor * depth for name, depth in depths.items()}
         scaled["sparse_depth"] = None if sparse is None else sparse.scaled(factor)
@@ -188,7 +188,7 @@ class Frame(_MaskedImage):
         return View(self.name, float(self.index), trained)
 
     def to(self, device: torch.device | str) -> Frame:
-        """The same frame on another device."""
+        """Return the frame on another device."""
         names = ("image", "depth", "mask", "seen", "depth_at_least", "depth_confidence")
         moved: dict[str, Any] = {name: getattr(self, name) for name in names}
         moved = {name: values if values is None else sent(values, device) for name, values in moved.items()}
@@ -312,7 +312,7 @@ class Scene:
         return torch.cat([depth[inside] for _, depth, inside in self._projected_points()])
 
     def _projected_points(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:
-        """Of up to 16 training frames: camera, z-depth of every point and whether the point is inside the image."""
+        """Camera, z-depth of every point and whether it is inside the image, of up to 16 training frames."""
         points = self.points.positions.double()
         for frame in self.train[:: max(1, len(self.train) // 16)]:
             camera = frame.camera.to(points.device, points.dtype)

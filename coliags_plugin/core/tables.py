@@ -1,4 +1,4 @@
-"""Whether compiled kernels can compute with tensors, and tensors as their tables."""
+"""Flat tables of tensors for compiled kernels, and which tensors these can compute with."""
 
 from __future__ import annotations
 

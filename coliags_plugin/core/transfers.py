@@ -1,4 +1,4 @@
-"""What goes from the host to a device without the host waiting for work that is queued there."""
+"""Copies from the host to a device that do not wait for the work queued there."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether the appearance head does."""
+        """Whether colours depend on the lamp, as the appearance head says."""
         return self.appearance_head.knows_lamp
 
     @property
@@ -171,7 +171,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
 
     @property
     def _on_kernels(self) -> bool:
-        """Whether the kernels of the CPU can compute."""
+        """Whether the kernels of the CPU can decode these anchors."""
         return fit_kernels(self.anchors)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
@@ -183,7 +183,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         return self._decoded(camera, None)
 
     def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
-        """The same with distance and angle of the anchors to the lamp those of a held light, if there is one."""
+        """Decode the visible anchors, whose distances and angles to the lamp are a held light's, if there is one."""
         return self._decoded(camera, light)
 
     def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:

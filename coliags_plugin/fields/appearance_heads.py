@@ -56,7 +56,7 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
 
     @property
     def frequencies(self) -> int:
-        """Those of gamma."""
+        """Number of frequencies of the positional encoding; 0 means none."""
         return 0
 
     def embed_direction(
@@ -174,7 +174,7 @@ class GlintAppearanceHead(IMIAAppearanceHead):
     Gaussians of their length, of six widths (docs/methods.md 3.8).
     """
 
-    #: Those of v, of the facets' components and lobes.
+    #: Channels of the encoded direction: v, the facets' components, and lobes.
     direction_channels: ClassVar[int] = 3 + 2 + len(WIDTHS)
 
     def __init__(

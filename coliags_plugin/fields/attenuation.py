@@ -101,11 +101,11 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         self.lamp_offset.copy_(MAX_OFFSET * torch.atanh((fitted.lamp_offset / MAX_OFFSET).clamp(-0.9, 0.9)))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
+        """Groups of the head, of the exponents, and of the lamp's offset, which needs a rate in scene units."""
         return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
 
     def networks(self, *inputs: Any) -> HeadNetworks | None:
-        """Those of the head below, if it has some."""
+        """Networks of the head below; None if it has none."""
         return self.head.networks(*inputs) if self.head.has_networks else None
 
     def forward(

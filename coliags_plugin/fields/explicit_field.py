@@ -149,7 +149,7 @@ class ExplicitField(GaussianField[ExplicitT]):
 
     @torch.no_grad()
     def _in_view(self, camera: Camera) -> Bool[Tensor, "N"]:
-        """Which Gaussians may overlap the image."""
+        """Mask of the Gaussians that may overlap the image. [N]"""
         reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
         return spheres_in_frustum(self.means, reach, camera)
 

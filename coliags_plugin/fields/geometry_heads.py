@@ -47,7 +47,7 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
 
     @property
     def frequencies(self) -> int:
-        """Those of gamma, by which the viewing direction is embedded; 0: as it is."""
+        """Number of frequencies of the embedding of the viewing direction; 0 leaves it as it is."""
         return 0
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -82,7 +82,7 @@ THICKNESS = 1e-8
 #: Colours are linear light to the power of 1 / GAMMA, of at least MIN_LIGHT.
 GAMMA = 2.2
 MIN_LIGHT = 1e-6
-#: Of mucosa, gamma-encoded RGB in [0, 1].
+#: Colour of mucosa, gamma-encoded RGB in [0, 1].
 PINK = (188 / 255, 99 / 255, 76 / 255)
 #: A Gaussian of lower opacity is drawn nowhere.
 MIN_OPACITY = 1.0 / 255.0
@@ -207,11 +207,11 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         return self._gaussians(camera, None)
 
     def gaussians_in_light(self, camera: Camera, light: HeldLight | None) -> Gaussians:
-        """The same with a held lamp as intense as the trained one, alike in all directions."""
+        """The Gaussians in view under a held lamp as intense as the trained one, alike in all directions."""
         return self._gaussians(camera, None, light)
 
     def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
-        """The same with noise on the network's inputs, and its products in ``network_precision``."""
+        """The Gaussians in view; noise is on the network's inputs, and its products are in ``network_precision``."""
         return self._gaussians(camera, generator)
 
     def _gaussians(self, camera: Camera, generator: torch.Generator | None, held: HeldLight | None = None) -> Gaussians:

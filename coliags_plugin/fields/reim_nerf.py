@@ -290,7 +290,7 @@ class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
 
     @property
     def ray_bounds(self) -> Float[Tensor, "2"]:
-        """See :attr:`bounds`."""
+        """Near and far ends of the sampled rays, scene units. [2]"""
         return self.bounds
 
     @property

@@ -12,7 +12,7 @@ MAX_DEGREE = 3
 #: Y_0, by which a colour becomes a coefficient of degree 0.
 Y0 = 0.5 / math.sqrt(math.pi)
 
-#: Of the functions of degrees 1 to 3 in turn: what the polynomials in :func:`basis` are multiplied by.
+#: Factors of the polynomials in :func:`basis`, of the functions of degrees 1 to 3 in turn.
 FACTORS = tuple(
     sign * math.sqrt(value / math.pi)
     for sign, value in (

@@ -128,7 +128,7 @@ class DepthAbsRel(DepthMetric):
 
 
 class SparseDepthErrorSettings(Settings):
-    """Which quantile of the errors."""
+    """Quantile of the errors."""
 
     quantile: float = Field(default=0.5, ge=0.0, le=1.0, description="0.5: the median.")
 

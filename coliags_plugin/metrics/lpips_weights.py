@@ -61,7 +61,7 @@ def weights_in(net: str, folders: Iterable[Path]) -> tuple[Path | None, Path | N
 
 
 def default_folder() -> Path:
-    """Where ``torch.hub`` keeps downloads."""
+    """Folder in which ``torch.hub`` keeps downloads."""
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
@@ -86,7 +86,7 @@ def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
 
 
 def searched_folders(folder: str | Path | None = None) -> Iterator[Path]:
-    """Where weights are searched for, in this order; heads also in an installed ``lpips`` package."""
+    """Folders in which weights are searched for, in order; heads also in an installed ``lpips`` package."""
     for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
         if named:
             yield Path(named).expanduser()

@@ -55,7 +55,7 @@ class CpuRenderer(SplattingRenderer[CpuRendererSettings]):
         return Availability(True, f"numba kernels on {torch.get_num_threads()} threads")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """See :func:`render_gaussians`."""
+        """Draw Gaussians by :func:`render_gaussians`."""
         return render_gaussians(gaussians, camera, wants, self.settings)
 
 

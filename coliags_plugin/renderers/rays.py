@@ -71,7 +71,7 @@ class CompositedRays:
 
     @property
     def weights(self) -> Float[Tensor, "P S"]:
-        """What each sample contributes. [P, S]"""
+        """Weights of the samples. [P, S]"""
         return self.transmittance[:, :-1] - self.transmittance[:, 1:]
 
     def output(self, name: str, background: Float[Tensor, "3"]) -> Float[Tensor, "P 1 *C"]:

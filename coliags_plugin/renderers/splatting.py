@@ -87,7 +87,7 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
     ) -> RenderOutput:
-        """See :class:`Renderer`; refuses ``pixels``, as whole images are drawn."""
+        """Draw a view as :class:`Renderer` says; refuses ``pixels``, as whole images are drawn."""
         self._check(field, pixels)
         return self.draw(field.gaussians(camera), camera, wants)
 
@@ -137,7 +137,7 @@ class DrawnView:
     radii: Float[Tensor, "N"]
 
     def output(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """What a renderer returns of it; ``means2d`` then retains its gradient."""
+        """Output of a renderer for this view; ``means2d`` then retains its gradient."""
         maps = {}
         for name in wants:
             if name == "depth_expected":

@@ -69,7 +69,7 @@ def composite_pairs(
 
 
 class _Hits(NamedTuple):
-    """Where the rays of a tile's P pixels meet R surfels; all finite.
+    """Intersections of the rays of a tile's P pixels with R surfels; all finite.
 
     A ray misses where W is 0, or the intersection is nearer than the near plane.
     """

@@ -114,7 +114,7 @@ def padded_rows(rows: Float[Tensor, "M K"], log_alpha: int) -> Float[Tensor, "M+
 
 
 def crossing_of_half(chunk: Chunk[Evaluated]) -> tuple[Int[Tensor, "G P"], Bool[Tensor, "G P"]]:
-    """Which pair of the chunk brings the transmittance to one half or less, and whether one does. [G, P], [G, P]"""
+    """Index of the pair that brings the transmittance to one half or less, and whether one does. [G, P], [G, P]"""
     crossing = (chunk.transmittances > 0.5).sum(1, keepdim=True).clamp_max(chunk.weights.shape[1] - 1)
     crosses = (chunk.before > 0.5) & (chunk.transmittances.gather(1, crossing).squeeze(1) <= 0.5)
     return crossing.squeeze(1), crosses & (chunk.weights.gather(1, crossing).squeeze(1) > 0)

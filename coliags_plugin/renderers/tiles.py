@@ -119,7 +119,7 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
 
 @dataclass(frozen=True)
 class SurfelExtents:
-    """Where surfels reach alpha_min: within the image of a disc, or a circle around the centre. Pixels.
+    """Bounds, pixels, of where surfels reach alpha_min: within the image of a disc, or a circle around the centre.
 
     Covariances and whitenings are as :class:`ProjectedGaussians` has them, of the ellipse, at whose rim the Mahalanobis
     distance is 1.

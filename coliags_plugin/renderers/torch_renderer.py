@@ -43,7 +43,7 @@ class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """See :func:`render_gaussians`."""
+        """Draw Gaussians by :func:`render_gaussians`."""
         return render_gaussians(gaussians, camera, wants, self.settings)
 
 

@@ -40,7 +40,7 @@ class TritonRenderer(SplattingRenderer[TritonRendererSettings]):
         return Availability(True, f"triton kernels on {torch.cuda.get_device_name()}")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """See :func:`render_gaussians`; refuses Gaussians that are not on a CUDA device."""
+        """Draw Gaussians by :func:`render_gaussians`; refuses Gaussians that are not on a CUDA device."""
         check_device(gaussians, self.devices, self.name)
         return render_gaussians(gaussians, camera, wants, self.settings)
 

@@ -100,7 +100,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Tensor | None = None,
     ) -> RenderOutput:
-        """See :class:`Renderer`.
+        """Render a view, or some of its pixels, as :class:`Renderer` says.
 
         Outputs of the first pass have ``_coarse`` behind their names; ``ray_lengths`` is the length of a pixel's ray
         per z-depth. Depths are z-depths; there are no normals and no distortion.
@@ -198,7 +198,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         return CompositedRays(places * lines.depth_per_place, behind, rgb)
 
     def _bounds(self, field: RadianceField, near_plane: float) -> tuple[Tensor | float, Tensor | float]:
-        """Where rays start and end, in terms of ``spacing``, by the options or by the field."""
+        """Start and end of rays, in terms of ``spacing``, by the options or by the field."""
         far = self.settings.far_plane
         if near_plane > 0.0 and far is not None:
             return near_plane, far

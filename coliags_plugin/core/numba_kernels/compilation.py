@@ -32,7 +32,7 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 _logger = logging.getLogger(__name__)
 #: What a cache may raise when its folder is full, unreadable or holds damaged files.
 _CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ValueError, AttributeError, ImportError, IndexError, TypeError)
-#: Of what has been told: whether kernels are kept.
+#: Announcements made: that kernels are kept (True), or cannot be (False).
 _announced: set[bool] = set()
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 

@@ -528,7 +528,7 @@ def _prefetching(name: str, writes: int) -> ir.Value:
 
 #: Prefetch the cache line of ``table[index]``
 prefetch = _prefetching("prefetch", 0)
-#: The same where it is to be written
+#: Prefetch the cache line of ``table[index]`` to write it
 prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 

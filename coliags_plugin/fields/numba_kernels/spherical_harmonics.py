@@ -139,7 +139,7 @@ def _load(terms, sh0, shN, rows, sight, group, scratch, places):
 
 @inline
 def _place(rows, group, width, places):
-    """Where the rows of a group begin in a table of rows of a width."""
+    """Offset of a group's rows in a table of rows of a width."""
     for lane in range(WIDTH):
         places[lane] = width * rows[min(group + lane, len(rows) - 1)]
 

@@ -15,7 +15,7 @@ import triton.language as tl
 
 #: Anchors of a tile, hidden units of a block, and columns of a block of inputs.
 ROWS, UNITS, COLUMNS = tl.constexpr(32), tl.constexpr(32), tl.constexpr(16)
-#: Of products of matrices: float32 throughout.
+#: Precision of products of matrices: float32 throughout.
 PRECISION = tl.constexpr("ieee")
 #: Outputs of a child in all: opacity, three logits of scales, a quaternion, a colour.
 OUTPUTS = tl.constexpr(11)
@@ -38,7 +38,7 @@ class Network(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where the next network begins."""
+        """Address at which the next network begins."""
         return self.start + self.units * (self.columns + 1) + self.outputs * self.children * (self.units + 1)
 
 
@@ -81,7 +81,7 @@ def _given(inputs, rows, seen, column, source, NETWORK: tl.constexpr):
 
 @triton.jit
 def _seen_by(features, inputs, rows, seen, column, NETWORK: tl.constexpr):
-    """What the first layer sees. [R, C]"""
+    """Inputs of the first layer. [R, C]"""
     source, octave, quadrant, is_wave = _sources(column, NETWORK)
     here = seen[:, None] & (column < NETWORK.features)[None, :]
     of_anchors = tl.load(features + rows[:, None] * NETWORK.features + column[None, :], here, 0.0)

@@ -141,7 +141,7 @@ class Pairs(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """The same pairs by tile and front to back; they are called entries there."""
+    """Pairs of a Gaussian and a tile by tile and front to back; they are called entries here."""
 
     keys: Array  # Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits
     entry_counts: Array  # entries of each of them

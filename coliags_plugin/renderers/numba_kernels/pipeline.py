@@ -47,7 +47,7 @@ class TooManyPairsError(Exception):
 
 
 class Layer(NamedTuple):
-    """What one pair of sweeps composites.
+    """Channels and tables that one pair of sweeps composites.
 
     ``channels`` is any tuple as long as there are channels in the records of ``projections``, and ``own`` is what is
     composited besides, ``layout.Extras`` or ``surfel_layout.Measures``.

@@ -59,7 +59,7 @@ ROW_CHANNELS = layout.ROW - SUM_CHANNELS
 
 
 class Measures(NamedTuple):
-    """What is composited that differs from pixel to pixel of a surfel: tuples with one element where wanted, else none.
+    """Measures that differ from pixel to pixel of a surfel: tuples with one element where wanted, else none.
 
     ``depth`` is for the accumulated and the expected depth; ``median`` is the depth of the surfel at which transmittance falls
     to one half; ``distortion`` are squared differences of reciprocal depths.

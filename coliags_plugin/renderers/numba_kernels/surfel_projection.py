@@ -156,7 +156,7 @@ def _slopes(function, right, down, per_x, per_y, scale):
 
 @inline
 def _bent(rim_x, rim_y, rise, z, near):
-    """What perspective makes of the image of a rim at depth z + rise.
+    """Image of a rim at depth z + rise under perspective.
 
     Returns whether it crosses the near plane, so that its image may be no ellipse; the shift of the ellipse's centre; and two
     vectors of pixels whose products are the ellipse's matrix, as those of ``rim_x`` and ``rim_y`` are without perspective.

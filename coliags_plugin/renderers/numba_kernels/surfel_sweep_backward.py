@@ -42,7 +42,7 @@ _STATE = _DEPTH + 96
 NUMBERS = CHUNK * FETCHED + layout.BLOCKS * _STATE
 #: Scratch of one thread: blocks of a chunk's entries.
 INTEGERS = CHUNK
-#: Of a multiple of (e, f): derivative of ln(alpha) with respect to the logarithm of the factor, over e^2 + f^2.
+#: Derivative of ln(alpha) with respect to the logarithm of a factor on (e, f), over e^2 + f^2.
 _PER_SQUARE = -2.0 * math.log(2.0)
 
 

@@ -14,7 +14,7 @@ from coliags_plugin.renderers.numba_kernels import layout
 CHUNK = 128
 #: Prefetch distance of records, entries.
 _AHEAD = 32
-#: The same of the memory of the sums.
+#: Prefetch distance of the memory of the sums, entries.
 _SUMS_AHEAD = 12
 
 # The first vectors of a block in the forward sweeps.
@@ -75,14 +75,14 @@ def block_pixels(block):
 
 @inline
 def inside(block, across, down):
-    """Which pixels of a block are among the first ``across`` columns and ``down`` rows of its tile."""
+    """Mask of the pixels of a block that are among the first ``across`` columns and ``down`` rows of its tile."""
     x, y = block_corner(block)
     return vec.both(vec.less(vec.lane_columns(), across - x), vec.less(vec.lane_rows(), down - y))
 
 
 @inline
 def place_in_blocks(x, y, stride):
-    """Where pixel (x, y) of a tile is in vectors of its blocks that are ``stride`` apart."""
+    """Index of pixel (x, y) of a tile in vectors of its blocks that are ``stride`` apart."""
     return stride * (4 * (y >> 2) + (x >> 2)) + 4 * (y & 3) + (x & 3)
 
 

@@ -176,7 +176,7 @@ class _Surfels(torch.autograd.Function):
         return *found, _of_pose(of_pose), None, None, None
 
 
-#: Of every launch here. Fused multiply-adds are no less accurate.
+#: Options of every launch here. Fused multiply-adds are no less accurate.
 _OPTIONS = {"BLOCK": BLOCK, "num_warps": WARPS, "enable_fp_fusion": True}
 
 
