@@ -15,21 +15,36 @@ from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.files import parallel_map
-from coliags_plugin.reconstruction.depth.completion import complete, data_weight, first_belief, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
-from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, depth_confidence, fuse_frame, sweep_weight
-from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
-from coliags_plugin.reconstruction.depth.settings import (
+from coliags_plugin.reconstruction.depth.priors import (
+    FilePrior,
+    LightPrior,
+    complete,
+    data_weight,
+    first_belief,
+    near_rim,
+    smooth_surface,
+)
+from coliags_plugin.reconstruction.depth.sweeping import (
+    Swept,
+    WeightedDepth,
+    depth_confidence,
+    fuse_frame,
+    ratios,
+    sweep_frame,
+    sweep_weight,
+)
+from coliags_plugin.reconstruction.depth.views import (
     MAX_BASELINE,
     MAX_TURN,
     SWEEPS,
     DepthEstimationSettings,
+    Guide,
+    Map,
     Sweep,
+    guide_of,
 )
-from coliags_plugin.reconstruction.depth.sweeping import Swept, ratios, sweep_frame
-from coliags_plugin.reconstruction.depth.views import Guide, Map, guide_of
 from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
-from coliags_plugin.reconstruction.structure.matching import camera_centers, check_motion
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +105,7 @@ class Estimation:
         self.medians = self.work.value(f"medians-{number}", self._medians)
 
     def _neighbours(self, number: int, sweep: Sweep) -> list[list[int]]:
-        centers = camera_centers(self.frames)
+        centers = _camera_centers(self.frames)
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
         neighbours: list[list[int]] = self.work.value(
             f"neighbours-{number}",
@@ -199,7 +214,18 @@ def _one_thread_of_opencv() -> Iterator[None]:
 
 def check_video(frames: Sequence[Frame], sources: Sequence[int]) -> None:
     """Check that a video can give depth at all, from the frames of these indices."""
-    check_motion([frames[index] for index in sources], FEWEST_FRAMES)
+    if len(sources) < FEWEST_FRAMES:
+        raise InputError(
+            f"{len(sources)} frames",
+            f"at least {FEWEST_FRAMES}, from different camera positions",
+            "Give more of the video",
+        )
+    if not np.ptp(_camera_centers([frames[index] for index in sources]), axis=0).max() > 0.0:
+        raise InputError(
+            f"all {len(sources)} cameras are at the same position",
+            "poses at different positions",
+            "A camera that does not move, or only turns, gives no depth; check the poses",
+        )
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         raise InputError(
@@ -208,6 +234,10 @@ def check_video(frames: Sequence[Frame], sources: Sequence[int]) -> None:
             f"--set datamanager.width={sizes[0][0]} --set datamanager.height={sizes[0][1]} makes them so, or estimate "
             "each camera's frames apart",
         )
+
+
+def _camera_centers(frames: Sequence[Frame]) -> Float[np.ndarray, "N 3"]:
+    return np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
 
 
 def choose_neighbours(

@@ -23,10 +23,10 @@ from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
-from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
-from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
+from coliags_plugin.reconstruction.depth.views import DepthEstimationSettings, Map, Mask
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
 from coliags_plugin.reconstruction.structure.features import image_and_mask
+from coliags_plugin.reconstruction.structure.matching import Pose
 
 log = logging.getLogger(__name__)
 

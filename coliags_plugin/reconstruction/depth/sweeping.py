@@ -1,4 +1,4 @@
-"""Depth of one frame by sweeping a surface through its neighbours."""
+"""Depth of one frame by sweeping a surface through its neighbours, its fusion with theirs, and how sure it is."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from coliags_plugin.reconstruction.depth.settings import Sweep
-from coliags_plugin.reconstruction.depth.views import Guide, Map
+from coliags_plugin.reconstruction.depth.views import Guide, Map, Mask, Sweep
+from coliags_plugin.reconstruction.structure.matching import Pose
 
 #: Log of the factor on depth over which a hypothesis must have had rivals.
 _RIVALS = math.log(2.0)
@@ -45,11 +45,7 @@ def ratios(sweep: Sweep, depth_range: tuple[float, float]) -> Float32[np.ndarray
 
 
 def sweep_frame(
-    guide: Guide,
-    neighbours: Sequence[Guide],
-    base: Map,
-    factors: Float32[np.ndarray, "D"],
-    sweep: Sweep,
+    guide: Guide, neighbours: Sequence[Guide], base: Map, factors: Float32[np.ndarray, "D"], sweep: Sweep
 ) -> Swept:
     """Match a frame with its neighbours at multiples (ascending) of a surface of z-depth, and take the best.
 
@@ -57,35 +53,94 @@ def sweep_frame(
     semi-global aggregation; a parabola between hypotheses. The neighbours, at least one, are all of one size.
     """
     from coliags_plugin.core.numba_kernels.lanes import WIDTH
-    from coliags_plugin.reconstruction.depth.numba_kernels import sweep as kernels
+    from coliags_plugin.reconstruction.depth.numba_kernels import kernels
 
     shape = base.shape
-    pairs = [guide.pose.homography(other.pose) for other in neighbours]
+    turns, shifts = zip(*(guide.pose.homography(other.pose) for other in neighbours), strict=True)
+    images = np.stack([other.intensity for other in neighbours])
+    masks = np.stack([other.usable for other in neighbours]).astype(np.uint8)
+    surface = np.ascontiguousarray(base, np.float32), factors, guide.intensity, guide.usable.astype(np.float32)
+    places = np.stack(turns), np.stack(shifts)
     cost = np.full((*shape, WIDTH * math.ceil(len(factors) / WIDTH)), np.inf, np.float32)
-    kernels.sweep(
-        np.ascontiguousarray(base, np.float32),
-        factors,
-        guide.intensity,
-        guide.usable.astype(np.float32),
-        np.stack([other.intensity for other in neighbours]),
-        np.stack([other.usable for other in neighbours]).astype(np.uint8),
-        np.stack([turn for turn, _ in pairs]),
-        np.stack([shift for _, shift in pairs]),
-        sweep.radius,
-        _NOISE**2,
-        _BEST_SHARE,
-        cost,
-    )
+    kernels.sweep(*surface, images, masks, *places, sweep.radius, _NOISE**2, _BEST_SHARE, cost)
     total = np.empty_like(cost)
-    kernels.aggregate(
-        cost,
-        guide.intensity,
-        np.float32(sweep.small_penalty),
-        np.float32(_LARGE_PENALTY),
-        np.float32(_EDGE_CONTRAST),
-        total,
-    )
+    small, large, contrast = np.float32(sweep.small_penalty), np.float32(_LARGE_PENALTY), np.float32(_EDGE_CONTRAST)
+    kernels.aggregate(cost, guide.intensity, small, large, contrast, total)
     index, fit, margin = (np.empty(shape, np.float32) for _ in range(3))
     kernels.pick(total, cost, math.ceil(_RIVALS / math.log1p(sweep.step)), index, fit, margin)
     position = np.interp(index.ravel(), np.arange(len(factors)), np.log(factors)).reshape(shape)
     return Swept((base * np.exp(position)).astype(np.float32), fit, margin)
+
+
+#: Iterations until a ray has met a neighbour's surface, and the relative change at which it has.
+_ITERATIONS, _CONVERGED = 12, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedDepth:
+    """Depth of a frame with weights."""
+
+    pose: Pose  # camera of its size
+    depth: Map  # z-depth; NaN where unknown
+    weight: Map  # 0 where it does not count
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """Depth that a frame and its neighbours agree on."""
+
+    depth: Map  # z-depth; the frame's own where no other counts
+    votes: Map  # weight of the frames that agree with it
+    spread: Map  # mean relative deviation within the group
+
+
+def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
+    """Weighted median of the depths that a frame and its neighbours give to each pixel, within the densest group.
+
+    A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
+    iteration from the frame's own depth. Depths agree up to a relative difference of ``agreement``.
+    """
+    from coliags_plugin.core.numba_kernels.lanes import WIDTH
+    from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject, vote
+
+    height, width = own.depth.shape
+    size = height * width
+    rest = (0, -size % WIDTH)
+    depth, weight = np.pad(own.depth.ravel(), rest), np.pad(own.weight.ravel(), rest)
+    candidates = np.empty((len(neighbours), len(depth)), np.float32)
+    trusts = np.empty_like(candidates)
+    for index, other in enumerate(neighbours):
+        there, back = own.pose.homography(other.pose), own.pose.depth_from(other.pose)
+        found = candidates[index], trusts[index]
+        reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *found)
+    written = np.empty((3, len(depth)), np.float32)
+    vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
+    return Fused(*written[:, :size].reshape(3, height, width))
+
+
+#: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.
+_COEFFICIENTS = (1.125, 0.797, -0.187, -1.396, -2.229)
+#: Half the width of that window, pixels.
+_STEP_REACH = 6
+
+
+def sweep_weight(swept: Swept) -> Map:
+    """Weight of a frame's own depth in fusion, 0 to 1."""
+    quality = np.clip((swept.match - 0.2) / 0.6, 0.0, 1.0) * np.clip(swept.margin / 1.0, 0.0, 1.0)
+    return np.asarray(np.where(swept.match > 0.0, 0.05 + 0.95 * quality, 0.0), np.float32)
+
+
+def depth_confidence(log_depth: Map, support: Map, spread: Map, rim: Mask) -> Map:
+    """Estimated probability that depth is off by less than 5 %: a logistic regression (docs/depth.md).
+
+    ``support`` is the weighted number of frames that agree with the completed depth, 0 (as is the confidence) where a
+    prior alone speaks; ``spread`` the mean relative deviation of their depths; ``rim`` the near side of a depth edge.
+    """
+    import cv2
+
+    window = np.ones((2 * _STEP_REACH + 1, 2 * _STEP_REACH + 1), np.uint8)
+    step = np.minimum(cv2.dilate(log_depth, window) - cv2.erode(log_depth, window), 1.0)
+    constant, of_support, of_spread, of_rim, of_step = _COEFFICIENTS
+    score = constant + of_support * np.log(support + 0.1) + of_spread * np.log(spread + 0.003)
+    score += of_rim * rim + of_step * step
+    return np.where(support > 0.0, 1.0 / (1.0 + np.exp(-score)), 0.0).astype(np.float32)

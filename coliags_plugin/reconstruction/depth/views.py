@@ -1,16 +1,51 @@
-"""Images prepared for matching, with their cameras as matrices."""
+"""Options and sweeps of depth estimation, and images prepared for matching."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
+from pydantic import Field
 
-from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, image_and_mask, usable
+from coliags_plugin.reconstruction.structure.matching import Pose
+
+
+class Sweep(NamedTuple):
+    """One sweep: matching and aggregation."""
+
+    reduction: int = 1  # factor by which images are reduced
+    step: float = 0.03  # relative difference of neighbouring hypotheses
+    reach: float | None = None  # relative depth about that of the sweep before; None: the whole depth range
+    #: Distances of the neighbours, in units of a frame's median depth; one frame to either side in the video for each.
+    baselines: tuple[float, ...] = (0.05, 0.08, 0.12, 0.16, 0.2, 0.25)
+    radius: int = 3  # half the width of the correlation windows, pixels
+    small_penalty: float = 0.08  # semi-global penalty P1 of a change by one hypothesis; costs are in [0, 2]
+
+
+#: One after the other; each but the first is about the completed depth of the one before, smoothed.
+SWEEPS = (
+    Sweep(reduction=2, radius=4),
+    Sweep(step=0.01, reach=0.15, baselines=(0.05, 0.1, 0.2, 0.3, 0.4, 0.5), radius=2, small_penalty=0.01),
+)
+#: Largest distance of a neighbour, and largest angle between its optical axis and the frame's, degrees.
+MAX_BASELINE, MAX_TURN = 0.6, 40.0
+
+
+class DepthEstimationSettings(Settings):
+    """Options of depth estimation."""
+
+    agreement: float = Field(
+        default=0.02, gt=0.0, lt=0.5, description="Relative difference up to which two frames' depths agree."
+    )
+    features: FeatureSettings = Field(
+        default=FeatureSettings(), description="Features that the depth range is found from, and highlights."
+    )
+
 
 #: A value, and whether one counts, for every pixel of a frame.
 Map = Float32[np.ndarray, "H W"]
@@ -18,49 +53,6 @@ Mask = Bool[np.ndarray, "H W"]
 
 #: Added to intensity before the logarithm, which would amplify the noise of dark pixels.
 _OFFSET = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Intrinsics and rigid pose of a view in float64."""
-
-    intrinsics: Intrinsics
-    camera_to_world: Float[np.ndarray, "4 4"]
-
-    @classmethod
-    def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
-        """The camera, of an image of another width and height if they are given."""
-        intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
-        return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K for pixel centres at integers + 0.5."""
-        k = self.intrinsics
-        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
-
-    def rays(self) -> Float[np.ndarray, "H W 3"]:
-        """Directions through the pixel centres in the camera's axes, z = 1."""
-        k = self.intrinsics
-        x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
-        y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
-        return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
-
-    def to(self, other: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-        """Rotation and translation from this camera's axes to another's."""
-        turn = other.camera_to_world[:3, :3].T
-        return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
-
-    def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
-        """A and b with which pixel p at z-depth z lies at A (p, 1) z + b in another view, homogeneous."""
-        rotation, translation = self.to(other)
-        turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
-        return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
-
-    def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
-        """The a and b with which pixel p of another view at z-depth z has z-depth a . (p, 1) z + b here."""
-        rotation, translation = other.to(self)
-        return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
 
 @dataclass(frozen=True, eq=False)

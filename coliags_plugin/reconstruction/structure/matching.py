@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Float, Float32, Int, UInt32
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress, with_progress
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
@@ -23,25 +24,6 @@ Matches = Mapping[tuple[int, int], Pairs]
 _DUPLICATE_DISTANCE = 2.0
 #: Largest ratio of the scales of matched features.
 _MAX_SCALE_RATIO = 1.6
-
-
-def camera_centers(frames: Sequence[Frame]) -> Float[np.ndarray, "N 3"]:
-    """World positions of the frames' cameras."""
-    return np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
-
-
-def check_motion(frames: Sequence[Frame], least: int) -> None:
-    """Refuse fewer frames than ``least``, and cameras that are all at one position."""
-    if len(frames) < least:
-        raise InputError(
-            f"{len(frames)} frames", f"at least {least}, from different camera positions", "Give more of the video"
-        )
-    if not np.ptp(camera_centers(frames), axis=0).max() > 0.0:
-        raise InputError(
-            f"all {len(frames)} cameras are at the same position",
-            "poses at different positions",
-            "A camera that does not move, or only turns, gives no depth; check the poses",
-        )
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:
@@ -103,30 +85,62 @@ def epipolar_matches(
     return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
 
 
-def relative_pose(cameras: tuple[Camera, Camera]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Transform from the first to the second camera's frame: rotation [3, 3] and translation [3]."""
-    one, other = (camera.to("cpu").camera_to_world.double().numpy() for camera in cameras)
-    rotation = other[:3, :3].T @ one[:3, :3]
-    return rotation, other[:3, :3].T @ (one[:3, 3] - other[:3, 3])
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Intrinsics and rigid pose of a view in float64."""
 
+    intrinsics: Intrinsics
+    camera_to_world: Float[np.ndarray, "4 4"]
 
-def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:
-    """Ray directions of pixels in the camera frame, z = 1. [N, 3]"""
-    x = (pixels[:, 0] - camera.cx) / camera.fx
-    y = (pixels[:, 1] - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones(len(pixels))], axis=1)
+    @classmethod
+    def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
+        """The camera, of an image of another width and height if they are given."""
+        intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
+        return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K for pixel centres at integers + 0.5."""
+        k = self.intrinsics
+        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self) -> Float[np.ndarray, "H W 3"]:
+        """Directions through the pixel centres in the camera's axes, z = 1."""
+        k = self.intrinsics
+        x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
+        y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
+        return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
+
+    def to(self, other: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """Rotation and translation from this camera's axes to another's."""
+        turn = other.camera_to_world[:3, :3].T
+        return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
+
+    def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
+        """A and b with which pixel p at z-depth z lies at A (p, 1) z + b in another view, homogeneous."""
+        rotation, translation = self.to(other)
+        turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
+        return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
+
+    def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
+        """The a and b with which pixel p of another view at z-depth z has z-depth a . (p, 1) z + b here."""
+        rotation, translation = other.to(self)
+        return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
 
 def _epipolar_candidates(
     first: Features, second: Features, cameras: tuple[Camera, Camera], max_error: float
 ) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """Pairs of features that satisfy the epipolar constraint, with similar scales and positive depths."""
-    rotation, translation = relative_pose(cameras)
+    rotation, translation = Pose.of(cameras[0]).to(Pose.of(cameras[1]))
     if not np.linalg.norm(translation) > 0.0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     x, y, z = translation / np.linalg.norm(translation)
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-    ray_one, ray_other = rays(first.pixels, cameras[0]), rays(second.pixels, cameras[1])
+    ray_one, ray_other = (
+        PinholeLens.of(camera.intrinsics).unproject(features.pixels)
+        for camera, features in zip(cameras, (first, second), strict=True)
+    )
     # Epipolar lines in pixels: coefficients of x and y divided by the focal lengths.
     line_in_other, line_in_one = ray_one @ essential.T, ray_other @ essential
     slope_other = np.linalg.norm(line_in_other[:, :2] / (cameras[1].fx, cameras[1].fy), axis=1)

@@ -12,14 +12,20 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame, SparseDepth
-from coliags_plugin.reconstruction.depth.completion import complete, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.depth_range import difference_from_neighbours, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
-from coliags_plugin.reconstruction.depth.fusion import depth_confidence
-from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
+from coliags_plugin.reconstruction.depth.priors import (
+    FilePrior,
+    LightPrior,
+    complete,
+    near_rim,
+    robust_fit,
+    smooth_surface,
+)
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
-from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.depth.sweeping import depth_confidence
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
+from coliags_plugin.reconstruction.structure.matching import Pose
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 
 FEATURES = FeatureSettings(highlight_level=256)
