@@ -31,8 +31,7 @@ def make_poses(context: StageContext) -> StageOutcome:
     from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
     from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
-    from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
-    from coliags_plugin.reconstruction.structure.sfm import reconstruct
+    from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
 
     settings = context.settings
     mask = read_lens_mask(context.frames)

@@ -24,8 +24,7 @@ from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, rea
 from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES, file_names, list_images, read_image
-from coliags_plugin.reconstruction.structure.sfm_cameras import camera_of_lens
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, camera_of_lens
 
 if TYPE_CHECKING:
     import cv2

@@ -21,8 +21,7 @@ from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.pipeline import capture_stages
 from coliags_plugin.pipeline.frame_sources import opened_recording
 from coliags_plugin.reconstruction.structure.image_files import read_mask
-from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, Start, starting_cameras
 from tests import commands
 from tests.layouts.endomapper import calibration_text
 from tests.pipeline.conftest import CAPTURE, TRAINING

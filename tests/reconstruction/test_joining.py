@@ -15,8 +15,12 @@ from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis
 from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.joining import join_models, stretches_of
 from coliags_plugin.reconstruction.structure.sfm import reconstruct
-from coliags_plugin.reconstruction.structure.sfm_cameras import tracked_starts
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import (
+    CameraSettings,
+    SfmSettings,
+    TrackSettings,
+    tracked_starts,
+)
 from coliags_plugin.reconstruction.structure.video import read_video
 from tests.textured_tube import INTRINSICS, tube_frames
 
@@ -61,7 +65,7 @@ def test_models_of_the_same_wall_become_one(halves):
     assert again.similarity is None
     centers = [
         np.array([model.images[number].projection_center() for number in range(1, COUNT + 1)])
-        for model in (joined.hypothesis.model, whole)
+        for model in (joined.model, whole)
     ]
     # In the frame and scale of the first half, of as many frames as the second.
     np.testing.assert_allclose(centers[0], centers[1], atol=0.02 * np.ptp(centers[1], axis=0).max())

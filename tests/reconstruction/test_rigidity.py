@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from coliags_plugin.reconstruction.structure import rigidity as structure_rigidity
-from coliags_plugin.reconstruction.structure.rigidity import rigid_frames, rigidity
+from coliags_plugin.reconstruction.structure import adjustment
+from coliags_plugin.reconstruction.structure.adjustment import rigid_frames, rigidity
 from tests.reconstruction.seen_points import frame_points, seen_points
 
 
@@ -53,6 +53,6 @@ def test_a_moving_scene_is_farther_off_the_longer_it_moves():
     ],
 )
 def test_a_model_is_as_long_as_what_it_shows_is_rigid(residuals, frames, monkeypatch):
-    monkeypatch.setattr(structure_rigidity, "rigidity", lambda model, tracks: residuals)
+    monkeypatch.setattr(adjustment, "rigidity", lambda model, tracks: residuals)
     camera = pycolmap.Camera(model="PINHOLE", width=160, height=128, params=[100.0, 100.0, 80.0, 64.0])
     assert rigid_frames(SimpleNamespace(cameras={1: camera}), ()) == frames

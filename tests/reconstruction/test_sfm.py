@@ -23,10 +23,15 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
-from coliags_plugin.reconstruction.structure.model_scale import distances_beside, from_diameter, from_distance, scaled
-from coliags_plugin.reconstruction.structure.sfm import Reconstruction, reconstruct
-from coliags_plugin.reconstruction.structure.sfm_cameras import distortion
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
+from coliags_plugin.reconstruction.structure.sfm import (
+    Reconstruction,
+    distances_beside,
+    from_diameter,
+    from_distance,
+    reconstruct,
+    scaled,
+)
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, distortion
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 KNOWN = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS))

@@ -9,8 +9,9 @@ from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.reconstruction.structure.sfm_cameras import (
+from coliags_plugin.reconstruction.structure.sfm_settings import (
     CALIBRATED,
+    CameraSettings,
     Picture,
     Start,
     calibrated_camera,
@@ -20,7 +21,6 @@ from coliags_plugin.reconstruction.structure.sfm_cameras import (
     starting_cameras,
     starts,
 )
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
 from tests.reconstruction.seen_points import seen_points
 from tests.textured_tube import HEIGHT, WIDTH
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,8 +59,7 @@ class PosesSfmCommand:
         from coliags_plugin.pipeline.frames import FrameSurvey
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for, read_image
-        from coliags_plugin.reconstruction.structure.model_scale import atlas_scaled, millimetres
-        from coliags_plugin.reconstruction.structure.sfm import reconstruct
+        from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
         arguments.refuse_output(self.output, self.frames, self.overwrite)
@@ -86,7 +85,7 @@ class PosesSfmCommand:
             atlas = reconstruct(images, settings, masks, progress)
             factor = millimetres(atlas.largest, self.diameter, known_distance)
             if factor is not None:
-                atlas = atlas_scaled(atlas, factor)
+                atlas = replace(atlas, models=(scaled(atlas.largest, factor), *atlas.models[1:]))
             write_sfm_scene(self.output, atlas, masks, self.overwrite, [] if factor is None else ["mm"])
         text = f"{atlas.summary()}\n{_unit(atlas.largest, factor)}"
         print_summary(text, written=[self.output], then=depth_commands(self.output), as_json=self.json)

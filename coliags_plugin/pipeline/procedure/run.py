@@ -25,8 +25,7 @@ from coliags_plugin.pipeline.procedure.page import write_procedure_page
 from coliags_plugin.pipeline.procedure.record import Procedure, SegmentJoin
 from coliags_plugin.pipeline.procedure.segments import SURVEY_FILE, Survey, checksum, cut, survey_video
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record
-from coliags_plugin.reconstruction.structure.sfm_cameras import has_known_camera
-from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, has_known_camera
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ at the lens resolves it: nearer points are brighter.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +18,10 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import adjust, held_out_error
-from coliags_plugin.reconstruction.structure.atlas import held_part, part_of
+from coliags_plugin.reconstruction.structure.atlas import Again, held_part, part_of
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
-from coliags_plugin.reconstruction.structure.sfm_cameras import (
+from coliags_plugin.reconstruction.structure.sfm_settings import (
+    SfmSettings,
     Start,
     distortion,
     field_of_view,
@@ -29,7 +30,6 @@ from coliags_plugin.reconstruction.structure.sfm_cameras import (
     starts,
     tracked_starts,
 )
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ class Hypothesis:
     model: pycolmap.Reconstruction
     correlation: float | None  # of log brightness with log depth; None: unknown
     is_reversed: bool = False  # made by reversing another one's depth
+    joins: Mapping[int, Again] = field(default_factory=dict)  # places where models were joined, by the frame before
 
     @classmethod
     def of(
@@ -62,6 +63,11 @@ class Hypothesis:
     ) -> Hypothesis:
         """The hypothesis of a bundle-adjusted model; ``brightness`` at the features of each image."""
         return cls(model, brightness_correlation(model, brightness), is_reversed)
+
+    @property
+    def frames(self) -> list[int]:
+        """Frames with a pose, ascending."""
+        return [number - 1 for number in sorted(self.model.reg_image_ids())]
 
     @property
     def images(self) -> int:

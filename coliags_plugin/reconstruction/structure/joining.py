@@ -21,13 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.alignment import Similarity
-from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error, median_of_points
+from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error, median_of_points, rigid_frames
 from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_links
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, adjusted
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.point_tracks import PointFinder, View
-from coliags_plugin.reconstruction.structure.rigidity import rigid_frames
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
@@ -54,26 +53,13 @@ _FEWEST_AGREEING, _FEWEST_SIDE = 10, 3
 _WORSE, _MORE, _MOST_LOST = 1.05, 0.1, 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A model of a video, and the places at which models were joined to it: by the last frame before each."""
-
-    hypothesis: Hypothesis
-    joins: dict[int, Again]
-
-    @property
-    def frames(self) -> list[int]:
-        """Frames with a pose, ascending."""
-        return [number - 1 for number in sorted(self.hypothesis.model.reg_image_ids())]
-
-
 def join_models(
     video: MatchedVideo,
     models: Sequence[Hypothesis],
     settings: SfmSettings,
     masks: Masks = None,
     progress: Progress | None = None,
-) -> tuple[MatchedVideo, list[Part], dict[int, Again]]:
+) -> tuple[MatchedVideo, list[Hypothesis], dict[int, Again]]:
     """Join models of tracks that show the same wall.
 
     A joined model is adjusted as a whole, with the points that were found again, and kept if held-out tracks are
@@ -83,7 +69,7 @@ def join_models(
         The video with the points found again, the models, and joins that were found but not made.
     """
     compare = _Comparison(video, settings, masks)
-    parts = [Part(model, {}) for model in models]
+    parts = list(models)
     left: list[tuple[range, range]] = []
     cuts = {link.after for model in models for link in weak_links(model.model)}
     stretches = [
@@ -178,7 +164,7 @@ class _Comparison:
 
         self.view = view
 
-    def agreeing(self, one: Part, earlier: range, other: Part, later: range) -> list[_Sighting]:
+    def agreeing(self, one: Hypothesis, earlier: range, other: Hypothesis, later: range) -> list[_Sighting]:
         """Comparisons of the frames at the ends of two stretches that give one similarity, the most typical first.
 
         Empty if too little of it agrees.
@@ -199,9 +185,9 @@ class _Comparison:
         fewest = min(len({sighting.frames[side] for sighting in kept}) for side in (0, 1))
         return kept if len(kept) >= _FEWEST_AGREEING and fewest >= _FEWEST_SIDE else []
 
-    def _posed(self, part: Part, frames: Sequence[int]) -> list[_Posed]:
+    def _posed(self, part: Hypothesis, frames: Sequence[int]) -> list[_Posed]:
         """Frames of a model with its well-known points of tracks; those that see none are left out."""
-        model = part.hypothesis.model
+        model = part.model
         rays = Rays.of(model, self.video.track_ids, [points[:, :2] for points in self.video.keypoints])
         rays = rays.only(np.isin(rays.ids, np.concatenate([self.video.track_ids[i] for i in frames]))[rays.tracks], 3)
         points = rays.triangulated()
@@ -218,7 +204,7 @@ class _Comparison:
         return posed
 
     def _sighting(
-        self, source: _Posed, target: _Posed, seen_by: Part, forwards: bool
+        self, source: _Posed, target: _Posed, seen_by: Hypothesis, forwards: bool
     ) -> tuple[Int64[np.ndarray, "K"], Float32[np.ndarray, "K 2"], Similarity] | None:
         """Points of the source found in the target: tracks, pixels, and the similarity from later to earlier model."""
         import pycolmap
@@ -230,7 +216,7 @@ class _Comparison:
         options.ransac.max_error, options.ransac.random_seed = _POSE_ERROR * float(target.view.stretch.max()), self.seed
         options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
         pixels, points = target.view.in_image(moved), source.points[rows]
-        camera = next(iter(seen_by.hypothesis.model.cameras.values()))
+        camera = next(iter(seen_by.model.cameras.values()))
         found = pycolmap.estimate_and_refine_absolute_pose(pixels.astype(np.float64), points, camera, options)
         if found is None or found["num_inliers"] < _FEWEST_FOUND:
             return None
@@ -302,8 +288,8 @@ def _with_sightings(video: MatchedVideo, sightings: Sequence[_Sighting]) -> Matc
 
 
 def _joined(
-    video: MatchedVideo, one: Part, other: Part, sightings: Sequence[_Sighting], after: int, before: int
-) -> Part | None:
+    video: MatchedVideo, one: Hypothesis, other: Hypothesis, sightings: Sequence[_Sighting], after: int, before: int
+) -> Hypothesis | None:
     """Both models as one, in the frame of the larger; None if it is not as good as they are."""
     import pycolmap
 
@@ -311,12 +297,12 @@ def _joined(
     larger, smaller = one, other
     if len(one.frames) < len(other.frames):
         larger, smaller, change = other, one, change.inverse()
-    moved = pycolmap.Reconstruction(smaller.hypothesis.model)
+    moved = pycolmap.Reconstruction(smaller.model)
     moved.transform(change)
     model = pycolmap.Reconstruction()
-    for camera in larger.hypothesis.model.cameras.values():
+    for camera in larger.model.cameras.values():
         model.add_camera_with_trivial_rig(camera)
-    for part in (larger.hypothesis.model, moved):
+    for part in (larger.model, moved):
         for number in sorted(part.reg_image_ids()):
             image = part.images[number]
             made = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=number)
@@ -329,7 +315,7 @@ def _joined(
     held = kept and link_at(result.model, after).holds and _is_rigid(result, video)
     if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
         return None
-    return Part(result, {**one.joins, **other.joins, after: _again(sightings, before)})
+    return replace(result, joins={**one.joins, **other.joins, after: _again(sightings, before)})
 
 
 def _is_rigid(joined: Hypothesis, video: MatchedVideo) -> bool:
@@ -338,10 +324,10 @@ def _is_rigid(joined: Hypothesis, video: MatchedVideo) -> bool:
     return longest is None or joined.images <= longest
 
 
-def _is_worse(joined: Hypothesis, parts: Sequence[Part], video: MatchedVideo) -> bool:
+def _is_worse(joined: Hypothesis, parts: Sequence[Hypothesis], video: MatchedVideo) -> bool:
     """Whether a joined model has a larger error of held-out tracks than its parts, or one that is unknown."""
     error = held_out_error(joined.model, video.tracks)
-    before = [held_out_error(part.hypothesis.model, video.tracks) for part in parts]
+    before = [held_out_error(part.model, video.tracks) for part in parts]
     known = [one for one in before if one is not None]
     if error is None or len(known) < len(before):
         return True

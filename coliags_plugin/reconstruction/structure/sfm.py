@@ -1,4 +1,4 @@
-"""Structure from motion by COLMAP: camera poses, intrinsics and points from images or the frames of a video."""
+"""Structure from motion by COLMAP: camera poses, intrinsics and points from images or a video, and their scale."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.reconstruction.structure.adjustment import held_out_error
+from coliags_plugin.reconstruction.structure.adjustment import held_out_error, rigid_frames, rigidity
 from coliags_plugin.reconstruction.structure.atlas import Again, Link, contradictions, link_at, part_of, weak_links
 from coliags_plugin.reconstruction.structure.features import quiet_colmap
 from coliags_plugin.reconstruction.structure.hypotheses import (
@@ -31,16 +31,15 @@ from coliags_plugin.reconstruction.structure.hypotheses import (
     with_camera,
 )
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
-from coliags_plugin.reconstruction.structure.joining import Part, join_models, stretches_of
+from coliags_plugin.reconstruction.structure.joining import join_models, stretches_of
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
-from coliags_plugin.reconstruction.structure.rigidity import rigid_frames, rigidity
-from coliags_plugin.reconstruction.structure.sfm_cameras import (
+from coliags_plugin.reconstruction.structure.sfm_settings import (
+    SfmSettings,
     field_of_view,
     has_known_camera,
     is_refined,
     tracked_starts,
 )
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, read_video
 
 if TYPE_CHECKING:
@@ -231,7 +230,7 @@ def _atlas(
             weak = [link for link in weak_links(hypothesis.model) if not link.holds]
             broken = _apart([*weak, *contradictions(hypothesis.model, weak)], settings.min_model_size)
         refused += broken
-        frames = np.array(sorted(hypothesis.model.reg_image_ids())) - 1
+        frames = np.array(hypothesis.frames)
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
             one = hypothesis
             if broken and len(part) >= settings.min_model_size:
@@ -241,11 +240,10 @@ def _atlas(
                 kept += pieces
                 refused += moving
     apart: dict[int, Again] = {}
-    parts = [Part(one, {}) for one in kept]
     if video.tracks:
-        video, parts, apart = join_models(video, kept, settings, masks, progress)
-    refused = [link for link in refused if not any(link.after in part.joins for part in parts)]  # not joined again
-    found = [_result(video, part.hypothesis, _links(part) if video.tracks else ()) for part in parts]
+        video, kept, apart = join_models(video, kept, settings, masks, progress)
+    refused = [link for link in refused if not any(link.after in one.joins for one in kept)]  # not joined again
+    found = [_result(video, one, _links(one) if video.tracks else ()) for one in kept]
     found.sort(key=lambda one: -len(one.registered))
     posed = {index for one in found for index in one.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
@@ -273,8 +271,8 @@ def _rigid_stretches(one: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothe
     count = 1 if longest is None else min(-(-one.images // longest), one.images // _SHORT)
     if longest is None or count < 2:
         return [one], []
-    frames = np.array(sorted(number - 1 for number in one.model.reg_image_ids()))
-    centers = np.array([one.model.images[number + 1].projection_center() for number in frames.tolist()])
+    frames = one.frames
+    centers = np.array([one.model.images[frame + 1].projection_center() for frame in frames])
     places = _far_apart(centers, count, _LEAST_EXTENT * median_depth(one.model))
     if not places:
         return [one], []
@@ -311,11 +309,11 @@ def _apart(links: Sequence[Link], least: int) -> list[Link]:
     return [min(group, key=lambda link: link.points) for group in groups]
 
 
-def _links(part: Part) -> tuple[Link, ...]:
+def _links(one: Hypothesis) -> tuple[Link, ...]:
     """Weak places of a model that hold, and those at which it was joined."""
-    model = part.hypothesis.model
+    model = one.model
     weak = {link.after: link for link in weak_links(model) if link.holds}
-    joined = {after: replace(link_at(model, after), again=again) for after, again in part.joins.items()}
+    joined = {after: replace(link_at(model, after), again=again) for after, again in one.joins.items()}
     return tuple(link for _, link in sorted({**weak, **joined}.items()))
 
 
@@ -367,7 +365,7 @@ _LIT = -0.15
 
 def _result(video: MatchedVideo, chosen: Hypothesis, links: tuple[Link, ...]) -> Reconstruction:
     images, model = video.images, chosen.model
-    registered = sorted(number - 1 for number in model.reg_image_ids())
+    registered = chosen.frames
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
@@ -411,3 +409,78 @@ def _color(model: pycolmap.Reconstruction, images: Sequence[Path]) -> None:
             total[observation.point3D_id] = total.get(observation.point3D_id, 0.0) + color
     for point, color in total.items():
         model.points3D[point].color = np.rint(color / model.points3D[point].track.length()).astype(np.uint8)
+
+
+#: Least number of points beside the path for an estimate of the diameter.
+_FEWEST_BESIDE = 30
+
+
+def millimetres(
+    reconstruction: Reconstruction, diameter: float | None = None, distance: tuple[str, str, float] | None = None
+) -> float | None:
+    """Millimetres per unit of a model; None where the scale stays unknown, with a warning.
+
+    Known are the colon's typical inner diameter, mm, or the names of two images and their cameras' distance, mm, which
+    takes precedence.
+    """
+    try:
+        if distance is not None:
+            return from_distance(reconstruction, *distance)
+        return None if diameter is None else from_diameter(reconstruction, diameter)
+    except InputError as error:
+        # The poses took minutes: they are kept all the same.
+        log.warning("%s The scale stays unknown", error)
+        return None
+
+
+def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:
+    """Distances of points from a polyline, without the points ahead of and behind it."""
+    start, along = path[:-1], np.diff(path, axis=0)
+    squares = np.maximum((along**2).sum(axis=1), 1e-30)
+    best = np.full(len(points), np.inf)
+    where = np.zeros(len(points))
+    for index, (origin, direction, square) in enumerate(zip(start, along, squares, strict=True)):
+        share = np.clip((points - origin) @ direction / square, 0.0, 1.0)
+        distance = np.linalg.norm(points - origin - share[:, None] * direction, axis=1)
+        nearer = distance < best
+        best[nearer], where[nearer] = distance[nearer], index + share[nearer]
+    return best[(where > 0.0) & (where < len(along))]
+
+
+def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
+    """Millimetres per unit, for a colon whose inner diameter, mm, is twice the wall's median distance from the path."""
+    points = np.array([point.xyz for point in reconstruction.model.points3D.values()]).reshape(-1, 3)
+    beside = distances_beside(reconstruction.camera_to_world[:, :3, 3], points)
+    if len(beside) < _FEWEST_BESIDE:
+        raise InputError(
+            f"--diameter {diameter:g}, and {len(beside)} of {len(points)} points lie beside the camera's path",
+            f"at least {_FEWEST_BESIDE}",
+            "Take a longer part of the video, or give the distance of two cameras (--distance), or neither",
+        )
+    return float(diameter / (2.0 * np.median(beside)))
+
+
+def from_distance(reconstruction: Reconstruction, first: str, second: str, distance: float) -> float:
+    """Millimetres per unit, from a known distance, mm, between the cameras of two images, by file name or stem."""
+    rows = {}
+    for row, index in enumerate(reconstruction.registered):
+        rows[reconstruction.images[index].stem] = rows[reconstruction.images[index].name] = row
+    for name in (first, second):
+        if name not in rows:
+            raise InputError(f"--distance: no image '{name}' with a pose", "two of the registered images, by name")
+    centers = reconstruction.camera_to_world[[rows[first], rows[second]], :3, 3]
+    units = float(np.linalg.norm(centers[1] - centers[0]))
+    if not units > 0.0:
+        raise InputError(f"--distance: the cameras of {first} and {second} coincide", "two positions")
+    return distance / units
+
+
+def scaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
+    """The model with positions of cameras and points multiplied by a factor."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(reconstruction.model)
+    model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+    camera_to_world = reconstruction.camera_to_world.copy()
+    camera_to_world[:, :3, 3] *= factor
+    return replace(reconstruction, model=model, camera_to_world=camera_to_world)

@@ -1,14 +1,24 @@
-"""Options of structure from motion."""
+"""Options of structure from motion, and cameras with which it starts: guessed, given, or of a known endoscope."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+from jaxtyping import Bool, UInt8
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 class CameraSettings(Settings):
@@ -111,3 +121,182 @@ class SfmSettings(Settings):
         "the middle of each of the three largest models.",
     )
     seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")
+
+
+#: Calibrated cameras by name: the lens of :data:`LENSES` whose pinhole (undistorted images) or which itself took the
+#: images.
+CALIBRATED = {"c3vd": "fisheye", "c3vd-undistorted": "legacy-pinhole"}
+#: Camera models that are tried where none is given: endoscopes have fisheye lenses, but images may be undistorted.
+_FISHEYE, _UNDISTORTED = "SIMPLE_RADIAL_FISHEYE", "SIMPLE_RADIAL"
+#: Largest deviation of an image's aspect ratio from the calibrated one's.
+_ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Start:
+    """Camera that mapping starts with."""
+
+    model: str  # of COLMAP, or of CALIBRATED
+    focal_factor: float  # focal length relative to the image's larger side, where no parameters are known
+    radial: float | None = None  # the model's last parameter, its only one of distortion; None: undistorted
+
+
+#: Share of the image's width and height from which the lens's picture fills it; brightness (of 255) of surroundings.
+_FILLED, _DARK = 0.95, 16
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The part of the images that the lens's picture takes up within black surroundings; its centre is the lens's."""
+
+    corner: tuple[int, int]  # column and row of its first pixel
+    size: tuple[int, int]  # width and height
+    frame: tuple[int, int]  # width and height of the images
+
+    @classmethod
+    def in_mask(cls, mask: Bool[np.ndarray, "H W"], image: UInt8[np.ndarray, "H W 3"]) -> Picture | None:
+        """The rectangle around what is not masked, or masked but mostly bright; None where it is nearly all."""
+        lit = image.max(axis=2) > _DARK
+        spans = []
+        for axis in (0, 1):
+            used = np.flatnonzero(mask.any(axis=axis) | (lit.mean(axis=axis) > 0.5))
+            spans.append((int(used[0]), int(used[-1]) + 1) if len(used) else (0, mask.shape[1 - axis]))
+        size = (spans[0][1] - spans[0][0], spans[1][1] - spans[1][0])
+        frame = (mask.shape[1], mask.shape[0])
+        if all(part >= _FILLED * whole for part, whole in zip(size, frame, strict=True)):
+            return None
+        return cls((spans[0][0], spans[1][0]), size, frame)
+
+    def to_frame(self, model: pycolmap.Reconstruction) -> None:
+        """Change cameras and keypoints of a model of the picture to those of whole images, in place."""
+        for camera in model.cameras.values():
+            camera.width, camera.height = self.frame
+            camera.principal_point_x += self.corner[0]
+            camera.principal_point_y += self.corner[1]
+        for image in model.images.values():
+            for point in image.points2D:
+                point.xy = point.xy + np.array(self.corner, float)
+
+
+def starts(settings: CameraSettings) -> list[Start]:
+    """Cameras to try, the most likely first; one if it is known.
+
+    Where no model is given, the fisheye starts from every focal length, and the pinhole with distortion from the first:
+    undistorted images are rarely wider than 100 degrees.
+    """
+    likely = settings.focal_factors[0]
+    if settings.model is None:
+        return [*(Start(_FISHEYE, factor) for factor in settings.focal_factors), Start(_UNDISTORTED, likely)]
+    factors = (likely,) if has_known_camera(settings) else settings.focal_factors
+    return [Start(settings.model, factor) for factor in factors]
+
+
+#: Distortion of the fisheye lenses tried on tracks, the most likely first: nearly a pinhole's image, whose radius is
+#: tan(x) = x + x^3 / 3 + ..., equal angles at equal distances, and between; and focal lengths, relative to the side.
+_RADIALS, _TRACKED_FACTORS = (0.333, 0.0, 0.167), (0.57, 0.4, 0.48, 0.68, 0.82, 1.0)
+
+
+def tracked_starts(settings: CameraSettings) -> tuple[list[Start], list[float]]:
+    """Lenses to try on tracks, the most likely first, all of one focal length; and focal lengths, this one first."""
+    factors = list(settings.focal_factors if settings.refine is False else _TRACKED_FACTORS)
+    if has_known_camera(settings):
+        factors = factors[:1]
+    if settings.model is not None or settings.refine is False:
+        return [Start(settings.model or _FISHEYE, factors[0])], factors
+    return [Start(_FISHEYE, factors[0], radial) for radial in _RADIALS], factors
+
+
+def has_known_camera(settings: CameraSettings) -> bool:
+    """Whether parameters are given or calibrated."""
+    return settings.params is not None or settings.model in CALIBRATED
+
+
+def is_refined(settings: CameraSettings) -> bool:
+    """Whether focal length and distortion are refined."""
+    return not has_known_camera(settings) if settings.refine is None else settings.refine
+
+
+def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a known camera, scaled to the size of images that show its whole frame."""
+    return camera_of_lens(LENSES[CALIBRATED[name]], f"--camera {name}", width, height)
+
+
+def camera_of_lens(whole: Lens, said: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a lens, scaled to images of its whole frame; ``said`` names it in errors."""
+    if abs((width / height) / (whole.width / whole.height) - 1.0) > _ASPECT_TOLERANCE:
+        raise InputError(
+            f"{said}, and images of {width} x {height}",
+            f"the whole frame, {whole.width} x {whole.height} or scaled from it",
+            "For cropped images, subtract the crop's corner from the principal point and pass --camera OPENCV_FISHEYE "
+            "and --params",
+        )
+    lens = whole.resized(width, height)
+    k = lens.pinhole
+    pinhole = (k.fx, k.fy, k.cx, k.cy)
+    if isinstance(lens, FisheyeLens):
+        return "OPENCV_FISHEYE", (*pinhole, lens.k1, lens.k2, lens.k3, lens.k4)
+    return "PINHOLE", pinhole
+
+
+def starting_cameras(
+    settings: CameraSettings, images: Sequence[Path], sizes: Sequence[tuple[int, int]], start: Start
+) -> list[pycolmap.Camera]:
+    """One camera per image size, in order of first appearance; ``images`` are the files, for errors."""
+    import pycolmap
+
+    known = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
+    if start.model not in known | set(CALIBRATED):
+        raise InputError(f"camera model {start.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(known))}")
+    if start.model in CALIBRATED and settings.params is not None:
+        raise InputError(f"--params, and --camera {start.model}", "--params with a model of COLMAP", "Drop --params")
+    cameras = []
+    for width, height in dict.fromkeys(sizes):
+        model, params = start.model, settings.params
+        if model in CALIBRATED:
+            model, params = calibrated_camera(model, width, height)
+        focal_length = start.focal_factor * max(width, height)
+        camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, width, height)
+        if start.radial is not None:
+            camera.params = [*camera.params[:-1], start.radial]
+        if params is not None:
+            if len(params) != len(camera.params):
+                raise InputError(f"{len(params)} parameters for {model}", f"{len(camera.params)}: {camera.params_info}")
+            camera.params = list(params)
+        # Also set for a guessed focal length: otherwise COLMAP estimates two-view geometry as uncalibrated, which is
+        # ill-conditioned for blurred images under forward motion and wrong for a fisheye.
+        camera.has_prior_focal_length = True
+        cameras.append(camera)
+    if settings.params is not None and len(cameras) > 1:
+        other = next(index for index, size in enumerate(sizes) if size != sizes[0])
+        raise InputError(
+            f"{images[other].name} is {sizes[other][0]} x {sizes[other][1]}, {images[0].name} "
+            f"{sizes[0][0]} x {sizes[0][1]}",
+            "images of one size, since the parameters of one camera are given",
+            "Leave out the images of other sizes",
+        )
+    return cameras
+
+
+def field_of_view(camera: pycolmap.Camera, side: float | None = None) -> float:
+    """Nominal (undistorted) field of view of the larger side, degrees: 2 atan(side / 2f), or side / f of a fisheye.
+
+    ``side``, pixels, is that of the lens's picture where it does not fill the images.
+    """
+    return float(np.degrees(2.0 * _border(camera, side)[1]))
+
+
+def distortion(camera: pycolmap.Camera) -> float:
+    """Displacement by distortion at the nominal border of the larger side, relative to the distance from the centre."""
+    radius, angle = _border(camera)
+    axis = 0 if camera.width >= camera.height else 1
+    ray = np.array([0.0, 0.0, np.cos(angle)])
+    ray[axis] = np.sin(angle)
+    center = (camera.principal_point_x, camera.principal_point_y)[axis]
+    return abs(float(camera.img_from_cam(ray[None])[0][axis] - center) / radius - 1.0)
+
+
+def _border(camera: pycolmap.Camera, side: float | None = None) -> tuple[float, float]:
+    """Half of the larger side, pixels, and its nominal angle from the optical axis, radians."""
+    radius = 0.5 * (side or max(camera.width, camera.height))
+    tangent = radius / camera.mean_focal_length()
+    return radius, float(tangent if "FISHEYE" in camera.model_name else np.arctan(tangent))

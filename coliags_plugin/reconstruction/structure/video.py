@@ -23,14 +23,14 @@ from coliags_plugin.reconstruction.structure.image_files import Masks, file_name
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
-from coliags_plugin.reconstruction.structure.sfm_cameras import (
+from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
+    SfmSettings,
     Start,
     has_known_camera,
     starting_cameras,
     starts,
 )
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
 if TYPE_CHECKING:
