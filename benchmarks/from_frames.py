@@ -19,8 +19,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.geometry.poses import colmap
-from coliags_plugin.geometry.poses.alignment import align
-from coliags_plugin.geometry.poses.association import FrameMatches
+from coliags_plugin.geometry.poses.alignment import FrameMatches, align
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.reconstruction.structure.image_files import list_images

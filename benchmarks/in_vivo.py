@@ -26,8 +26,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.images import decode_image, write_image
-from coliags_plugin.geometry.poses.alignment import Alignment, align
-from coliags_plugin.geometry.poses.association import FrameMatches
+from coliags_plugin.geometry.poses.alignment import Alignment, FrameMatches, align
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import list_images

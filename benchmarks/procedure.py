@@ -41,7 +41,7 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, compare_meshes
 from coliags_plugin.geometry.poses.alignment import Similarity
-from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
+from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
 from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.context import Submap

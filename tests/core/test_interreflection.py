@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from coliags_plugin.lighting.interreflection import Cavity
+from coliags_plugin.lighting.photometry import Cavity
 
 
 def sphere(count, radius):

@@ -20,9 +20,8 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
 from coliags_plugin.datamanagers.units import write_unit
-from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, Undistortion
 from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
-from coliags_plugin.geometry.lenses.undistortion import Undistortion
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
 from tests.datamanagers.wall_scenes import PINHOLE, look, manager, off_wall, poses, rays, seen_from, video

@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.poses import tum
-from coliags_plugin.geometry.poses.association import nearest_in_time
+from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.datamanagers.kinds import change_lines, files
 from tests.datamanagers.wall_scenes import FRAMES, PINHOLE, look, manager, names, poses, rays, video

@@ -16,8 +16,7 @@ from coliags_plugin.datamanagers.units import read_unit
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses import colmap
-from coliags_plugin.geometry.poses.alignment import align
-from coliags_plugin.geometry.poses.association import associate
+from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import training_stages

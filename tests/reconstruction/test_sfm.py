@@ -16,8 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap
-from coliags_plugin.geometry.poses.alignment import align
-from coliags_plugin.geometry.poses.association import associate
+from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png

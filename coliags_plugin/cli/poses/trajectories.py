@@ -148,8 +148,7 @@ class PosesAlignCommand:
 
     def run(self) -> None:
         """Align, and print a table of the errors."""
-        from coliags_plugin.geometry.poses.alignment import align
-        from coliags_plugin.geometry.poses.association import associate
+        from coliags_plugin.geometry.poses.alignment import align, associate
 
         _, estimate = read_and_log(self.estimate, self.estimate_format)
         kind, reference = read_and_log(self.reference, self.reference_format)

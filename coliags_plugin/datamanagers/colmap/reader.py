@@ -27,7 +27,6 @@ from coliags_plugin.datamanagers.units import FACTORS
 from coliags_plugin.geometry.lenses.models import Array, PinholeLens
 from coliags_plugin.geometry.lenses.tabulated import MappedLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
-from coliags_plugin.geometry.poses import colmap_files
 
 if TYPE_CHECKING:
     import pycolmap
@@ -112,14 +111,14 @@ def find_models(scene: Path) -> list[Path]:
         parent = scene / name
         numbered = [] if name == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
         candidates = [*sorted(numbered, key=lambda path: int(path.name)), parent]
-        if found := [path for path in candidates if colmap_files.model_suffix(path, _PARTS) is not None]:
+        if found := [path for path in candidates if colmap_poses.model_suffix(path, _PARTS) is not None]:
             return found
     return []
 
 
 def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model; binary if both exist. It must be possible to undistort its images to a pinhole."""
-    suffix = colmap_files.model_suffix(folder, _PARTS)
+    suffix = colmap_poses.model_suffix(folder, _PARTS)
     if suffix is None:
         raise InputError(
             f"{folder} holds no COLMAP model",
@@ -128,9 +127,9 @@ def read_model(folder: Path) -> SparseModel:
         )
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
     trajectory = colmap_poses.read(folder)
-    cameras, points = colmap_files.read_cameras(files[0]), colmap_files.read_points(files[2])
+    cameras, points = colmap_poses.read_cameras(files[0]), colmap_poses.read_points(files[2])
     rows = {point.number: row for row, point in enumerate(points)}
-    by_name = {image.name: image for image in colmap_files.read_images(files[1])}
+    by_name = {image.name: image for image in colmap_poses.read_images(files[1])}
     images = []
     for name in trajectory.names or ():
         image = by_name[name]
@@ -166,7 +165,7 @@ def sidecar_file(folder: Path, name: str, suffixes: Sequence[str]) -> Path | Non
     return None
 
 
-def _lens(camera: colmap_files.ColmapCamera, file: Path) -> ColmapLens:
+def _lens(camera: colmap_poses.ColmapCamera, file: Path) -> ColmapLens:
     lens = ColmapLens(width=camera.width, height=camera.height, model=camera.model, params=camera.params)
     if camera.model in _PANORAMIC:
         raise InputError(

@@ -20,16 +20,16 @@ from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
-#: Key -> allowed shapes; a letter is the same size throughout the file, F the number of poses.
-SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
-    "cam_unnorm_rots": ((1, 4, "F"),),
-    "cam_trans": ((1, 3, "F"),),
-    "gt_w2c_all_frames": (("F", 4, 4),),
-    "intrinsics": ((3, 3),),
-    "org_width": ((), (1,)),
-    "org_height": ((), (1,)),
-    "means3D": (("N", 3),),
-    "rgb_colors": (("N", 3),),
+#: Key -> shape, of at least one dimension; a letter is the same size throughout the file, F the number of poses.
+SHAPES: dict[str, tuple[int | str, ...]] = {
+    "cam_unnorm_rots": (1, 4, "F"),
+    "cam_trans": (1, 3, "F"),
+    "gt_w2c_all_frames": ("F", 4, 4),
+    "intrinsics": (3, 3),
+    "org_width": (1,),
+    "org_height": (1,),
+    "means3D": ("N", 3),
+    "rgb_colors": ("N", 3),
 }
 _POSES = ("cam_unnorm_rots", "cam_trans")
 _PINHOLE = ("intrinsics", "org_width", "org_height")
@@ -180,22 +180,13 @@ def _fault(key: str, array: np.ndarray, sizes: dict[str, int]) -> str:
     """Describe the fault of an array, or return an empty string; records the sizes of letters."""
     if not (np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)):
         return f"{key} holds {array.dtype}, not numbers"
-    for shape in SHAPES[key]:
-        expected = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in shape)
-        fits = len(expected) == array.ndim and all(
-            isinstance(want, str) or want == have for want, have in zip(expected, array.shape, strict=True)
-        )
-        if fits:
-            sizes.update((size, have) for size, have in zip(shape, array.shape, strict=True) if isinstance(size, str))
-            break
-    else:
-        wanted = " or ".join(_shape(shape, sizes) for shape in SHAPES[key])
-        return f"{key} has the shape {list(array.shape)}, not {wanted}"
+    shape, expected = np.atleast_1d(array).shape, [sizes.get(str(size), size) for size in SHAPES[key]]
+    if len(shape) != len(expected) or any(
+        isinstance(want, int) and want != have for want, have in zip(expected, shape, strict=True)
+    ):
+        return f"{key} has the shape {list(array.shape)}, not [{', '.join(map(str, expected))}]"
+    sizes.update((size, have) for size, have in zip(SHAPES[key], shape, strict=True) if isinstance(size, str))
     return "" if np.all(np.isfinite(array)) else f"{key} holds numbers that are not finite"
-
-
-def _shape(shape: tuple[int | str, ...], sizes: dict[str, int]) -> str:
-    return f"[{', '.join(str(sizes.get(size, size)) if isinstance(size, str) else str(size) for size in shape)}]"
 
 
 _KEEPS = frozenset({"intrinsics"})

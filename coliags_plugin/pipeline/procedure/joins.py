@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.datamanagers.colmap.reader import find_models
-from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_images, read_points
+from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
 from coliags_plugin.pipeline.procedure.record import SegmentJoin
 
 #: Fewest frames that both models have to have posed.

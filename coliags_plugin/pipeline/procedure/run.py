@@ -13,7 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.execution.executors import ExecutionOptions, Executor
 from coliags_plugin.execution.queue import Job, make_executor
-from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
+from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.chain import identity_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_selection import reduced

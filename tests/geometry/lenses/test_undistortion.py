@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask, undistortion_map
-from coliags_plugin.geometry.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.lenses.models import LENSES, Undistortion, octagon_mask, undistortion_map
 
 NAMES = sorted(LENSES)
 STRAIGHT = replace(LENSES["legacy-pinhole"], k1=0.0, k2=0.0)

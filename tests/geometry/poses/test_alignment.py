@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.alignment import Similarity, align, umeyama, world_rotation
-from coliags_plugin.geometry.poses.association import FrameMatches, associate
+from coliags_plugin.geometry.poses.alignment import FrameMatches, Similarity, align, associate, umeyama, world_rotation
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.geometry.poses.winding import some_transform, trajectories, winding
 
