@@ -9,8 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin._version import __version__
 from coliags_plugin.config.registry import phantom_layouts
@@ -20,21 +23,17 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.alignment import umeyama
-from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
+from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
-from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
-from coliags_plugin.phantom.light import CameraLight
-from coliags_plugin.phantom.living import WallMotion, frame_times, wall_motion
-from coliags_plugin.phantom.measured import displaced, estimated_depth, pose_errors
-from coliags_plugin.phantom.motion import poses_during
+from coliags_plugin.phantom.light import CameraLight, IndirectLight, indirect_lights
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, meter_weights, white_balances
 from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
-from coliags_plugin.phantom.streams import Purpose, stream
+from coliags_plugin.phantom.streams import Purpose, slow_drift, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
-from coliags_plugin.phantom.trajectory import RotationView, camera_path, turn_away
+from coliags_plugin.phantom.trajectory import RotationView, camera_path, poses_during, turn_away
 
 _LOG = logging.getLogger(__name__)
 
@@ -140,15 +139,10 @@ def world_at(world: World, motion: WallMotion | None, settings: PhantomSettings,
     return world
 
 
-def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
-    """Image width and height, pixels; the layout's default if not set."""
-    width, height = layout.default_size
-    return value_or_default(settings.width, width), value_or_default(settings.height, height)
-
-
 def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
     """Settings with every None replaced, and without rotation views if the layout does not support them."""
-    size = dict(zip(("width", "height"), image_size(settings, layout), strict=True))
+    width, height = layout.default_size
+    size = {"width": value_or_default(settings.width, width), "height": value_or_default(settings.height, height)}
     views = settings.rotation_views if layout.has_rotation else 0
     return settings.model_copy(update={**size, "rotation_views": views}).resolved()
 
@@ -176,7 +170,7 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
         albedo = vertex_albedo(surface, mucosa)
         indirect[:] = indirect_lights(surface, albedo, tracer, lamps, everywhere, settings.interreflection, generator)
     report("colon", 3, 4)
-    lens, mask = layout.lens(*image_size(settings, layout))
+    lens, mask = layout.lens(settings.width or 0, settings.height or 0)
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
     weights = meter_weights(thin.mask, settings)
@@ -401,3 +395,43 @@ def _write_mesh(path: Path, surface: ColonSurface, albedo: Float[np.ndarray, "V 
 def _write_gains(path: Path, gains: Float[np.ndarray, "T 3"]) -> None:
     rows = np.column_stack([np.arange(len(gains)), gains])
     np.savetxt(path, rows, "%d,%.9g,%.9g,%.9g", header="frame,gain_r,gain_g,gain_b", comments="")
+
+
+#: Jitter of a training frame's pose, as a share of the drift.
+_JITTER = 0.2
+#: Standard deviations of the kernels of depth that bleeds over edges, and of its noise, as shares of the width.
+_BLEEDING, _BLOBS = 0.006, 0.08
+
+
+def pose_errors(settings: PhantomSettings, training: Bool[np.ndarray, "T"]) -> Float[np.ndarray, "T 6"]:
+    """Errors of poses: translation, mm, and rotation vector, radians. A slow drift, and jitter in training frames."""
+    generator = stream(settings.seed, Purpose.POSE_NOISE)
+    millimetres, degrees = settings.pose_noise
+    deviations = np.repeat([millimetres, np.radians(degrees)], 3)
+    drift = slow_drift(generator, len(training), 6, deviations)
+    jitter = _JITTER * deviations * generator.standard_normal(drift.shape)
+    return np.asarray(drift + jitter * training[:, None])
+
+
+def displaced(poses: Float[np.ndarray, "N 4 4"], errors: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 4 4"]:
+    """Poses moved by errors: translated in world axes, and turned about their own centres."""
+    given = poses.copy()
+    given[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(errors[:, 3:]).as_matrix()
+    given[:, :3, 3] += errors[:, :3]
+    return given
+
+
+def estimated_depth(
+    z_depth: Float[np.ndarray, "H W"], settings: PhantomSettings, frame: int
+) -> Float[np.ndarray, "H W"]:
+    """The z-depth of a frame as it is given, mm: it bleeds over edges, and its relative noise is smooth; 0 stays 0."""
+    height, width = z_depth.shape
+    known = z_depth > 0.0
+    sigma = max(_BLEEDING * width, 0.3)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma)
+    blurred = cv2.GaussianBlur(z_depth, (0, 0), sigma) / np.maximum(weight, 1e-6)
+    noise = stream(settings.seed, Purpose.DEPTH_NOISE, frame).standard_normal((height, width))
+    blobs = _BLOBS * width
+    # A Gaussian kernel in two dimensions leaves 1 / (2 sqrt(pi) sigma) of the deviation of white noise.
+    noise = scipy.ndimage.gaussian_filter(noise, blobs, mode="wrap") * (2.0 * np.sqrt(np.pi) * blobs)
+    return np.where(known, blurred * np.exp(settings.depth_noise * noise), 0.0).astype(np.float32)

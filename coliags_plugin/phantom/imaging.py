@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.colon import ColonSurface
-from coliags_plugin.phantom.interreflection import IndirectLight
-from coliags_plugin.phantom.light import CameraLight
+from coliags_plugin.phantom.light import CameraLight, IndirectLight
 from coliags_plugin.phantom.mucosa import Mucosa
 from coliags_plugin.phantom.props import Body
 from coliags_plugin.phantom.tracing import Hits, Tracer, rotated

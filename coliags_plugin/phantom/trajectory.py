@@ -1,4 +1,10 @@
-"""Camera paths of phantoms: withdrawal, inspection, rotation in place, and rotated test views."""
+"""Camera paths of phantoms: withdrawal, rotation in place, inspection, examination, and rotated test views.
+
+The path that inspects rests at stops at even times, alternately far and near. At a far stop the camera is near the
+centre line and the wall in the middle of the image is about 60 mm away; at a near stop it has moved straight towards a
+spot of the wall, has turned to it and is about 6 mm from the wall. Speeds of the path that examines, a withdrawal back
+and forth with fast turns and wall contacts, are per second: more frames show more of the same motion.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +12,376 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom.colon import CentreLine
-from coliags_plugin.phantom.examination import examining_path
-from coliags_plugin.phantom.inspection import inspecting_path
-from coliags_plugin.phantom.living import WallMotion
-from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, looking, rotation, rotation_about, times
+from coliags_plugin.phantom.colon import CentreLine, WallMotion
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer
+
+#: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
+NEAREST = 6.0
+#: Arc length of a withdrawal's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
+SHALLOW_END = 26.0
+
+#: Cycles of a sway over a sequence.
+_CYCLES = np.array([0.6, 1.3, 2.4])
+
+Curve = Callable[[Float[np.ndarray, "T"]], Float[np.ndarray, "T"]]
+#: Distance at which the image motion of an exposure is judged, mm, and the motion from one rendering to the next, px.
+_JUDGED_AT, _BLUR_STEP = 15.0, 1.25
+#: Most renderings of an exposure.
+_MOST = 24
+
+
+def poses_between(poses: Float[np.ndarray, "T 4 4"], at: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 4 4"]:
+    """Poses at fractional frames; positions and rotations are linear from frame to frame."""
+    at = np.clip(at, 0.0, len(poses) - 1.0)
+    numbers = np.arange(len(poses))
+    between = np.tile(np.eye(4), (len(at), 1, 1))
+    between[:, :3, :3] = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
+    between[:, :3, 3] = np.stack([np.interp(at, numbers, axis) for axis in poses[:, :3, 3].T], axis=1)
+    return between
+
+
+def poses_during(
+    poses: Float[np.ndarray, "T 4 4"], frame: int, shutter: float, focal_length: float, least: int
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses at even times of a frame's exposure, ``least`` or more, close enough for a smooth blur.
+
+    The shutter is open for the share ``shutter`` of the frame interval, and the frame's own pose is in the middle.
+    """
+    first, last = poses_between(poses, frame + shutter * np.array([-0.5, 0.5]))
+    angle = np.arccos(np.clip(0.5 * (np.trace(first[:3, :3].T @ last[:3, :3]) - 1.0), -1.0, 1.0))
+    moved = np.linalg.norm(last[:3, 3] - first[:3, 3])
+    count = int(np.clip(np.ceil(focal_length * (angle + moved / _JUDGED_AT) / _BLUR_STEP), least, max(_MOST, least)))
+    return list(poses_between(poses, frame + shutter * ((np.arange(count) + 0.5) / count - 0.5)))
+
+
+def times(settings: PhantomSettings) -> Float[np.ndarray, "T"]:
+    """Time of every frame along the path, from 0 to 1, in even steps."""
+    return np.linspace(0.0, 1.0, settings.frames)
+
+
+def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
+    return np.asarray(
+        rotation_about(np.array([0.0, 1.0, 0.0]), yaw)
+        @ rotation_about(np.array([1.0, 0.0, 0.0]), pitch)
+        @ rotation_about(np.array([0.0, 0.0, 1.0]), roll)
+    )
+
+
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about a unit axis, radians, right-handed (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+
+
+def _farthest(is_clear: Callable[[float], bool], most: float, steps: int) -> float:
+    """How far one can go, up to ``most``, by so many bisections."""
+    low, high = 0.0, most
+    for _ in range(steps):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_clear(middle) else (low, middle)
+    return low
+
+
+def looking(
+    centers: Float[np.ndarray, "T 3"], targets: Float[np.ndarray, "T 3"], frames: Float[np.ndarray, "T 3 3"]
+) -> Float[np.ndarray, "T 4 4"]:
+    """Poses that look at targets, x along the centre line's first across direction."""
+    forward = targets - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = frames[:, :, 0] - (frames[:, :, 0] * forward).sum(axis=1, keepdims=True) * forward
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
+    poses[:, :3, 3] = centers
+    return poses
+
+
+def draw_sway(generator: np.random.Generator, cycles: Float[np.ndarray, "3"] = _CYCLES) -> Curve:
+    """A smooth random curve with amplitude 1 over times from 0 to 1, independent of its sampling."""
+    phase = generator.uniform(0.0, 2.0 * np.pi, 3)
+    weight = np.array([1.0, 0.7, 0.35]) * generator.uniform(0.7, 1.3, 3)
+
+    def curve(at: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+        return np.asarray((weight * np.sin(2.0 * np.pi * cycles * at[:, None] + phase)).sum(axis=1))
+
+    largest = np.abs(curve(np.linspace(0.0, 1.0, 512))).max()
+    return lambda at: np.asarray(curve(at) / largest)
+
+
+#: Near stops of a sequence.
+APPROACHES = 3
+#: Distance to the wall at the closest point of an approach, mm. The margin is for frames between those tested.
+_CLOSEST = NEAREST + 0.4
+#: How much farther than that the wall may be at the near stop itself, where a fold is passed closer by, mm.
+_CLOSER_BEFORE = 0.3
+#: Distance from the camera to the spot that it inspects, at most, mm. At 6.4 mm from the wall, this is an angle of
+#: incidence of up to 48 degrees.
+_SPOT_WITHIN = 9.5
+#: Angle between the centre line and the direction to a spot, degrees. Smaller ones meet the wall too obliquely.
+_SPOT_ANGLE = (45.0, 75.0)
+#: Spots tried per approach. The worst of 120 seeds in both presets needs 51.
+_DRAWS = 256
+#: Points per approach at which the distance to the wall is tested. Odd: the near stop is one of them.
+_TESTED = 41
+#: Distance of the wall in the middle of the image at a far stop, and how far its quartiles may deviate, mm.
+_FAR, _FAR_MARGIN = 60.0, 8.0
+#: The middle of the image: angles of the rings of rays around its centre, degrees.
+_MIDDLE = (2.0, 4.0)
+#: Angles between the centre line and the views tried for a far stop, degrees.
+_FAR_ANGLES = np.arange(0.0, 36.0, 2.0)
+
+
+@dataclass(frozen=True)
+class _Withdrawal:
+    """The motion without its approaches: along the centre line, drifting sideways between them."""
+
+    centre_line: CentreLine
+    length: float  # mm of arc
+    most: float  # largest offset along each of the two across directions, mm
+    drift: tuple[Curve, Curve]  # curve of each offset, of amplitude 1
+
+    def at(self, time: Float[np.ndarray, "T"]) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]:
+        """Positions, world, mm, and frames of the centre line there."""
+        arc = resting(SHALLOW_END + self.length * np.linspace(1.0, 0.0, 2 * APPROACHES + 1)[:, None], time)[:, 0]
+        points, frames = self.centre_line.at(arc)
+        sideways = self.most * np.stack([curve(time) for curve in self.drift], axis=1)
+        sideways *= (1.0 - nearness(time))[:, None]
+        return points + np.einsum("tck,tk->tc", frames[:, :, :2], sideways), frames
+
+
+#: A near stop in the centre line's frame: the camera's offset from the withdrawal, mm, and the rotation vector from the
+#: centre line's direction to the spot's, radians.
+_Spot = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+
+
+def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
+    """Camera-to-world pose of every frame, OpenCV axes, mm."""
+    generator = stream(settings.seed, Purpose.TRAJECTORY)
+    drift = draw_sway(generator), draw_sway(generator)
+    roll = draw_sway(generator)
+    withdrawal = _Withdrawal(centre_line, settings.path_length, settings.light_preset.wobble[1], drift)
+    spots = _choose_spots(withdrawal, tracer, settings.seed, generator)
+
+    shifts, turns = np.zeros((2, 2 * APPROACHES + 1, 3))
+    shifts[1::2], turns[1::2] = zip(*spots, strict=True)
+    turns[::2] = [
+        _far_turn(withdrawal, number / APPROACHES, turns[1::2][max(number - 1, 0) : number + 1], tracer)
+        for number in range(APPROACHES + 1)
+    ]
+
+    time = times(settings)
+    points, frames = withdrawal.at(time)
+    rolls = np.radians(settings.light_preset.turn[2]) * roll(time)
+    poses = np.tile(np.eye(4), (settings.frames, 1, 1))
+    poses[:, :3, :3] = frames @ _matrices(resting(turns, time)) @ _matrices(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
+    poses[:, :3, 3] = points + np.einsum("tck,tk->tc", frames, resting(shifts, time))
+    return poses
+
+
+def resting(values: Float[np.ndarray, "S K"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T K"]:
+    """A twice continuously differentiable curve through values at even times from 0 to 1, which rests at each.
+
+    Between two of them it follows Perlin's quintic, whose first and second derivatives are 0 at its ends.
+    """
+    position = time * (len(values) - 1)
+    low = np.minimum(position.astype(int), len(values) - 2)
+    x = (position - low)[:, None]
+    share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    return np.asarray(values[low] * (1.0 - share) + values[low + 1] * share)
+
+
+def nearness(time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+    """0 at far stops, 1 at near stops."""
+    return resting((np.arange(2 * APPROACHES + 1) % 2.0)[:, None], time)[:, 0]
+
+
+def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator: np.random.Generator) -> list[_Spot]:
+    """The spots to inspect: by turns around the lumen, and otherwise random."""
+    spots = []
+    clock = generator.uniform(0.0, 2.0 * np.pi)
+    for number in range(APPROACHES):
+        for draw in range(_DRAWS):
+            # More and more of the circumference is tried.
+            tried = clock + generator.uniform(-1.0, 1.0) * min(0.3 + 0.1 * draw, np.pi)
+            turn = _turn(np.radians(generator.uniform(*_SPOT_ANGLE)), tried)
+            spot = _approach(withdrawal, number, turn, tracer)
+            if spot is not None:
+                break
+        else:
+            raise InputError(
+                f"the colon of seed {seed} leaves no path that approaches {APPROACHES} spots of the wall",
+                f"{_CLOSEST:g} mm from the wall, a spot at most {_SPOT_WITHIN:g} mm away",
+                "Choose another seed",
+            )
+        spots.append(spot)
+        # The golden angle distributes any number of directions evenly.
+        clock = tried + np.pi * (3.0 - np.sqrt(5.0))
+    return spots
+
+
+def _approach(withdrawal: _Withdrawal, number: int, turn: Float[np.ndarray, "3"], tracer: Tracer) -> _Spot | None:
+    """The near stop on the way to the spot that lies in a direction; None where something else is in the way."""
+    away = _matrices(turn) @ np.array([0.0, 0.0, 1.0])
+    time = (number + np.linspace(0.0, 1.0, _TESTED)) / APPROACHES
+    points, frames = withdrawal.at(time)
+    middle = _TESTED // 2
+    to_spot = float(_distances(points[middle], frames[middle], away[None], tracer)[0])
+    if not np.isfinite(to_spot):
+        return None
+    course = nearness(time)[:, None] * (frames @ away)
+
+    amount = _farthest(lambda amount: tracer.clearance(points + amount * course).min() > _CLOSEST, to_spot, 16)
+    reached = float(tracer.clearance(points[middle : middle + 1] + amount * course[middle])[0])
+    if reached > _CLOSEST + _CLOSER_BEFORE or to_spot - amount > _SPOT_WITHIN:
+        return None
+    return amount * away, turn
+
+
+def _far_turn(
+    withdrawal: _Withdrawal, time: float, neighbours: Float[np.ndarray, "N 3"], tracer: Tracer
+) -> Float[np.ndarray, "3"]:
+    """Rotation vector of a far stop: the one nearest to its neighbours' of those whose wall is about 60 mm away."""
+    (point,), (frame,) = withdrawal.at(np.array([time]))
+    clocks = np.arange(24) * (np.pi / 12.0)
+    turns = np.array([_turn(angle, clock) for angle in np.radians(_FAR_ANGLES) for clock in clocks])
+    around = [_turn(angle, clock) for angle in np.radians(_MIDDLE) for clock in clocks[::3]]
+    rays = _matrices(np.array([np.zeros(3), *around]))[:, :, 2]
+    directions = np.einsum("tij,rj->tri", _matrices(turns), rays)
+    distances = _distances(point, frame, directions.reshape(-1, 3), tracer).reshape(len(turns), -1)
+    # Quartiles, as the median of a view onto the edge of a fold changes with every step.
+    quartiles = np.quantile(distances, [0.25, 0.75], axis=1)
+    error = np.maximum(np.abs(quartiles - _FAR).max(axis=0), _FAR_MARGIN)
+    apart = ((turns[:, None] - neighbours[None]) ** 2).sum(axis=(1, 2))
+    return np.asarray(turns[np.lexsort((apart, error))[0]])
+
+
+def _distances(
+    point: Float[np.ndarray, "3"], frame: Float[np.ndarray, "3 3"], directions: Float[np.ndarray, "N 3"], tracer: Tracer
+) -> Float[np.ndarray, "N"]:
+    """Distances, mm, of the wall from a point, infinite where there is none; directions are in axes ``frame``."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = frame, point
+    directions = directions / directions[:, 2:]
+    depth = tracer.cast(pose, directions.astype(np.float32)).z_depth
+    return np.asarray(depth * np.linalg.norm(directions, axis=1))
+
+
+def _turn(angle: float, clock: float) -> Float[np.ndarray, "3"]:
+    """Rotation vector that turns the third axis by an angle towards a clock angle around it, radians."""
+    return angle * np.array([-np.sin(clock), np.cos(clock), 0.0])
+
+
+def _matrices(turns: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
+    """Rotations of rotation vectors."""
+    return np.asarray(Rotation.from_rotvec(turns).as_matrix())
+
+
+#: Frequencies of the path's sway and of the camera's turning, Hz.
+_SLOW, _QUICK = np.array([0.08, 0.2, 0.4]), np.array([0.15, 0.4, 0.9])
+#: How far the camera goes back and forth along the colon, beside its withdrawal, mm, and from the centre line, mm.
+_BACK, _SIDEWAYS = 7.0, 8.0
+#: Largest yaw, pitch and roll between fast turns, degrees.
+_TURN = (30.0, 25.0, 35.0)
+#: Angle of fast turns, degrees, and the times in which they turn, stay and turn back, s.
+_FAST_TURN, _FAST_TIMES = (30.0, 50.0), (0.35, 0.4, 0.45)
+#: Times in which a contact is approached, lasts and is left, s, and its view's angle to the centre line, degrees.
+_CONTACT_TIMES, _CONTACT_TURN = (0.6, 0.35, 0.6), 65.0
+#: Distance of the lens from the wall, mm: in a contact, and the smallest otherwise, of a wall at rest.
+_TOUCH, _CLEAR_OF_WALL = 1.2, 2.5
+
+Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
+
+
+def examining_path(
+    centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance, touch: Callable[[int], Clearance]
+) -> Float[np.ndarray, "T 4 4"]:
+    """Camera-to-world pose of every frame, OpenCV axes, mm; ``touch`` measures clearance in the wall of a frame."""
+    generator = stream(settings.seed, Purpose.TRAJECTORY)
+    seconds = settings.frames / settings.frame_rate
+    share = np.linspace(0.0, 1.0, settings.frames)
+    slow = np.stack([draw_sway(generator, _SLOW * seconds)(share) for _ in range(3)], axis=1)
+    quick = np.stack([draw_sway(generator, _QUICK * seconds)(share) for _ in range(3)], axis=1)
+    arc = SHALLOW_END + _BACK + settings.path_length * (1.0 - share) + _BACK * slow[:, 0]
+    points, frames = centre_line.at(arc)
+    sideways = np.einsum("tck,tk->tc", frames[:, :, :2], _SIDEWAYS / np.sqrt(2.0) * slow[:, 1:])
+    sideways *= _permitted(points, sideways, clearance, settings)[:, None]
+    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
+    poses = looking(points + sideways, ahead, frames)
+    turns = np.radians(_TURN) * quick
+    for pose, (yaw, pitch, roll) in zip(poses, turns, strict=True):
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([0.0, 0.0, 1.0]), roll)
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([0.0, 1.0, 0.0]), yaw)
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([1.0, 0.0, 0.0]), pitch)
+    events = np.array(["turn"] * settings.turns + ["contact"] * settings.contacts)
+    generator.shuffle(events)
+    for number, event in enumerate(events):
+        middle = (number + generator.uniform(0.35, 0.65)) / len(events) * seconds
+        clock = generator.uniform(0.0, 2.0 * np.pi)
+        across = np.array([-np.sin(clock), np.cos(clock), 0.0])
+        stages = _FAST_TIMES if event == "turn" else _CONTACT_TIMES
+        swing = _swing(np.arange(settings.frames) / settings.frame_rate - middle, stages)
+        angle = generator.uniform(*_FAST_TURN) if event == "turn" else _CONTACT_TURN
+        frame = min(round(middle * settings.frame_rate), settings.frames - 1)
+        aside = poses[frame, :3, :3] @ np.array([np.cos(clock), np.sin(clock), 0.0])
+        for pose, amount in zip(poses, swing, strict=True):
+            pose[:3, :3] = pose[:3, :3] @ rotation_about(across, amount * np.radians(angle))
+        if event == "contact":
+            poses[:, :3, 3] += _reach(poses, swing, aside, frame, touch)[:, None] * aside
+    return poses
+
+
+def _permitted(
+    points: Float[np.ndarray, "T 3"],
+    sideways: Float[np.ndarray, "T 3"],
+    clearance: Clearance,
+    settings: PhantomSettings,
+) -> Float[np.ndarray, "T"]:
+    """Share of the sideways motion that keeps the camera off the wall, smooth in time."""
+    nearest = _CLEAR_OF_WALL + settings.wave + settings.breathing
+    low, high = np.zeros(len(points)), np.ones(len(points))
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        clear = clearance(points + middle[:, None] * sideways) > nearest
+        low, high = np.where(clear, middle, low), np.where(clear, high, middle)
+    width = max(round(0.4 * settings.frame_rate), 1)
+    return np.asarray(scipy.ndimage.gaussian_filter1d(scipy.ndimage.minimum_filter1d(low, 2 * width + 1), 0.5 * width))
+
+
+def _swing(time: Float[np.ndarray, "T"], stages: tuple[float, float, float]) -> Float[np.ndarray, "T"]:
+    """0, then 1 during the second stage, whose middle is time 0, then 0; Perlin's quintic between."""
+    there, stay, back = stages
+    x = np.clip(np.minimum((time + 0.5 * stay + there) / there, (0.5 * stay + back - time) / back), 0.0, 1.0)
+    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+
+
+def _reach(
+    poses: Float[np.ndarray, "T 4 4"],
+    swing: Float[np.ndarray, "T"],
+    aside: Float[np.ndarray, "3"],
+    frame: int,
+    touch: Callable[[int], Clearance],
+) -> Float[np.ndarray, "T"]:
+    """Motion towards the wall, mm, that ends where the lens nearly touches it."""
+    near = np.flatnonzero(swing > 0.0)
+    clearance = touch(frame)
+
+    def is_clear(amount: float) -> bool:
+        # Along the whole way, as the distance alone would be large again beyond the wall.
+        way = poses[frame, :3, 3] + np.linspace(0.0, amount, 60)[:, None] * aside
+        moved = poses[near, :3, 3] + (amount * swing[near])[:, None] * aside
+        return bool(min(clearance(way).min(), clearance(moved).min()) > _TOUCH)
+
+    return _farthest(is_clear, 30.0, 16) * swing
+
 
 #: Interval of held-out test frames.
 TEST_EVERY = 8
@@ -163,11 +528,4 @@ def _with_approach(
         # The wobble is faded out during the approach.
         return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * direction)
 
-    low, high = 0.0, 14.0
-    for _ in range(18):
-        amount = 0.5 * (low + high)
-        if float(distances(swung(amount))[near].min()) > closest:
-            low = amount
-        else:
-            high = amount
-    return swung(low)
+    return swung(_farthest(lambda amount: float(distances(swung(amount))[near].min()) > closest, 14.0, 18))

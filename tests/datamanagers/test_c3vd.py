@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
 from coliags_plugin.datamanagers.c3vd_v2.reader import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.phantom.layouts.c3vd import depth_steps
+from coliags_plugin.phantom.layouts.built_in import depth_steps
 from tests.datamanagers.kinds import write
 from tests.datamanagers.wall_scenes import (
     colors,

@@ -14,7 +14,7 @@ from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, part_folder
-from coliags_plugin.phantom.layouts.c3vd import write_poses
+from coliags_plugin.phantom.layouts.built_in import write_poses
 from coliags_plugin.phantom.trajectory import TEST_EVERY
 
 #: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.

@@ -12,7 +12,7 @@ from coliags_plugin.geometry.lenses.vicalib import TYPE
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout
-from coliags_plugin.phantom.layouts.rgbd import DEPTH_SCALE, depth_steps
+from coliags_plugin.phantom.layouts.built_in import DEPTH_SCALE, depth_steps
 
 CALIBRATION = "calibration.xml"
 #: Like a colonoscope's: 150 degrees of view across the frame.
@@ -39,7 +39,7 @@ class EndoMapperLayout(Layout):
         _, lit = self.lens(width, height)
         name = f"{frame.index:04d}.png"
         write_image(folder / "rgb" / name, frame.color)
-        write_image(folder / "depth" / name, depth_steps(frame.z_depth))
+        write_image(folder / "depth" / name, depth_steps(frame.z_depth, DEPTH_SCALE, 0))
         write_mask(folder / "mask" / name, lit)
 
     def write_sequence(self, folder, part, poses, lens):

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom import inspection
+from coliags_plugin.phantom import trajectory
 from coliags_plugin.phantom.colon import CentreLine, build_surface, grow_anatomy
 from coliags_plugin.phantom.generate import generate
-from coliags_plugin.phantom.inspection import APPROACHES, nearness, resting
-from coliags_plugin.phantom.motion import NEAREST
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.phantom.tracing import Tracer
-from coliags_plugin.phantom.trajectory import camera_path
+from coliags_plugin.phantom.trajectory import APPROACHES, NEAREST, camera_path, nearness, resting
 
 #: The far stops fall on frames 0, 40, 80, 120, and the near ones on 20, 60, 100.
 FRAMES = 121
@@ -116,8 +114,8 @@ def test_a_curve_that_rests_goes_through_its_values_and_stands_still_there():
 
 
 def test_a_colon_without_such_a_path_is_an_error(colon, monkeypatch):
-    monkeypatch.setattr(inspection, "_SPOT_WITHIN", 1.0)
-    monkeypatch.setattr(inspection, "_DRAWS", 3)
+    monkeypatch.setattr(trajectory, "_SPOT_WITHIN", 1.0)
+    monkeypatch.setattr(trajectory, "_DRAWS", 3)
     with pytest.raises(InputError, match=f"seed {colon.settings.seed} .*no path") as refused:
         path_of(colon)
     assert "another seed" in str(refused.value)

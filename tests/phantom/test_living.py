@@ -13,12 +13,12 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.phantom.colon import WAVE_LENGTH, WAVE_SPEED, breathing, peristalsis, wall_motion
 from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
 from coliags_plugin.phantom.imaging import Sensor
-from coliags_plugin.phantom.living import WAVE_LENGTH, WAVE_SPEED, breathing, peristalsis, wall_motion
-from coliags_plugin.phantom.motion import poses_between, poses_during, rotation
 from coliags_plugin.phantom.props import Cover
 from coliags_plugin.phantom.settings import IN_VIVO, PhantomSettings, phantom_settings
+from coliags_plugin.phantom.trajectory import poses_between, poses_during, rotation
 from tests.phantom.phantom_layouts import TINY
 
 SMALL = TINY | {"width": 48, "height": 38, "mesh_spacing": 2.5, "texture_spacing": 0.8, "rotation_views": 0}

@@ -16,7 +16,7 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom import interreflection
+from coliags_plugin.phantom import light as lighting
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from tests.phantom import phantom_layouts
@@ -145,7 +145,7 @@ def test_gain_and_light_are_told(phantom):
 
 
 def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypatch):
-    monkeypatch.setattr(interreflection, "_PATCH", 15.0)  # mm: few pairs of patches, whose light takes most of the time
+    monkeypatch.setattr(lighting, "_PATCH", 15.0)  # mm: few pairs of patches, whose light takes most of the time
     small = {**TINY, "frames": 9, "rotation_views": 1, "interreflection": 1.0, "mesh_spacing": 2.5}
     for name, seed in (("one", 7), ("two", 7), ("other", 8)):
         generate(PhantomSettings(**small, seed=seed), tmp_path / name)

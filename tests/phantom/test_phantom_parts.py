@@ -13,15 +13,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose
-from coliags_plugin.phantom.interreflection import form_factors, make_patches, solve
-from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight
-from coliags_plugin.phantom.motion import NEAREST, rotation, rotation_about
+from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight, form_factors, make_patches, solve
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import develop, encode, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings, phantom_settings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
-from coliags_plugin.phantom.trajectory import camera_path, turn_away
+from coliags_plugin.phantom.trajectory import NEAREST, camera_path, rotation, rotation_about, turn_away
 
 ALBEDO = (0.7, 0.3, 0.2)
 COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}

@@ -15,11 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.comparison.named_files import load_benchmark
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.phantom.generate import generate, prepare
+from coliags_plugin.phantom.generate import displaced, estimated_depth, generate, pose_errors, prepare
 from coliags_plugin.phantom.imaging import Sensor, World, expose
-from coliags_plugin.phantom.interreflection import indirect_lights
-from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight
-from coliags_plugin.phantom.measured import displaced, estimated_depth, pose_errors
+from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight, indirect_lights
 from coliags_plugin.phantom.response import develop, encoded, exposure_for, exposures, meter_weights
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream

@@ -1,0 +1,154 @@
+"""The layouts that phantoms are written in: C3VD's, COLMAP's, nerfstudio's and TUM's (docs/layouts)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
+
+from coliags_plugin.core.files import atomic_write, write_json
+from coliags_plugin.core.images import write_image
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
+from coliags_plugin.datamanagers.reading.files import write_camera_json
+from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.c3vd import matrix_lines
+from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
+from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
+
+#: The largest number of 16 bits.
+_LAST = 65_535
+#: TUM's depth steps per mm: 0.002 mm each, up to 131 mm; farther is unknown, as for its sensor.
+DEPTH_SCALE = 500.0
+#: Seconds: TUM's clock and frame rate.
+_START, _RATE = 1_305_031_102.0, 30.0
+#: nerfstudio's millimetres per depth step: up to 655 mm.
+_DEPTH_UNIT = 0.01
+#: A mild barrel distortion, so that missing undistortion is noticed.
+_DISTORTION: dict[str, Any] = {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002}
+#: COLMAP's points are observed in one of this many images that show them, like detected features.
+_SEEN_IN_ONE_OF = 3
+
+
+class C3VDLayout(Layout):
+    """Undistorted frames in ColIAGS's layout: images/, depths/, camera_pose.txt, camera.json."""
+
+    has_rotation = True
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`."""
+        folder = part_folder(folder, frame.part)
+        write_image(folder / "images" / f"{frame.index:04d}_color.png", frame.color)
+        write_image(folder / "depths" / f"{frame.index:04d}_depth.png", depth_steps(frame.z_depth))
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`."""
+        folder = part_folder(folder, part)
+        write_poses(folder / "camera_pose.txt", poses)
+        write_camera_json(folder / "camera.json", lens.pinhole, h=lens.height, w=lens.width)
+
+
+def write_poses(path: Path, camera_to_world: Float[np.ndarray, "N 4 4"]) -> None:
+    """Write C3VD's pose file with the release's nine digits; OpenCV axes, mm."""
+    atomic_write(path, matrix_lines(camera_to_world, digits=9))
+
+
+def depth_steps(
+    z_depth: Float[np.ndarray, "H W"], per_mm: float = _LAST / 100.0, beyond: int = _LAST
+) -> UInt16[np.ndarray, "H W"]:
+    """z-depth, mm, in 16-bit steps, by default C3VD's: 0 where unknown, ``beyond`` where it is out of their range."""
+    known = np.isfinite(z_depth) & (z_depth > 0.0)
+    steps = np.maximum(np.rint(np.where(known, z_depth, 0.0) * per_mm), 1)
+    return np.where(known, np.where(steps > _LAST, beyond, steps), 0).astype(np.uint16)
+
+
+class ColmapLayout(Layout):
+    """images/, unit.txt and a binary model of one PINHOLE camera in sparse/0, its points with their images."""
+
+    has_points = True
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`; depth is not part of this layout."""
+        write_image(folder / "images" / f"{frame.index:04d}.png", frame.color)
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`; poses are part of the model."""
+
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`. Points seen in fewer than two images are left out, as COLMAP leaves them out."""
+        names = [f"{index:04d}.png" for index in range(len(poses))]
+        model = posed_model(colmap_poses(poses), names, [lens.pinhole], [0] * len(poses))
+        numbers = np.arange(len(points.positions))
+        seen = [points.seen_in(index) & ((numbers + index) % _SEEN_IN_ONE_OF == 0) for index in range(len(poses))]
+        kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)
+        observations = []
+        for index, matrix in enumerate(inverse(poses)):
+            indices = np.flatnonzero(seen[index][kept])
+            local = points.positions[kept[indices]] @ matrix[:3, :3].T + matrix[:3, 3]
+            observations.append(SeenPoints(lens.project(local), indices))
+        add_points(model, observations, points.positions[kept], points.colors[kept])
+        write_reconstruction(folder / "sparse/0", model)
+        write_unit(folder, "mm")
+
+
+class NerfstudioLayout(Layout):
+    """images/, depth/, unit.txt and a transforms.json with an OPENCV camera that distorts."""
+
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
+        """The default camera with OpenCV's lens distortion."""
+        plain, lit = super().lens(width, height)
+        return OpenCVLens(**vars(plain.pinhole), **_DISTORTION), lit
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`."""
+        name = f"frame_{frame.index + 1:05d}.png"
+        write_image(folder / "images" / name, frame.color)
+        steps = np.rint(frame.z_depth / _DEPTH_UNIT).clip(0, _LAST)
+        write_image(folder / "depth" / name, steps.astype(np.uint16))
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`."""
+        names = [f"frame_{index + 1:05d}.png" for index in range(len(poses))]
+        frames = [
+            {
+                "file_path": f"images/{name}",
+                "depth_file_path": f"depth/{name}",
+                "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist(),
+            }
+            for name, pose in zip(names, poses, strict=True)
+        ]
+        k = lens.pinhole
+        camera = {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": lens.width, "h": lens.height, **_DISTORTION}
+        content = {"camera_model": "OPENCV", **camera, "depth_unit_scale_factor": _DEPTH_UNIT, "frames": frames}
+        write_json(folder / "transforms.json", content)
+        write_unit(folder, "mm")
+
+
+class RGBDLayout(Layout):
+    """Images and depth named by timestamps, groundtruth.txt, camera.json, and TUM's file lists."""
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`."""
+        name = f"{_time(frame.index)}.png"
+        write_image(folder / "rgb" / name, frame.color)
+        write_image(folder / "depth" / name, depth_steps(frame.z_depth, DEPTH_SCALE, 0))
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`."""
+        times = [_time(index) for index in range(len(poses))]
+        tum.write(folder / "groundtruth.txt", Trajectory(poses, timestamps=np.array(times, np.float64)))
+        write_camera_json(folder / "camera.json", lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
+        write_unit(folder, "mm")
+        for kind in ("rgb", "depth"):
+            lines = ["# timestamp filename", *(f"{time} {kind}/{time}.png" for time in times)]
+            atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
+
+
+def _time(index: int) -> str:
+    return f"{_START + index / _RATE:.6f}"
