@@ -26,7 +26,7 @@ from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.surface.meshing.fusion import fuse_run
-from coliags_plugin.surface.meshing.settings import MeshSettings
+from coliags_plugin.surface.meshing.views import MeshSettings
 
 
 class DepthModel:

@@ -48,8 +48,7 @@ from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
 from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
-from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import Level
+from coliags_plugin.surface.coverage.visibility import CoverageView, Level
 
 #: Of each phantom: seeds count from here; lengths of the withdrawals, mm; frames, and frames between two phantoms.
 SEED, LENGTHS, FRAMES, BETWEEN = 4100, (60, 45, 55, 35, 60, 50, 40, 60), 700, 50

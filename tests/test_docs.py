@@ -33,7 +33,7 @@ from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.results.reading import find_results
-from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.visibility import CoverageSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]

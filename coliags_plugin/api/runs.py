@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from coliags_plugin.export.viewer.saving import ScenePage
     from coliags_plugin.results.record import Result
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
-    from coliags_plugin.surface.meshing.writing import MeshedRun
+    from coliags_plugin.surface.meshing.fusion import MeshedRun
 
 
 class Run:
@@ -185,8 +185,8 @@ class Run:
                 surface, the truth is of another world or unit, or the folder exists or cannot be written.
         """
         from coliags_plugin.core.settings import validated
-        from coliags_plugin.surface.meshing.settings import MeshSettings
-        from coliags_plugin.surface.meshing.writing import mesh_run
+        from coliags_plugin.surface.meshing.fusion import mesh_run
+        from coliags_plugin.surface.meshing.views import MeshSettings
 
         given: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
         given |= parse_assignments(options.settings, "--set", "KEY=VALUE, for instance depth=median")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.pipeline.procedure.run import FinishedProcedure
     from coliags_plugin.pipeline.stages import Record
-    from coliags_plugin.surface.coverage.settings import CoverageSettings
+    from coliags_plugin.surface.coverage.visibility import CoverageSettings
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
 
 
@@ -84,7 +84,7 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
 def coverage_settings(options: CoverageOptions) -> CoverageSettings:
     """What counts as seen."""
     from coliags_plugin.core.settings import validated
-    from coliags_plugin.surface.coverage.settings import CoverageSettings
+    from coliags_plugin.surface.coverage.visibility import CoverageSettings
 
     given = parse_assignments(options.settings, "--set", "KEY=VALUE, for instance region_diameter=10")
     return validated(CoverageSettings, given, "coverage option")

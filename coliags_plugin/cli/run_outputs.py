@@ -112,7 +112,7 @@ class MeshCommand(RunCommand, options.MeshOptions):
     def run(self) -> None:
         """Make the mesh, and print the comparison."""
         from coliags_plugin.reporting.text_formats import terminal_text
-        from coliags_plugin.surface.meshing.writing import comparison_blocks
+        from coliags_plugin.surface.meshing.fusion import comparison_blocks
 
         meshed = self.opened().mesh(self)
         compared = meshed.comparison

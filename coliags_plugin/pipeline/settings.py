@@ -9,8 +9,8 @@ from pydantic import Field
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.depth.views import DepthEstimationSettings
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.meshing.settings import MeshSettings
+from coliags_plugin.surface.coverage.visibility import CoverageSettings
+from coliags_plugin.surface.meshing.views import MeshSettings
 
 #: Fewest frames that can give depth (docs/depth.md 6).
 FEWEST = 4

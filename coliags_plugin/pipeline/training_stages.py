@@ -107,7 +107,7 @@ def _training_psnr(trained: TrainedRun) -> dict[str, float]:
 def mesh(context: StageContext) -> StageOutcome:
     """Fuse the rendered depth into a mesh."""
     from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.surface.meshing.writing import mesh_run
+    from coliags_plugin.surface.meshing.fusion import mesh_run
 
     trained = load_trained(context.run, context.device, context.scene)
     made = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)

@@ -8,7 +8,7 @@ import pytest
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.surface.meshing.writing import mesh_run
+from coliags_plugin.surface.meshing.fusion import mesh_run
 from tests.commands import refused, run
 from tests.surface.meshing.exact import exact_run
 
@@ -47,7 +47,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     def full(path: Path, mesh, texture) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("coliags_plugin.surface.meshing.writing.write_mesh", full)
+    monkeypatch.setattr("coliags_plugin.surface.meshing.fusion.write_mesh", full)
     with pytest.raises(InputError, match="No space"):
         mesh_run(exact_run(frames=9), tmp_path / "mesh")
     assert not any(tmp_path.iterdir())

@@ -25,7 +25,7 @@ from coliags_plugin.export.splats.files import read_splats
 from coliags_plugin.outputs.image_files import read_depth_tiff
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
-from coliags_plugin.surface.meshing.settings import MeshSettings
+from coliags_plugin.surface.meshing.views import MeshSettings
 from tests.comparison.small import TINY
 from tests.scenes import wall_scene
 

@@ -24,9 +24,15 @@ from coliags_plugin.surface.coverage.centreline import (
     guessed_wall,
     wall_around,
 )
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import FaceViews, Level, classify, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import (
+    CoverageSettings,
+    CoverageView,
+    FaceViews,
+    Level,
+    classify,
+    facing_cameras,
+    see_faces,
+)
 
 #: Guessed wall continues a region of reconstructed wall whose centroids are as near as this, mm.
 _TOUCHING = 2.0

@@ -20,12 +20,16 @@ from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
-from coliags_plugin.surface.coverage.map import draw_map, draw_partial, face_colors
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
-from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page, summary
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.views import recorded_views
-from coliags_plugin.surface.coverage.visibility import Level
+from coliags_plugin.surface.coverage.page import (
+    RESEARCH_USE,
+    coverage_page,
+    draw_map,
+    draw_partial,
+    face_colors,
+    summary,
+)
+from coliags_plugin.surface.coverage.visibility import CoverageSettings, Level, recorded_views
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,40 @@
-"""Fusion of the rendered depth of a run into a triangle mesh."""
+"""Fusion of the rendered depth of a run into a mesh, and its files, compared with the true surface if there is one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.truth import match_truth
+from coliags_plugin.geometry.meshes.files import MESH_FORMATS, write_mesh
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
-from coliags_plugin.outputs.image_files import eight_bit
+from coliags_plugin.geometry.meshes.truth import (
+    SurfaceComparison,
+    TrueSurface,
+    compare_meshes,
+    find_true_surface,
+    read_true_surface,
+)
+from coliags_plugin.outputs.image_files import eight_bit, write_png
+from coliags_plugin.reporting.model import Block, Paragraph, simple_table
 from coliags_plugin.surface.meshing.colors import best_colors, best_texture
 from coliags_plugin.surface.meshing.mending import close_holes, smoothed
-from coliags_plugin.surface.meshing.settings import MeshSettings, voxel_size_of
-from coliags_plugin.surface.meshing.views import DepthView, rendered_depth
+from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
+from coliags_plugin.surface.meshing.views import DepthView, MeshSettings, max_depth_of, rendered_depth, voxel_size_of
 from coliags_plugin.surface.meshing.volume import Volume
 
 
@@ -74,3 +90,159 @@ def images_of(trained: TrainedRun, settings: MeshSettings) -> Callable[[DepthVie
         return eight_bit(render_held(trained.model, camera, light, ("rgb",)).rgb).cpu()
 
     return flattened
+
+
+#: Version of mesh.json.
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class MeshedRun:
+    """The mesh of a run and the folder it was written to."""
+
+    folder: Path  # with ``mesh.ply`` and so on, the texture where there is one, and ``mesh.json``
+    mesh: TriangleMesh  # world of the poses, scene units
+    comparison: SurfaceComparison | None  # with the true surface, where there is one
+
+
+def mesh_run(
+    trained: TrainedRun,
+    output: Path,
+    settings: MeshSettings | None = None,
+    formats: Sequence[str] = MESH_FORMATS,
+    truth: Path | None = None,
+    overwrite: bool = False,
+) -> MeshedRun:
+    """Fuse a run into a mesh and write it, with a comparison where there is a true surface.
+
+    The folder gets the mesh in each format; ``mesh.json`` with settings, counts and figures; and, with a true surface,
+    ``comparison.png``, ``mesh_error.ply`` and ``truth_error.ply``, coloured by distance. ``truth`` is that surface, in
+    the world of the scene and mm, or the folder of a scene with one; None: that of the run's scene, where there is one.
+    """
+    scene = trained.scene
+    settings = settings or MeshSettings()
+    with atomic_folder(output, overwrite) as folder:
+        surface = _true_surface(scene, truth)
+        fused = fuse_run(trained, settings)
+        mesh = fused.mesh
+        compared = None if surface is None else compare_meshes(mesh, surface)
+        for name in formats:
+            write_mesh(folder / f"mesh.{name}", mesh, fused.texture)
+        if surface is not None:
+            _write_comparison(folder, mesh, surface, scene)
+        write_json(folder / "mesh.json", _summary(trained, fused, settings, surface, compared))
+    return MeshedRun(output, mesh, compared)
+
+
+def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
+    path = given or (None if scene.folder is None else find_true_surface(scene.folder))
+    if path is None or (given is None and not scene.is_metric):
+        return None
+    unit = "mm" if scene.is_metric else _same_world(scene, path).length_unit
+    surface = replace(read_true_surface(path), unit=unit)
+    if surface.seen_by:
+        return surface
+    seen = first_hits(surface.mesh, scene.train)
+    if not seen.any():
+        raise InputError(
+            f"no training view of scene '{scene.name}' sees any of {path}",
+            "the true surface of this scene, in mm and in the world of its poses",
+        )
+    return replace(surface, seen=seen, seen_by="first hit of a pixel of a training frame, cast at the mesh")
+
+
+def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, "F"]:
+    """Triangles that are the first hit of the ray through the centre of an unmasked pixel of any frame. [F]"""
+    seen = np.zeros(len(mesh), bool)
+    for frame in frames:
+        camera = frame.camera.to("cpu", torch.float64)
+        directions = camera.rays()[frame.valid.cpu()]
+        hit, _ = mesh.rays.cast(camera.center.numpy(), directions.numpy())
+        seen[hit[hit >= 0]] = True
+    return seen
+
+
+def _same_world(scene: Scene, truth: Path) -> Scene:
+    """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
+    if not truth.is_dir():
+        raise InputError(
+            f"scene '{scene.name}' is of unknown scale, {truth} in mm",
+            "the folder of a scene with the same poses, and with a true surface",
+            "Pass --truth SCENE, or give the scene its scale first (docs/poses.md)",
+        )
+    return match_truth(scene, open_scene(truth)).scene
+
+
+def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scene: Scene) -> None:
+    frames = scene.train
+    cameras = [frames[index].camera for index in sorted({0, len(frames) // 2, len(frames) - 1})]
+    write_png(folder / "comparison.png", comparison_picture(mesh, truth, cameras))
+    errors = distance_colors(truth.mesh.rays.nearest(mesh.vertices)[0])
+    write_mesh(folder / "mesh_error.ply", replace(mesh, colors=errors))
+    seen = np.zeros(len(truth.mesh.vertices), bool)
+    seen[truth.mesh.triangles[truth.seen]] = True
+    gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], seen)
+    write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
+
+
+def _summary(
+    trained: TrainedRun,
+    fused: FusedRun,
+    settings: MeshSettings,
+    truth: TrueSurface | None,
+    compared: SurfaceComparison | None,
+) -> dict[str, Any]:
+    """Contents of mesh.json."""
+    scene, mesh, reach = trained.scene, fused.mesh, max_depth_of(settings, trained.scene)
+    used = {"voxel_size": voxel_size_of(settings, scene), "max_depth": reach if np.isfinite(reach) else None}
+    return {
+        "format": FORMAT,
+        "method": trained.method,
+        "scene": scene.name,
+        "step": trained.step,
+        "views": len(scene.train),
+        "unit": scene.provenance.get("unit", "mm") if scene.is_metric else "unknown",
+        "settings": settings.model_dump() | used,
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh),
+        "holes_closed": fused.holes,
+        "texture": None if fused.texture is None else fused.texture.image.shape[0],
+        "area": float(mesh.areas.sum()),
+        "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
+        "truth": None if truth is None else _relative_path(truth.path, scene),
+        "comparison": None if compared is None else compared.as_json(),
+    }
+
+
+def _relative_path(path: Path, scene: Scene) -> str:
+    """The path of a file in the scene's folder, or the name of another."""
+    file = path.resolve()
+    if scene.folder is not None and file.is_relative_to(scene.folder):
+        return file.relative_to(scene.folder).as_posix()
+    return file.name
+
+
+def comparison_blocks(compared: SurfaceComparison) -> list[Block]:
+    """The figures of a comparison as two tables and a few sentences."""
+    unit = compared.unit
+    directions = {
+        "accuracy: mesh to true surface": compared.accuracy,
+        "completeness: seen to mesh": compared.completeness,
+    }
+    distances = [[name, f"{d.mean:.3f}", f"{d.median:.3f}", f"{d.percentile_95:.3f}"] for name, d in directions.items()]
+    shares = [
+        [f"{score.threshold:g} {unit}", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
+        for score in compared.scores
+    ]
+    return [
+        simple_table([unit, "mean", "median", "95 %"], distances),
+        simple_table(["within", "precision", "recall", "F"], shares),
+        Paragraph(
+            f"Chamfer distance (mean of both means) {compared.chamfer:.3f} {unit}, "
+            f"HD95 {compared.hausdorff_95:.3f} {unit}, normals {compared.normal_error:.1f} degrees off"
+        ),
+        Paragraph(
+            f"seen: {compared.seen_area:.0f} {unit}^2 ({compared.seen_by}); "
+            f"{compared.beyond_seen:.1%} of the mesh lies beyond it"
+        ),
+    ]

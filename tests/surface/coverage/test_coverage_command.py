@@ -15,9 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.surface.coverage.page import RESEARCH_USE
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.views import recorded_views
-from coliags_plugin.surface.coverage.visibility import Level
+from coliags_plugin.surface.coverage.visibility import CoverageSettings, Level, recorded_views
 from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
 from tests.commands import refused, run
 

@@ -15,10 +15,9 @@ from coliags_plugin.surface.coverage.centreline import (
     guessed_wall,
     wall_around,
 )
-from coliags_plugin.surface.coverage.map import draw_map, draw_partial
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.visibility import Level
+from coliags_plugin.surface.coverage.page import draw_map, draw_partial
+from coliags_plugin.surface.coverage.visibility import CoverageSettings, Level
 from tests.surface.coverage.tubes import grid_mesh, pinhole, plane, tube, view_at
 
 FEW_RAYS = CoverageSettings(rays=20_000)

@@ -10,9 +10,14 @@ from coliags_plugin.core.settings import validated
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.measure import connected, large_regions, near_pairs, neighbours
-from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.views import RayGrid
-from coliags_plugin.surface.coverage.visibility import Level, classify, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import (
+    CoverageSettings,
+    Level,
+    RayGrid,
+    classify,
+    facing_cameras,
+    see_faces,
+)
 from tests.surface.coverage.tubes import joined, pinhole, plane, sphere, tube, view_at
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.views import CoverageView
+from coliags_plugin.surface.coverage.visibility import CoverageView
 
 
 def pinhole(width: int = 64, height: int = 48, focal: float = 40.0) -> PinholeLens:

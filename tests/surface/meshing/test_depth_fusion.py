@@ -16,8 +16,13 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.meshing import fusion
 from coliags_plugin.surface.meshing.colors import best_texture
 from coliags_plugin.surface.meshing.fusion import fuse_run
-from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
-from coliags_plugin.surface.meshing.views import incidence_cosines, rendered_depth
+from coliags_plugin.surface.meshing.views import (
+    MeshSettings,
+    incidence_cosines,
+    max_depth_of,
+    rendered_depth,
+    voxel_size_of,
+)
 from tests.scenes import camera_at, wall_color, wall_scene
 from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run
 

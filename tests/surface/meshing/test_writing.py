@@ -15,8 +15,8 @@ from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.text_formats import terminal_text
-from coliags_plugin.surface.meshing.settings import MeshSettings
-from coliags_plugin.surface.meshing.writing import comparison_blocks, first_hits, mesh_run
+from coliags_plugin.surface.meshing.fusion import comparison_blocks, first_hits, mesh_run
+from coliags_plugin.surface.meshing.views import MeshSettings
 from tests.scenes import wall_scene, write_wall
 from tests.surface.coverage.tubes import plane
 from tests.surface.meshing.exact import exact_run, with_provenance
