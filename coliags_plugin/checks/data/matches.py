@@ -12,7 +12,7 @@ from coliags_plugin.checks.data.reprojection import CHANGES, GIVEN, changed
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
-from coliags_plugin.reconstruction.structure.matching import have_positive_depths, mutual_matches, rays, relative_pose
+from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
 from coliags_plugin.reconstruction.structure.point_tracks import PointTracker
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 
@@ -136,7 +136,7 @@ def epipolar_agreement(matches: Sequence[FrameMatches], change: str = GIVEN) -> 
 def _epipolar_errors(pair: FrameMatches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Distances from the epipolar lines, px; whether points are in front of both cameras; parallax, px. [K] each"""
     camera, there = (changed(frame.camera, CHANGES[change]) for frame in (pair.source, pair.target))
-    rotation, translation = relative_pose((camera, there))
+    rotation, translation = Pose.of(camera).to(Pose.of(there))
     length = float(np.linalg.norm(translation))
     if length == 0.0:
         return None

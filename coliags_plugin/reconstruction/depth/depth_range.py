@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.reconstruction.depth.views import MAX_TURN
 from coliags_plugin.reconstruction.structure.features import (
     Features,
@@ -22,7 +21,7 @@ from coliags_plugin.reconstruction.structure.features import (
     image_and_mask,
     quiet_colmap,
 )
-from coliags_plugin.reconstruction.structure.matching import Pose, epipolar_matches
+from coliags_plugin.reconstruction.structure.matching import Pose, epipolar_matches, rays
 
 log = logging.getLogger(__name__)
 
@@ -105,8 +104,8 @@ def triangulated_depths(first: Features, second: Features, one: Frame, other: Fr
     if not np.linalg.norm(translation) > 0.0 or turn > MAX_TURN:
         return depths
     pairs = epipolar_matches(first, second, cameras, _ERROR, 0.8, 0.7)
-    turned = PinholeLens.of(one.camera.intrinsics).unproject(first.pixels[pairs[:, 0]]) @ rotation.T
-    opposite = PinholeLens.of(other.camera.intrinsics).unproject(second.pixels[pairs[:, 1]])
+    turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T
+    opposite = rays(second.pixels[pairs[:, 1]], other.camera)
     # Depth a of least distance between the lines a * turned + translation and b * opposite.
     aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (opposite, opposite), (turned, opposite)))
     sine = 1.0 - ab**2 / (aa * bb)

@@ -128,6 +128,11 @@ class Pose:
         return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
 
+def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:
+    """Ray directions of pixels in the camera frame, z = 1. [N, 3]"""
+    return PinholeLens.of(camera.intrinsics).unproject(pixels)
+
+
 def _epipolar_candidates(
     first: Features, second: Features, cameras: tuple[Camera, Camera], max_error: float
 ) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
@@ -137,10 +142,7 @@ def _epipolar_candidates(
         return np.empty(0, np.int64), np.empty(0, np.int64)
     x, y, z = translation / np.linalg.norm(translation)
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-    ray_one, ray_other = (
-        PinholeLens.of(camera.intrinsics).unproject(features.pixels)
-        for camera, features in zip(cameras, (first, second), strict=True)
-    )
+    ray_one, ray_other = rays(first.pixels, cameras[0]), rays(second.pixels, cameras[1])
     # Epipolar lines in pixels: coefficients of x and y divided by the focal lengths.
     line_in_other, line_in_one = ray_one @ essential.T, ray_other @ essential
     slope_other = np.linalg.norm(line_in_other[:, :2] / (cameras[1].fx, cameras[1].fy), axis=1)
