@@ -66,7 +66,7 @@ class ResultsExportCommand:
         """Write the table."""
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.results.reading import find_results
-        from coliags_plugin.results.tables import write_csv
+        from coliags_plugin.results.summaries import write_csv
 
         if not self.paths:
             raise InputError("no results to export", "at least one file or folder")

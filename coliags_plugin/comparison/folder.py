@@ -93,26 +93,9 @@ class ComparisonFolder:
     def check_extends(self, request: Request) -> None:
         """Refuse to mix runs of different length or with different changes, and to decide after the first run."""
         before = read_plan(self.path)
-        self._check_decided(request, before)
-        if before is None:
-            return
-        if before.steps != request.steps:
-            earlier = "each method's own steps" if before.steps is None else f"--steps {before.steps}"
-            now = request.steps or "each method's own"
-            raise InputError(f"{self.path} compares runs of {earlier}, not {now}", "the same, or another --output")
-        values = [list(parse_assignments(each).items()) for each in (before.overrides, request.overrides)]
-        if values[0] != values[1]:  # 1e-3 is 0.001
-            earlier, now = (
-                " ".join(f"--set {each}" for each in changes) or "no --set"
-                for changes in (before.overrides, request.overrides)
-            )
-            raise InputError(f"{self.path} compares runs with {earlier}, not {now}", "the same, or another --output")
-
-    def _check_decided(self, request: Request, before: ComparisonPlan | None) -> None:
-        if request.reference is None or (before is None and not (self.path / RESULTS).is_dir()):
-            return
-        decided = None if before is None else before.decided
-        if decided is None or (decided.reference, decided.primary) != (request.reference, tuple(request.primary)):
+        decided, now = None if before is None else before.decided, (request.reference, tuple(request.primary))
+        is_begun = before is not None or (self.path / RESULTS).is_dir()
+        if is_begun and request.reference is not None and now != (decided and (decided.reference, decided.primary)):
             earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
             raise InputError(
                 f"--reference {request.reference} --primary {' '.join(request.primary)}, where {self.path} had decided "
@@ -120,6 +103,17 @@ class ComparisonFolder:
                 "no other decision after the first run",
                 "Leave both out, or choose another --output",
             )
+        if before is None:
+            return
+        plans = (before, request)
+        lengths = [f"--steps {each.steps}" if each.steps else "each method's own steps" for each in plans]
+        changes = [" ".join(f"--set {change}" for change in each.overrides) or "no --set" for each in plans]
+        values = [list(parse_assignments(each.overrides).items()) for each in plans]  # 1e-3 is 0.001
+        for (earlier, later), is_same in ((lengths, before.steps == request.steps), (changes, values[0] == values[1])):
+            if not is_same:
+                raise InputError(
+                    f"{self.path} compares runs with {earlier}, not {later}", "the same, or another --output"
+                )
 
     def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:
         """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
@@ -134,9 +128,9 @@ class ComparisonFolder:
         ]
         if changed:
             log.warning(
-                "%d cells are not those of the former plan, as their method, scene or the code has changed: %s",
+                "%d cells are not those of the former plan, as their method, scene or the code has changed, such as %s",
                 len(changed),
-                ", ".join(cell.title for cell in changed[:3]) + (", ..." if len(changed) > 3 else ""),
+                changed[0].title,
             )
         scenes = dict(before.scenes)
         for cell in cells:

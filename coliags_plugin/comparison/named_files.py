@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -17,7 +16,7 @@ from coliags_plugin.config.method_files import BENCHMARKS, is_path, method_folde
 from coliags_plugin.config.yaml_tree import dump_inline, errors_with_origins, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.phantom.settings import PhantomSettings, phantom_settings
+from coliags_plugin.phantom.settings import PhantomSettings
 
 #: Folder of the shipped ablations, beside the benchmarks.
 ABLATIONS = "ablations"
@@ -46,21 +45,15 @@ def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> t
         raise InputError("\n".join(errors_with_origins(error, tree, noun))) from error
 
 
-def _valid(check: Callable[[Any], object]) -> AfterValidator:
-    """Make a pydantic validator of a function that raises InputError for invalid values; None is valid."""
-
-    def validated(value: Any) -> Any:
-        try:
-            _ = value is None or check(value)
-        except InputError as error:
-            raise ValueError(str(error)) from error
-        return value
-
-    return AfterValidator(validated)
+def _known(name: str) -> str:
+    try:
+        registry.datamanagers.get(name)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+    return name
 
 
-_DataFormat = Annotated[str | None, _valid(registry.datamanagers.get)]
-_Phantom = Annotated[dict[str, Any] | None, _valid(phantom_settings)]
+_DataFormat = Annotated[str, AfterValidator(_known)]
 
 
 class BenchmarkScene(Settings):
@@ -69,25 +62,20 @@ class BenchmarkScene(Settings):
     folder: str | tuple[str, ...] = Field(
         (), description="Folder in that of the benchmark's data, or names of which one is there; default: its name."
     )
-    phantom: _Phantom = Field(None, description="Settings of the phantom to make (docs/phantom.md 6).")
-    format: _DataFormat = Field(None, description="Data manager; default: the benchmark's.")
+    phantom: PhantomSettings | None = Field(None, description="The phantom to make (docs/phantom.md 6).")
+    format: _DataFormat | None = Field(None, description="Data manager; default: the benchmark's.")
     options: dict[str, Any] = Field(default_factory=dict, description="Options of the data manager.")
 
     def folders(self, name: str) -> tuple[str, ...]:
         """Names that the scene's folder may have, the first being the usual one."""
         return ((self.folder,) if isinstance(self.folder, str) else self.folder) or (name,)
 
-    @property
-    def phantom_settings(self) -> PhantomSettings | None:
-        """The phantom's settings; None for a scene of a dataset."""
-        return None if self.phantom is None else phantom_settings(self.phantom)
-
 
 class BenchmarkSettings(Settings):
     """Content of a benchmark's file."""
 
     description: str  # one line
-    format: _DataFormat = None  # data manager of all scenes; null: recognised from the files
+    format: _DataFormat | None = None  # data manager of all scenes; null: recognised from the files
     split: str | None = None  # of all scenes; null: the data manager's
     options: dict[str, Any] = Field(default_factory=dict)  # options of the data manager, for all scenes
     scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # by name

@@ -13,7 +13,8 @@ from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.core.errors import InterruptedRunError
 from coliags_plugin.execution.executors import ExecutionOptions, Executor
-from coliags_plugin.execution.queue import Job, JobQueue, Phase
+from coliags_plugin.execution.queue import Job, JobQueue
+from coliags_plugin.execution.tasks import Ending
 from coliags_plugin.results.reading import read_result
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ class CellRuns:
     ) -> None:
         self.folder, self.executor, self.options = folder, executor, options
         self.failures, self._count = list[FailureRecord](), len(cells)
-        self._ended: dict[Phase, int] = {"done": 0, "failed": 0}
+        self._ended = {"done": 0, "failed": 0}
         equal: dict[str, list[ComparisonCell]] = {}
         for cell in cells:
             if (result := folder.done(cell)) is not None:
@@ -61,15 +62,14 @@ class CellRuns:
             ) from error
         return self.failures
 
-    def tell(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:
-        """Count a cell that is done or has failed, and log its phase."""
-        if phase in self._ended:
-            self._ended[phase] += 1
-        log.info("[%d/%d] %s: %s%s", sum(self._ended.values()), self._count, cell.title, phase, reason)
+    def end(self, cell: ComparisonCell, how: str, reason: str = "") -> None:
+        """Count a cell that is ``done`` or has ``failed``, and tell so."""
+        self._ended[how] += 1
+        log.info("[%d/%d] %s: %s%s", sum(self._ended.values()), self._count, cell.title, how, reason)
 
-    def _told(self) -> str:
-        running = len(self._queue.running)
-        counts = {"waiting": self._count - running - sum(self._ended.values()), "running": running, **self._ended}
+    def _told(self, running: Sequence[Job]) -> str:
+        waiting = self._count - len(running) - sum(self._ended.values())
+        counts = {"waiting": waiting, "running": len(running), **self._ended}
         return ", ".join(f"{count} {phase}" for phase, count in counts.items() if count)
 
 
@@ -77,17 +77,12 @@ class CellJob(Job):
     """Cells of one result key: the first is run, the others are equal to it."""
 
     def __init__(self, equal: Sequence[ComparisonCell], runs: CellRuns) -> None:
-        self._equal, self._cell, self._runs = equal, equal[0], runs
-        self.key, self.title = self._cell.known_keys.result, self._cell.title
+        self._equal, self._runs, cell = equal, runs, equal[0]
         self.size = sum(cell.steps for cell in equal)
-
-    def task(self) -> CellTask:
-        """See :class:`Job`."""
-        cell, runs = self._cell, self._runs
-        runs.tell(cell, "running")
-        return CellTask(
+        self._run = runs.folder.run(cell)
+        self.task = CellTask(
             title=cell.title,
-            key=self.key,
+            key=cell.known_keys.result,
             name=cell.variant.name,
             method=str(Path(cell.variant.method).resolve()) if is_path(cell.variant.method) else cell.variant.method,
             overrides=cell.overrides,
@@ -97,7 +92,7 @@ class CellJob(Job):
             seed=cell.seed,
             device=runs.options.device,
             protocol=cell.protocol,
-            run=str(runs.folder.run(cell).path),
+            run=str(self._run.path),
             result=str(runs.folder.result(cell)),
             log=str(runs.folder.log(cell)),
             threads=runs.executor.threads,
@@ -106,19 +101,19 @@ class CellJob(Job):
 
     def progress(self) -> int:
         """Steps taken; the last one of a cell is over with its evaluation."""
-        return min(self._runs.folder.run(self._cell).logged_step, self._cell.steps - 1)
+        return min(self._run.logged_step, self._equal[0].steps - 1)
 
     def finish(self) -> Sequence[Job]:
         """See :class:`Job`."""
-        result = read_result(self._runs.folder.result(self._cell))
+        result = read_result(self._runs.folder.result(self._equal[0]))
         for cell in self._equal:
             self._runs.folder.add(cell, result)
-            self._runs.tell(cell, "done")
+            self._runs.end(cell, "done")
         return ()
 
-    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
+    def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
         """See :class:`Job`."""
         for cell in self._equal:
             self._runs.failures.append(self._runs.folder.fail(cell, reason, attempts))
-            self._runs.tell(cell, "failed", f": {reason}")
+            self._runs.end(cell, "failed", f": {reason}")
         return ()

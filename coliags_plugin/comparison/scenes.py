@@ -112,7 +112,7 @@ def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[Scene
             _first_there([(data / folder).resolve() for folder in entry.folders(name)]),
             benchmark.overrides(name),
             entry.format or benchmark.settings.format,
-            entry.phantom_settings,
+            entry.phantom,
         )
         for name, entry in scenes.items()
         if only in (None, name)

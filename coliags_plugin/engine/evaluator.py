@@ -42,8 +42,7 @@ from coliags_plugin.results.record import (
     Result,
     SceneRecord,
 )
-from coliags_plugin.results.summaries import means_summary
-from coliags_plugin.results.tables import per_frame_table
+from coliags_plugin.results.summaries import means_summary, per_frame_table
 
 logger = logging.getLogger(__name__)
 

@@ -37,9 +37,8 @@ class Executor(ABC):
     slots: int  # how many run at once
     threads: int  # CPU threads of each
 
-    @abstractmethod
-    def check(self, folder: Path, inputs: Sequence[Path]) -> None:
-        """Refuse a folder that tasks will not see or cannot write, and files and folders that they will not see."""
+    def check(self, folder: Path, inputs: Sequence[Path]) -> None:  # noqa: B027
+        """Refuse a folder that tasks will not see or cannot write, and inputs that they will not see."""
 
     @abstractmethod
     def start(self, task: Task) -> None:
@@ -65,9 +64,6 @@ class LocalExecutor(Executor):
         self.slots, self.threads = slots, threads
         self._gpus = tuple(gpus)
         self._workers: dict[int, LocalWorker] = {}  # by slot
-
-    def check(self, folder: Path, inputs: Sequence[Path]) -> None:
-        """See :class:`Executor`; this machine always does."""
 
     def start(self, task: Task) -> None:
         """See :class:`Executor`."""

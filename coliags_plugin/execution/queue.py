@@ -21,7 +21,6 @@ from coliags_plugin.execution.tasks import Ending, Task, TaskOutcome
 log = logging.getLogger(__name__)
 
 ExecutorName = Literal["local", "ray"]
-Phase = Literal["waiting", "running", "done", "failed"]
 
 #: Between two reports of progress, seconds.
 POLL_INTERVAL_S = 1.0
@@ -62,17 +61,8 @@ def _gpus(device: str) -> list[str]:
 class Job(ABC):
     """Work of a queue."""
 
-    key: str  # of its task, and of no other job
-    title: str  # what messages call it
+    task: Task  # whose key no other job of the queue has
     size: int  # its share of the whole, in a unit of its queue
-
-    @abstractmethod
-    def task(self) -> Task:
-        """The task to start, with this job's key.
-
-        Raises:
-            InputError: It cannot be done.
-        """
 
     @abstractmethod
     def progress(self) -> int:
@@ -81,7 +71,7 @@ class Job(ABC):
     @property
     def doing(self) -> str:
         """What messages say of it while it runs."""
-        return self.title
+        return self.task.title
 
     @abstractmethod
     def finish(self) -> Sequence[Job]:
@@ -92,12 +82,8 @@ class Job(ABC):
         """
 
     @abstractmethod
-    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
-        """Record that it cannot be done; returns jobs that are now to be done."""
-
-    def unwritable(self, reason: str, attempts: int) -> Sequence[Job]:
-        """Take that its folder cannot be written, as where the disk is full: fail, or end the queue with an error."""
-        return self.fail(reason, attempts)
+    def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
+        """Record that it cannot be done; returns jobs that are now to be done, or ends the queue with an error."""
 
 
 class JobQueue:
@@ -115,58 +101,50 @@ class JobQueue:
         self._waiting, self._running = deque(jobs), dict[str, Job]()
         self._attempts: Counter[str] = Counter()
 
-    def run(self, title: str, told: Callable[[], str]) -> None:
-        """Do all jobs; ``told`` are the facts beside the progress.
+    def run(self, title: str, told: Callable[[Sequence[Job]], str]) -> None:
+        """Do all jobs; ``told`` of those that run are the facts beside the progress.
 
         Raises:
             KeyboardInterrupt: Ctrl-C, or the system's request to end; all tasks have saved their state.
         """
         with (
             _sigterm_as_interrupt(),
-            ProgressReport(title, self._total, self._done, _PLAIN_LINE_EVERY_S, log_console()) as progress,
+            ProgressReport(title, self._total, self._over, _PLAIN_LINE_EVERY_S, log_console()) as report,
         ):
             try:
-                while self._start_next():
-                    progress.update(self._done, told())
+                self._start()
+                while self._running:
+                    self._report(report, told)
                     for task, outcome in self._executor.wait(POLL_INTERVAL_S):
                         self._take(self._running.pop(task.key), outcome)
-                progress.update(self._done, told())
+                    self._start()
+                self._report(report, told)
             except KeyboardInterrupt:
                 log.info("stopping: the state is saved; Ctrl-C again to stop at once")
                 raise
             finally:
                 self._executor.stop()
 
-    @property
-    def running(self) -> Sequence[Job]:
-        """Jobs whose tasks run."""
-        return tuple(self._running.values())
+    def _report(self, report: ProgressReport, told: Callable[[Sequence[Job]], str]) -> None:
+        running = tuple(self._running.values())
+        report.update(self._over + sum(job.progress() for job in running), told(running))
 
-    @property
-    def _done(self) -> int:
-        """Size of what is over, of running jobs as far as they are."""
-        return self._over + sum(job.progress() for job in self._running.values())
-
-    def _start_next(self) -> bool:
-        """Start what can be started; whether there is anything left to wait for."""
+    def _start(self) -> None:
+        """Start what can be started."""
         while self._waiting and len(self._running) < self._executor.slots:
-            self._start(self._waiting.popleft())
-        return bool(self._running)
-
-    def _start(self, job: Job) -> None:
-        self._attempts[job.key] += 1
-        try:
-            self._executor.start(job.task())
-        except InputError as error:
-            self._fail(job, str(error))
-        except OSError as error:
-            self._fail(job, f"cannot be started: {error.strerror or error}")
-        else:
-            self._running[job.key] = job
+            job = self._waiting.popleft()
+            self._attempts[job.task.key] += 1
+            log.info("%s: started", job.task.title)
+            try:
+                self._executor.start(job.task)
+            except OSError as error:
+                self._fail(job, f"cannot be started: {error.strerror or error}")
+            else:
+                self._running[job.task.key] = job
 
     def _take(self, job: Job, outcome: TaskOutcome) -> None:
         """Take the result of a job whose worker has ended; retry or fail it, or take up what comes after it."""
-        reason, attempts = outcome.reason or outcome.ending, self._attempts[job.key]
+        reason, attempts = outcome.reason or outcome.ending, self._attempts[job.task.key]
         if outcome.ending == "done":
             try:
                 self._waiting.extendleft(reversed(job.finish()))
@@ -178,13 +156,12 @@ class JobQueue:
         elif attempts > self._retries:
             self._fail(job, f"{reason}, {attempts} times")
         else:
-            log.warning("%s: %s; trying again", job.title, reason)
+            log.warning("%s: %s; trying again", job.task.title, reason)
             self._waiting.appendleft(job)
 
     def _fail(self, job: Job, reason: str, ending: Ending = "failed") -> None:
         self._over += job.size
-        take = job.unwritable if ending == "unwritable" else job.fail
-        self._waiting.extendleft(reversed(take(reason, self._attempts[job.key])))
+        self._waiting.extendleft(reversed(job.fail(reason, self._attempts[job.task.key], ending)))
 
 
 @contextmanager

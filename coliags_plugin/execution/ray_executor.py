@@ -27,8 +27,6 @@ log = logging.getLogger(__name__)
 
 #: For an answer of a node to the question what it sees, seconds.
 _ANSWER = 120.0
-#: For a node that has vanished to be counted as dead by Ray, seconds.
-_VANISHING = 60.0
 #: For a connection to the cluster's address, seconds.
 _CONNECT = 10.0
 _PAUSE = 0.1
@@ -78,7 +76,7 @@ class RayExecutor(Executor):
         file = folder.resolve() / f".storage-{uuid.uuid4().hex}"
         atomic_write(file, "")
         try:
-            for node in self._nodes():
+            for node in (node for node in self._ray.nodes() if node["Alive"]):
                 fault = self._ask(node, file, [path.resolve() for path in inputs])
                 if fault is not None:
                     seen, expected, do = fault
@@ -128,9 +126,6 @@ class RayExecutor(Executor):
     def _resource(self, name: str) -> float:
         return float(self._ray.cluster_resources().get(name, 0.0))
 
-    def _nodes(self) -> list[Mapping[str, Any]]:
-        return [node for node in self._ray.nodes() if node["Alive"]]
-
     def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> _Fault | None:
         """What a node lacks; None where it lacks nothing, or is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -141,8 +136,7 @@ class RayExecutor(Executor):
         try:
             fault: _Fault | None = self._ray.get(question, timeout=_ANSWER)
         except self._ray.exceptions.RayError as error:
-            lost = (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)
-            if isinstance(error, lost) and self._is_gone(node):
+            if isinstance(error, (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)):
                 log.warning("node %s is gone", node["NodeManagerAddress"])
                 return None
             return (
@@ -151,15 +145,6 @@ class RayExecutor(Executor):
                 "Install it there in the Python that runs `ray start`",
             )
         return fault
-
-    def _is_gone(self, node: Mapping[str, Any]) -> bool:
-        """Whether a node that runs no tasks is dead, as Ray finds out after a while."""
-        until = time.monotonic() + _VANISHING
-        while any(other["NodeID"] == node["NodeID"] for other in self._nodes()):
-            if time.monotonic() > until:
-                return False
-            time.sleep(_PAUSE)
-        return True
 
     def _outcome(self, reference: Any) -> TaskOutcome:
         try:

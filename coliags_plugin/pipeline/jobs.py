@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InterruptedRunError, NotWritableError
 from coliags_plugin.core.locks import locked
 from coliags_plugin.execution.executors import ExecutionOptions, Executor
 from coliags_plugin.execution.queue import Job, JobQueue
-from coliags_plugin.execution.tasks import Task, TaskOutcome, attempt, run_worker
+from coliags_plugin.execution.tasks import Ending, Task, TaskOutcome, attempt, run_worker
 from coliags_plugin.pipeline.chain import stages_of
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.page import write_index
@@ -51,7 +51,7 @@ def run_jobs(executor: Executor, options: ExecutionOptions, jobs: Sequence[Job],
     """
     queue = JobQueue(executor, options.retries, jobs, total)
     try:
-        queue.run("reconstruct", lambda: ", ".join(job.doing for job in queue.running))
+        queue.run("reconstruct", lambda running: ", ".join(job.doing for job in running))
     except KeyboardInterrupt as error:
         raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
 
@@ -154,27 +154,19 @@ class PartJob(Job):
 
     def __init__(self, jobs: PartJobs, part: Part, stages: Sequence[Stage], size: int) -> None:
         self._jobs, self.part, self.stages, self.size = jobs, part, stages, size
-        out = jobs.context.out.resolve()
-        self.key = f"{out} {part_name(part)}"
-        self.title = f"{out.name}, {'poses' if part is None else f'sub-map {part}'}"
-
-    def task(self) -> PartTask:
-        """See :class:`Job`."""
-        jobs, context = self._jobs, self._jobs.context
-        out = context.out.resolve()
-        log.info("%s: started", self.title)
-        return PartTask(
-            title=self.title,
-            key=self.key,
+        context, out = jobs.context, jobs.context.out.resolve()
+        self.task = PartTask(
+            title=f"{out.name}, {'poses' if part is None else f'sub-map {part}'}",
+            key=f"{out} {part_name(part)}",
             device=jobs.options.device,
-            log=str(out / LOGS / f"{part_name(self.part)}.log"),
+            log=str(out / LOGS / f"{part_name(part)}.log"),
             threads=jobs.executor.threads,
             source=str(context.source.resolve()),
             out=str(out),
             settings=context.settings.model_dump_json(),
             mask=None if context.mask is None else str(context.mask.resolve()),
             data_format=context.data_format,
-            part=self.part,
+            part=part,
         )
 
     def progress(self) -> int:
@@ -188,19 +180,17 @@ class PartJob(Job):
         """See :class:`Job`: with the stage that its worker is at."""
         stages = Record.of(self._jobs.context.out).stages
         begun = [stage.name for stage in self.stages if stage.name in stages and stages[stage.name].state == "begun"]
-        return " ".join([self.title, *(name.rpartition("/")[2] for name in begun)])
+        return " ".join([self.task.title, *(name.rpartition("/")[2] for name in begun)])
 
     def finish(self) -> Sequence[Job]:
         """See :class:`Job`."""
         return self._jobs.end(self)
 
-    def fail(self, reason: str, attempts: int) -> Sequence[Job]:
-        """See :class:`Job`."""
+    def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
+        """See :class:`Job`; a disk that cannot be written is that of the other parts, too."""
+        if ending == "unwritable":
+            raise NotWritableError(f"{self.task.title}: {reason}", do="What is done is kept")
         return self._jobs.end(self, reason or "it failed")
-
-    def unwritable(self, reason: str, attempts: int) -> Sequence[Job]:
-        """See :class:`Job`: the other parts are written to the same disk."""
-        raise NotWritableError(f"{self.title}: {reason}", do="What is done is kept")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,10 +38,10 @@ _BESIDE = "<!-- pictures beside the page -->"
 _PLACEHOLDER = re.compile(r"picture:([0-9a-f]{20})")
 
 
-def write_html(page: Page, output: Path, limit: int | None = None) -> None:
+def write_html(page: Page, output: Path, limit: int = PAGE_LIMIT) -> None:
     """Write a page; pictures that do not fit into ``limit`` bytes go into a folder beside it."""
     refuse_folder(output)
-    atomic_write(output, html_text(page, output, PAGE_LIMIT if limit is None else limit))
+    atomic_write(output, html_text(page, output, limit))
 
 
 def html_text(page: Page, output: Path | None = None, limit: int = PAGE_LIMIT) -> str:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import json_text, parse_json
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import FORMAT, VERSION, Result
@@ -38,39 +37,9 @@ def read_result(path: Path) -> Result:
         NewerResultError: It is of a newer version of the schema.
         InputError: There is none, it is damaged, or its values are not those that were written.
     """
-    try:
-        text = json_text(path)
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}", _EXPECTED) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}", _EXPECTED) from error
-    _check_version(_parsed(text, path), path)
-    with invalid_reported(f"{path}: ", _EXPECTED, _AGAIN):
-        result = Result.model_validate_json(text, strict=True)
-    if metrics_sha256(result.sets) != result.metrics_sha256:
-        raise InputError(
-            f"{path}: the values do not have the hash metrics_sha256; the file was changed or damaged",
-            "the values as `coliags eval` wrote them",
-            _AGAIN,
-        )
-    return result
-
-
-def _parsed(text: str, path: Path) -> dict[str, Any]:
-    try:
-        content = parse_json(text)
-    except ValueError as error:
-        whole = text.rstrip()
-        cut = whole.startswith("{") and not whole.endswith("}")
-        cut |= isinstance(error, json.JSONDecodeError) and error.pos >= len(whole)
-        what = "is empty" if not whole else "is cut off" if cut else "is not JSON"
-        raise InputError(f"{path} {what}: {error}", _EXPECTED, _AGAIN) from error
+    content = read_json(path, _EXPECTED, _AGAIN)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path} is not a results file: it lacks "format": "{FORMAT}"', _EXPECTED)
-    return content
-
-
-def _check_version(content: dict[str, Any], path: Path) -> None:
     version = content.get("version")
     if type(version) is not int or version < 1:
         raise InputError(f"{path}: version is {json.dumps(version)}", f"a number from 1 to {VERSION}", _AGAIN)
@@ -80,6 +49,15 @@ def _check_version(content: dict[str, Any], path: Path) -> None:
             f"version {VERSION} or older",
             "Update the package",
         )
+    with invalid_reported(f"{path}: ", _EXPECTED, _AGAIN):
+        result = Result.model_validate_json(json.dumps(content), strict=True)
+    if metrics_sha256(result.sets) != result.metrics_sha256:
+        raise InputError(
+            f"{path}: the values do not have the hash metrics_sha256; the file was changed or damaged",
+            "the values as `coliags eval` wrote them",
+            _AGAIN,
+        )
+    return result
 
 
 def find_results(paths: Sequence[Path]) -> list[Result]:
@@ -106,8 +84,9 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     try:
-        files = [file for file in sorted(path.rglob("*.json")) if not _hidden(file.relative_to(path))]
-        matches = [file for file in files if file.is_file() and _MARK in file.read_bytes()]
+        files = sorted(path.rglob("*.json"))
+        seen = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
+        matches = [file for file in seen if file.is_file() and _MARK in file.read_bytes()]
     except OSError as error:
         raise InputError(f"{error.filename or path} cannot be read: {error.strerror}", "a readable folder") from error
     if not matches:
@@ -115,7 +94,3 @@ def _files(path: Path) -> list[Path]:
             f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
         )
     return matches
-
-
-def _hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)

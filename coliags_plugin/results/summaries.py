@@ -1,12 +1,22 @@
-"""Summaries of a result: the content of ``metrics.json``, and facts in words."""
+"""Summaries of a result: the content of ``metrics.json``, facts in words, and tables of single frames."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.reporting.numbers import duration
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
+
+#: Columns of the long table: one row per run, test set, frame and metric.
+VALUE_COLUMNS = (
+    *("key", "method", "scene", "split", "seed", "protocol", "protocol_version"),
+    *("set", "frame", "metric", "value", "unit"),
+)
 
 
 def means_summary(result: Result) -> dict[str, Any]:
@@ -63,3 +73,41 @@ def facts(result: Result) -> dict[str, str]:
 
 def _said(value: float | None, text: Callable[[float], str]) -> str:
     return "" if value is None else text(value)
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Rows below a heading as CSV: numbers with all their digits, None empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def frame_rows(result: Result, metrics: Iterable[str]) -> Iterator[list[Any]]:
+    """Test set and name of every frame with its metrics; None where it lacks one."""
+    names = list(metrics)
+    for set_name, part in result.sets.items():
+        for index, frame in enumerate(part.frames):
+            values = (part.values[name][index] if name in part.values else None for name in names)
+            yield [set_name, frame, *values]
+
+
+def per_frame_table(result: Result) -> str:
+    """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
+    return csv_text(["set", "frame", *result.metrics], frame_rows(result, result.metrics))
+
+
+def value_rows(result: Result) -> Iterator[tuple[Any, ...]]:
+    """Rows of :data:`VALUE_COLUMNS`, one for each value of each frame; None where the frame has none."""
+    run = (result.key, result.method, result.scene.name, result.scene.split, result.seed)
+    protocol = (result.protocol.name, result.protocol.version)
+    for set_name, part in result.sets.items():
+        for metric, values in part.values.items():
+            for frame, value in zip(part.frames, values, strict=True):
+                yield (*run, *protocol, set_name, frame, metric, value, result.metrics[metric].unit)
+
+
+def write_csv(path: Path, results: Sequence[Result]) -> None:
+    """Write the values of results as CSV, with all their digits, missing ones empty."""
+    atomic_write(path, csv_text(VALUE_COLUMNS, (row for result in results for row in value_rows(result))))

@@ -315,7 +315,7 @@ def departures(settings: PhantomSettings) -> set[str]:
     ("name", "seeds", "unassumed"), [("phantoms-12", TEST_SEEDS, 7), ("phantoms-tuning", [2047, 4229, 5063, 9850], 2)]
 )
 def test_the_benchmarks_have_both_kinds_of_scenes(name, seeds, unassumed):
-    scenes = {key: scene.phantom_settings for key, scene in load_benchmark(name).settings.scenes.items()}
+    scenes = {key: scene.phantom for key, scene in load_benchmark(name).settings.scenes.items()}
     assert [chosen.seed for chosen in scenes.values()] == seeds
     for key, chosen in scenes.items():
         assert key.endswith(f"-{chosen.seed}")
@@ -331,7 +331,7 @@ def test_the_benchmarks_have_both_kinds_of_scenes(name, seeds, unassumed):
 
 
 def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
-    scenes = {key: scene.phantom_settings for key, scene in load_benchmark("phantoms-tracked").settings.scenes.items()}
+    scenes = {key: scene.phantom for key, scene in load_benchmark("phantoms-tracked").settings.scenes.items()}
     errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
     for key, chosen in scenes.items():
         assert key.endswith(f"-{chosen.seed}")

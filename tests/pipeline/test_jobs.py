@@ -10,12 +10,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.jobs import PartJob
+from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome, StageRecord
 from tests.comparison.small import lock_holder, until
 from tests.pipeline.conftest import TRAINING, write_atlas
@@ -81,7 +84,9 @@ def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, a
 
 def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
     stages = [SimpleNamespace(name=f"submap-3/{name}") for name in ("depth", "train", "mesh")]
-    job = PartJob(SimpleNamespace(context=SimpleNamespace(out=tmp_path)), 3, stages, 10)
+    context = StageContext(tmp_path, tmp_path, ReconstructionSettings(), None, None, torch.device("cpu"))
+    options = SimpleNamespace(device="cpu", threads=1)
+    job = PartJob(SimpleNamespace(context=context, options=options, executor=options), 3, stages, 10)
     assert job.doing == f"{tmp_path.name}, sub-map 3"
     record = Record(tmp_path)
     record.put("submap-3/depth", StageRecord({}, "done"))

@@ -18,8 +18,7 @@ from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
 from coliags_plugin.results.reading import read_result, write_result
 from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
-from coliags_plugin.results.summaries import means_summary
-from coliags_plugin.results.tables import per_frame_table
+from coliags_plugin.results.summaries import means_summary, per_frame_table
 from tests.results.made import METRICS, made_result, made_set, numbers, results
 
 quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -142,17 +141,16 @@ def test_the_hash_of_images_does_not_depend_on_their_memory():
 
 
 def test_a_missing_file(tmp_path):
-    assert "there is no file" in refusal(tmp_path / "gone.json")
-    assert "cannot be read" in refusal(tmp_path)
+    assert all("cannot read" in refusal(path) for path in (tmp_path / "gone.json", tmp_path))
 
 
 @pytest.mark.parametrize(
     ("content", "part"),
     [
-        (b"", "is empty"),
+        (b"", "is not JSON"),
         (b"psnr,30", "is not JSON"),
         (b'{"format": "coliags-result",,}', "is not JSON"),
-        (b"\xff\xfe\x00", "cannot be read"),
+        (b"\xff\xfe\x00", "cannot read"),
         (b"[" * 100_000, "result.json is"),
         (b"[]", "is not a results file"),
         (b'{"psnr": 30}', "is not a results file"),
@@ -171,13 +169,12 @@ def test_other_content_is_refused(content, part, tmp_path):
 
 @quick
 @given(share=st.floats(0.0, 0.999))
-def test_a_file_that_is_cut_off_says_so(share, tmp_path):
+def test_a_file_that_is_cut_off_is_refused(share, tmp_path):
     path = tmp_path / "result.json"
     write_result(path, made_result())
     whole = path.read_bytes().rstrip()
     path.write_bytes(whole[: int(share * len(whole))])
-    message = refusal(path)
-    assert "is cut off" in message or "is empty" in message
+    assert "is not JSON" in refusal(path)
 
 
 def test_a_newer_version_is_refused_whatever_else_it_has(file):

@@ -396,7 +396,7 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
 @pytest.mark.parametrize(
     ("file", "content", "match"),
     [
-        ("result.json", b"{", r"result\.json is cut off"),
+        ("result.json", b"{", r"result\.json is not JSON"),
         ("truth/test/0004.png", b"x", r"truth/test/0004\.png .*cannot be decoded"),
         ("depth/test/0004.tiff", b"x", r"depth/test/0004\.tiff .*cannot be decoded"),
         (

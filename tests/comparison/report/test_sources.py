@@ -157,7 +157,7 @@ def test_what_was_not_evaluated_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "content", "match"),
     [
-        ("results", "{", "cut off"),
+        ("results", "{", "is not JSON"),
         ("results", "{}", "not a results file"),
         ("failures", "{", "is not JSON"),
     ],
