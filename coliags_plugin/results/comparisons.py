@@ -185,17 +185,15 @@ def rank_biserial(differences: Differences) -> float:
     return float(np.sum(np.sign(kept) * ranks) / np.sum(ranks))
 
 
-def t_interval(differences: Differences, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval of the mean of two differences or more by Student's t; the mean alone where all are equal.
+def t_interval(differences: Differences) -> tuple[float, float]:
+    """95 % interval of the mean of two differences or more by Student's t; the mean alone where all are equal.
 
     Where scenes are few, it covers more than bootstraps do (docs/reports.md 4).
     """
-    mean, count = float(np.mean(differences)), len(differences)
     if _constant(differences):
-        return mean, mean
-    error = np.std(differences, ddof=1) / np.sqrt(count)
-    reach = float(stats.t.ppf(0.5 + 0.5 * confidence, count - 1) * error)
-    return mean - reach, mean + reach
+        return float(np.mean(differences)), float(np.mean(differences))
+    found = stats.ttest_1samp(differences, 0.0).confidence_interval(0.95)
+    return float(found.low), float(found.high)
 
 
 def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:

@@ -135,8 +135,9 @@ def test_pictures_without_room_are_written_beside_the_page(tmp_path):
     text = (tmp_path / "page.html").read_text()
     assert len(files) == 1 and f'src="page_files/{min(files)}"' in text and text.count('src="data:') == 1
     assert "1 picture in the folder page_files beside this page" in text
+    (tmp_path / "page_files" / "notes.txt").write_text("mine")
     write_html(page, tmp_path / "page.html")
-    assert not (tmp_path / "page_files").exists()
+    assert [path.name for path in (tmp_path / "page_files").iterdir()] == ["notes.txt"]
     with pytest.raises(InputError, match="is a folder"):
         write_html(page, tmp_path)
 

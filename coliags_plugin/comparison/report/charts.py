@@ -10,7 +10,7 @@ import numpy as np
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.outputs.charts import Series
-from coliags_plugin.reporting.model import Block, Chart, Figures, Folded, Paragraph, Section, Template
+from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Section, Template
 from coliags_plugin.results.comparisons import common_scenes
 from coliags_plugin.results.record import ProfileRecord
 
@@ -80,7 +80,7 @@ def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of
     return Series(method, style, ((edges[:-1] + edges[1:]) / 2.0)[enough].tolist(), shown[enough].tolist())
 
 
-def training_blocks(study: Study) -> list[Block]:
+def training_section(study: Study) -> Section:
     """Curves of every scene against steps and seconds; says so where there is no log."""
     logs: dict[str, list[_Log]] = {}
     for style, (method, runs) in enumerate(study.by_method.items()):
@@ -88,7 +88,8 @@ def training_blocks(study: Study) -> list[Block]:
             if run.run is not None and (columns := RunFolder(run.run).history()):
                 logs.setdefault(run.scene, []).append((method, style, columns))
     if not logs:
-        return [Paragraph("No training log: only results files are here, or runs without metrics.jsonl.")]
+        text = "No training log: only results files are here, or runs without metrics.jsonl."
+        return Section("Training", [Paragraph(text)], screen_only=True)
     figures = {
         scene: Figures(_training_charts(logs[scene]), legend=study.methods) for scene in study.scenes if scene in logs
     }
@@ -101,11 +102,8 @@ def training_blocks(study: Study) -> list[Block]:
         hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
     if any(len({method for method, *_ in own}) < len(own) for own in logs.values()):
         hints.append("One curve for each seed.")
-    return [
-        Template("curves.html"),
-        Paragraph(" ".join(hints)),
-        *(folded if len(figures) > 1 else figures.values()),
-    ]
+    shown = folded if len(figures) > 1 else figures.values()
+    return Section("Training", [Template("curves.html"), Paragraph(" ".join(hints)), *shown], screen_only=True)
 
 
 def _training_charts(logs: Sequence[_Log]) -> list[Chart]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_blocks
-from coliags_plugin.comparison.report.comparability import cautions
-from coliags_plugin.comparison.report.costs import cost_table
+from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_section
+from coliags_plugin.comparison.report.comparability import cautions, code_of, scene_provenance
+from coliags_plugin.comparison.report.costs import cost_table, training_device
 from coliags_plugin.comparison.report.leads import (
     EXPLANATION,
     choose_reference,
@@ -21,9 +21,8 @@ from coliags_plugin.comparison.report.leads import (
     statistics_text,
 )
 from coliags_plugin.comparison.report.metric_tables import ALL_COLUMNS, means_table, metric_columns
-from coliags_plugin.comparison.report.provenance import provenance_section
 from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.comparison.report.study import MissingResult, Part, Study
+from coliags_plugin.comparison.report.study import MissingResult, Part, Study, StudyRun
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.core.errors import check_name
 from coliags_plugin.core.files import atomic_write, write_json
@@ -37,7 +36,10 @@ from coliags_plugin.reporting.model import (
     Paragraph,
     Section,
     Table,
+    TableCell,
     Template,
+    leaves,
+    record,
 )
 from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.reporting.text_formats import latex_text, markdown_text, page_values
@@ -46,6 +48,8 @@ from coliags_plugin.results.summaries import csv_text, frame_rows
 _TIMES = "\N{MULTIPLICATION SIGN}"
 #: Scenes listed by name; of more, only their number is given.
 _LISTED = 12
+#: Hexadecimal digits of a hash that are shown.
+_DIGITS = 12
 
 Format = Literal["html", "markdown", "latex", "csv", "json"]
 
@@ -85,63 +89,47 @@ def write_report(
     for file in files.values():
         refuse_folder(file)
     study = read_study(paths, protocol, methods)
-    text = text_page(study, choices)
-    screen = screen_page(text, study, choices, scene) if "html" in files else text
+    page = report_page(study, choices, screen="html" in files, scene=scene)
     for each, file in files.items():
-        if each == "html":
-            write_html(screen, file)
-        elif each == "csv":
-            atomic_write(file, per_frame_csv(study))
-        elif each == "json":
-            write_json(file, page_values(text))
-        else:
-            atomic_write(file, latex_text(text) if each == "latex" else markdown_text(text))
+        match each:
+            case "html":
+                write_html(page, file)
+            case "csv":
+                atomic_write(file, per_frame_csv(study))
+            case "json":
+                write_json(file, page_values(page))
+            case _:
+                atomic_write(file, latex_text(page) if each == "latex" else markdown_text(page))
     return [*files.values()]
 
 
-def text_page(study: Study, choices: Choices) -> Page:
-    """The page without what only a screen shows."""
+def report_page(study: Study, choices: Choices, screen: bool = False, scene: Section | None = None) -> Page:
+    """The page; with what only a screen shows, views, charts, provenance and a scene to fly through, if asked for."""
     for name in choices.columns:
         check_name("metric", name, [*study.metrics, ALL_COLUMNS])
     reference = choose_reference(study, choices.reference)
+    title = f"{study.methods[0]} on" if len(study.methods) == 1 else f"{len(study.methods)} methods compared on"
+    where = study.scenes[0] if len(study.scenes) == 1 else counted(len(study.scenes), "scene")
+    sections = [_metrics(study, choices, reference), _missing(study.missing)]
+    if screen:
+        sections += [
+            view_section(study, reference, choices.frames),
+            *([scene] if scene else []),
+            profile_section(study),
+        ]
+    sections.append(Section("Costs", [cost_table(study)]))
+    if screen:
+        sections.append(training_section(study))
+    sections.append(_scenes(study, choices))
+    if screen:
+        sections += [_frames(study), _provenance(study)]
     return Page(
-        title=choices.title if choices.title is not None else _title(study),
-        sections=[
-            _metrics(study, choices, reference),
-            _missing(study.missing),
-            Section("Costs", [cost_table(study)]),
-            _scenes(study, choices),
-        ],
+        title=choices.title if choices.title is not None else f"{title} {where}",
+        sections=sections,
         facts=[*_facts(study), Fact("How the metrics are computed", study.protocol.description, wide=True)],
         note=choices.note or "",
         cautions=cautions(study),
     )
-
-
-def screen_page(text: Page, study: Study, choices: Choices, scene: Section | None = None) -> Page:
-    """The whole page, for HTML: the text page with views, charts and provenance, and a scene to fly through."""
-    reference = choose_reference(study, choices.reference)
-    metrics, missing, costs, scenes = text.sections
-    sections = [
-        metrics,
-        missing,
-        view_section(study, reference, choices.frames),
-        *([] if scene is None else [scene]),
-        profile_section(study),
-        Section("Training", [*costs.blocks, *training_blocks(study)]),
-        scenes,
-        _frames(study),
-        provenance_section(study),
-    ]
-    return replace(text, sections=sections)
-
-
-def _title(study: Study) -> str:
-    scenes = study.scenes
-    where = scenes[0] if len(scenes) == 1 else counted(len(scenes), "scene")
-    if len(study.methods) == 1:
-        return f"{study.methods[0]} on {where}"
-    return f"{len(study.methods)} methods compared on {where}"
 
 
 def _facts(study: Study) -> list[Fact]:
@@ -241,3 +229,50 @@ def _missing(missing: Sequence[MissingResult]) -> Section:
         rows = [{"method": one.method, "scene": one.scene, "seed": one.seed, "reason": one.reason} for one in failed]
         blocks.append(Table("Failed", columns, rows, count=counted(len(rows), "cell"), name="failed"))
     return Section("Cells without a result", blocks)
+
+
+def _provenance(study: Study) -> Section:
+    """What is recorded of every scene, of one run of every method, and of all runs in a table."""
+    blocks: list[Block] = []
+    for scene in study.scenes:
+        runs = [run for run in study.runs if run.scene == scene]
+        records = [scene_provenance(run.result) for run in runs]
+        differ = any(leaves(own) != leaves(records[0]) for own in records)
+        for run, own in zip(runs if differ else runs[:1], records, strict=False):
+            blocks.append(record(f"Data of {scene}{f', {run.method}' if differ else ''}", own))
+    for method, runs in study.by_method.items():
+        run, result = runs[0], runs[0].result
+        values = {"run": run.stamp, "steps": result.steps, "seed": result.seed, "software": result.software}
+        recorded = {name: value for name, value in result.provenance.items() if name != "scene"}
+        blocks.append(record(method, {**values, **recorded, "config": result.config}))
+    rows = [_run_row(run, study.methods.index(run.method)) for run in study.runs]
+    note = (
+        f"Key: of all that determines the result. Values, predictions, truth: the first {_DIGITS} digits of their "
+        "SHA-256, the latter two of each test set"
+    )
+    columns = [Column(name, words=name not in ("Seed", "Steps")) for name in rows[0]]
+    blocks.append(Folded(counted(len(study.runs), "run"), [Table("Runs", columns, rows, [note], name="runs")]))
+    return Section("Provenance", blocks, screen_only=True)
+
+
+def _run_row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
+    result = run.result
+    predictions, truth = (
+        " ".join(dict.fromkeys(getattr(part, name)[:_DIGITS] for part in result.sets.values()))
+        for name in ("predictions_sha256", "truth_sha256")
+    )
+    return {
+        "Method": TableCell(run.method, style=style),
+        "Scene": run.scene,
+        "Split": result.scene.split,
+        "Seed": result.seed,
+        "Steps": TableCell(f"{result.steps:,}", result.steps),
+        "Run": run.stamp,
+        "Device": training_device(result.cost),
+        "Version": str(result.software.get("package_version") or ""),
+        "Code": code_of(result),
+        "Key": result.key,
+        "Values": result.metrics_sha256[:_DIGITS],
+        "Predictions": predictions,
+        "Truth": truth,
+    }

@@ -34,11 +34,6 @@ class StudyRun:
         """Folder of its images."""
         return None if self.run is None else self.run / "eval" / self.result.evaluation_name
 
-    @property
-    def title(self) -> str:
-        """Method, scene and seed."""
-        return f"{self.method} on {self.scene}, seed {self.result.seed}"
-
 
 @dataclass(frozen=True)
 class MissingResult:

@@ -19,7 +19,6 @@ from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch
 from coliags_plugin.outputs.image_files import encode_png, write_depth_tiff
-from coliags_plugin.reporting import html_page
 from tests.comparison.report.made import (
     FRAMES,
     HEIGHT,
@@ -242,30 +241,6 @@ def test_large_images_are_reduced(tmp_path):
     page = report(tmp_path, [write_run(tmp_path / "run", result, depth=None)])
     assert page.images("true image")[0].shape == (33, 427, 3)
     assert "1/3 of their size" in page.words
-
-
-def test_pictures_beyond_the_limit_stand_beside_the_page(tmp_path, monkeypatch):
-    runs = [
-        write_run(tmp_path / method, result_of(method, size=(96, 80), frames={"test": FRAMES["test"]}))
-        for method in ("coliags", "3dgs")
-    ]
-    whole = report(tmp_path, runs)
-    limit = (tmp_path / "out" / "report.html").stat().st_size - 80_000
-    monkeypatch.setattr(html_page, "PAGE_LIMIT", limit)
-    page = report(tmp_path, runs)
-    assert limit - 100_000 < (tmp_path / "out" / "report.html").stat().st_size <= limit
-    folder = tmp_path / "out" / "report_files"
-    sources = [attributes["src"] for attributes in page.all("img") if "src" in attributes]
-    beside = {source for source in sources if source.startswith("report_files/")}
-    assert beside == {f"report_files/{file.name}" for file in folder.iterdir()}
-    assert len(beside) > 2 and sum(source.startswith("data:") for source in sources) > 5
-    assert len(sources) == len([attributes for attributes in whole.all("img") if "src" in attributes])
-    assert "pictures in the folder report_files beside this page" in page.words
-    # A smaller report of that name leaves no pictures of the former, and no other file is touched.
-    monkeypatch.undo()
-    (folder / "notes.txt").write_text("mine")
-    report(tmp_path, runs)
-    assert [file.name for file in folder.iterdir()] == ["notes.txt"]
 
 
 # Curves and profiles

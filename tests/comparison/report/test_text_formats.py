@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from coliags_plugin.comparison.report.report import Choices, text_page
+from coliags_plugin.comparison.report.report import Choices, report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.reporting.html_page import html_blocks
 from coliags_plugin.reporting.model import Column, Folded, Page, Section, Table, TableCell
@@ -22,7 +22,7 @@ NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
 def page(tmp_path_factory):
     methods = {"coliags": 2.0, "scaffold-gs": 0.5, "ablations/none": 0.0}
     folder = write_comparison(tmp_path_factory.mktemp("comparison"), made_scenes(methods, seeds=2)[:-2])
-    return text_page(decided(read_study([folder]), "psnr", "depth_mse"), Choices(note=NASTY))
+    return report_page(decided(read_study([folder]), "psnr", "depth_mse"), Choices(note=NASTY))
 
 
 def tables_of(page):
