@@ -67,20 +67,13 @@ def test_without_a_device_it_says_what_it_would_do(monkeypatch):
     assert not any("frames/s" in result.detail for result in results.values())
 
 
-def wrong_value(output):
-    return replace(output, alpha=output.alpha * 1.0002)
-
-
-def wrong_gradient(output):
-    return replace(output, rgb=output.rgb + 0.002 * (output.rgb - output.rgb.detach()))
-
-
-def not_a_number(output):
-    return replace(output, rgb=output.rgb * torch.nan)
-
-
 @pytest.mark.parametrize(
-    ("spoiled", "told"), [(wrong_value, "alpha of"), (wrong_gradient, "colors of"), (not_a_number, "rgb of")]
+    ("spoiled", "told"),
+    [
+        (lambda output: replace(output, alpha=output.alpha * 1.0002), "alpha of"),
+        (lambda output: replace(output, rgb=output.rgb + 0.002 * (output.rgb - output.rgb.detach())), "colors of"),
+        (lambda output: replace(output, rgb=output.rgb * torch.nan), "rgb of"),
+    ],
 )
 def test_a_wrong_renderer_fails(small, monkeypatch, spoiled, told):
     right = cpu_renderer.render_gaussians

@@ -35,3 +35,9 @@ def copied(walls, tmp_path) -> Callable[[str], Path]:
         return Path(shutil.copytree(whole, tmp_path / "data")) / KINDS[name].scene
 
     return copy
+
+
+@pytest.fixture
+def mine(copied, request) -> Path:
+    """A copy, to be spoilt, of the scene of the kind that a test module is about."""
+    return copied(request.module.KIND)

@@ -27,31 +27,19 @@ Spoil = Callable[[Path], Any]
 
 @dataclass(frozen=True)
 class Kind:
-    """One layout, or one form of it; patterns of files are from the scene's folder.
+    """One layout, or one form of it; patterns of files are from the scene's folder."""
 
-    Attributes:
-        layout: Name of its writer.
-        format: The data manager that reads it.
-        images: Of its images.
-        depths: Of its depth files; empty where there are none.
-        poses: The file of its poses; empty where it is binary.
-        size: The file that says how large images are; empty: the first image.
-        scene: Where in the folder that is written the scene's folder is.
-        params: EndoGSLAM's result.
-        accuracy: Of depth, mm: half a step, and where images are undistorted, up to half a stored pixel beside the ray.
-        prepare: What makes another form of the layout.
-    """
-
-    layout: str
-    format: str
+    layout: str  # name of its writer
+    format: str  # the data manager that reads it
     images: str
-    depths: str
-    poses: str
-    size: str = ""
-    scene: str = "."
-    params: str = ""
+    depths: str  # empty where there are none
+    poses: str  # the file of its poses; empty where it is binary
+    size: str = ""  # the file that says how large images are; empty: the first image
+    scene: str = "."  # where in the folder that is written the scene's folder is
+    params: str = ""  # EndoGSLAM's result
+    #: Of depth, mm: half a step, and where images are undistorted, up to half a stored pixel beside the ray.
     accuracy: float = 0.0
-    prepare: Spoil | None = None
+    prepare: Spoil | None = None  # what makes another form of the layout
 
     @property
     def is_undistorted(self) -> bool:
@@ -410,6 +398,14 @@ def unregistered(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return empty
 
 
+def panoramic(_: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    params = {"model": "EQUIRECTANGULAR", "width": 64, "height": 32, "params": [64, 32]}
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **params))
+    model.add_image_with_trivial_frame(pycolmap.Image(name="0.png", camera_id=1, image_id=1), pycolmap.Rigid3d())
+    return model
+
+
 def shorten(arrays: dict[str, np.ndarray]) -> None:
     """EndoGSLAM's result without its last frames."""
     arrays |= {key: arrays[key][..., :-2] for key in ("cam_unnorm_rots", "cam_trans")}
@@ -739,7 +735,15 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             "holds confidence/, but no depth",
         ),
     ],
+    "colmap": [
+        (
+            write("sparse/0/cameras.bin", (1).to_bytes(8, "little") + b"\1\0\0\0\x63\0\0\0"),
+            r"cameras\.bin .* is damaged",
+        ),
+        (change_model(panoramic), "camera 1 is EQUIRECTANGULAR"),
+    ],
     "colmap-text": [
+        (edit("sparse/0/cameras.txt", " 40 32 ", " 40 32 -"), r"(cameras\.txt|focal)"),
         (write("sparse/0/points3D.txt", "1 hello world\n"), r"points3D\.txt, line 1: '1 hello world'"),
     ],
     "endomapper": [

@@ -27,7 +27,6 @@ from tests.datamanagers.wall_scenes import (
     colors,
     manager,
     names,
-    video,
     worst_off_wall,
     write_undistorted,
     write_wall,
@@ -119,7 +118,7 @@ def test_other_files_of_the_release_are_left_alone(tmp_path, layout, name):
     for other in ("0001_flow.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png", "diffuse/0000_x.tiff"):
         (folder / other).parent.mkdir(exist_ok=True)
         (folder / other).write_bytes(b"")
-    assert len(video(load(folder, name))) == 3
+    assert len(load(folder, name).video) == 3
 
 
 # C3VDv2's lens

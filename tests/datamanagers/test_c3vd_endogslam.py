@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,24 +22,22 @@ from tests.datamanagers.kinds import change_npz, files, remove
 from tests.datamanagers.wall_scenes import (
     HEIGHT,
     WIDTH,
-    manager,
+    load_scene,
     names,
     off_wall,
     poses,
-    video,
     worst_off_wall,
     write_wall,
 )
 
 PARAMS = "params.npz"
 
-
-def load(folder: Path, **options) -> Scene:
-    return manager("c3vd-endogslam", **options).load(folder)
+KIND = "c3vd-endogslam"
+load = partial(load_scene, "c3vd-endogslam")
 
 
 def matrices(scene: Scene) -> np.ndarray:
-    return np.array([frame.camera.camera_to_world.double().numpy() for frame in video(scene)])
+    return np.array([frame.camera.camera_to_world.double().numpy() for frame in scene.video])
 
 
 def from_first(count: int) -> np.ndarray:
@@ -69,12 +68,6 @@ def drift(pose: np.ndarray) -> np.ndarray:
     share = np.arange(len(pose)) / len(pose)
     turns = Rotation.from_rotvec(np.outer(share, [0.01, -0.02, 0.03])).as_matrix()
     return rigid(turns @ pose[:, :3, :3], pose[:, :3, 3] + np.outer(share, [0.3, 0.1, -0.2]))
-
-
-@pytest.fixture
-def mine(copied):
-    """A copy to spoil, of eleven images."""
-    return copied("c3vd-endogslam")
 
 
 @pytest.fixture
@@ -274,4 +267,4 @@ def test_originals_kept_by_the_script_are_left_alone(mine):
         (mine / kind).mkdir()
         (mine / kind / "0000_x.png").write_text("not looked at")
     remove("truth/seen/*")(mine)
-    assert len(video(load(mine))) == 11
+    assert len(load(mine).video) == 11

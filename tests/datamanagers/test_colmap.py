@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,14 +15,14 @@ from pydantic import ValidationError
 
 from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.reader import find_models, read_model
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses import colmap as colmap_poses
-from tests.datamanagers.kinds import change_model, edit
-from tests.datamanagers.wall_scenes import colors, look, manager, off_wall, poses, seen_from, video
+from tests.datamanagers.kinds import change_model
+from tests.datamanagers.wall_scenes import colors, load_scene, look, manager, off_wall, poses, seen_from
 
 WIDTH, HEIGHT, COUNT = 64, 48, 5
 #: Off-centre; pixel centres at integers + 0.5. One set of parameters for every model that takes images.
@@ -108,8 +109,7 @@ def write_colmap(
     return folder
 
 
-def load(folder: Path, **options) -> Scene:
-    return manager("colmap", **options).load(folder)
+load = partial(load_scene, "colmap")
 
 
 def opened(folder: Path, **options) -> Recording:
@@ -159,12 +159,12 @@ def test_images_of_every_camera_become_pinhole_images(model, tmp_path):
 
 def test_cameras_of_different_sizes_each_have_their_view(tmp_path):
     cameras = [camera(), camera("OPENCV", 2, 60, 44), camera("SIMPLE_RADIAL", 3)]
-    frames = video(load(write_colmap(tmp_path, cameras)))
+    frames = load(write_colmap(tmp_path, cameras)).video
     assert [(frame.camera.width, frame.camera.height) for frame in frames[:3]] == [(64, 48), (60, 44), (64, 48)]
     for frame in (*frames, *load(tmp_path, width=41, height=33, focal_scale=0.7).train):
         assert frame.image.shape[:2] == (frame.camera.height, frame.camera.width)
         assert off_wall(sparse_points(frame)).max() < 1e-4
-    assert {frame.camera.width for frame in video(load(tmp_path, width=41, height=33))} == {41}
+    assert {frame.camera.width for frame in load(tmp_path, width=41, height=33).video} == {41}
 
 
 def test_a_rig_of_two_cameras(tmp_path):
@@ -380,30 +380,6 @@ def test_binary_goes_before_text_and_images_may_be_elsewhere(mine, tmp_path):
         load(mine)
 
 
-# What is refused besides
-
-
-def test_cameras_that_are_none(mine, tmp_path):
-    path = mine / "sparse/0/cameras.bin"
-    path.write_bytes(path.read_bytes()[:12] + (99).to_bytes(4, "little") + path.read_bytes()[16:])
-    with pytest.raises(InputError, match=r"cameras\.bin .* is damaged"):
-        opened(mine)
-    text = write_colmap(tmp_path / "text", names=NAMES[:2], text=True)
-    edit("sparse/0/cameras.txt", "64 48 61 55", "64 48 -61 55")(text)
-    with pytest.raises(InputError, match=r"(cameras\.txt|focal)"):
-        opened(text)
-
-
-def test_a_panorama_is_refused_by_name(tmp_path):
-    model = pycolmap.Reconstruction()
-    params = {"model": "EQUIRECTANGULAR", "width": 64, "height": 32, "params": [64, 32]}
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **params))
-    model.add_image_with_trivial_frame(pycolmap.Image(name="0.png", camera_id=1, image_id=1), pycolmap.Rigid3d())
-    model.write_binary(str(tmp_path))
-    with pytest.raises(InputError, match="camera 1 is EQUIRECTANGULAR"):
-        opened(tmp_path)
-
-
 # A real model, before and after COLMAP undistorted it
 
 
@@ -446,5 +422,5 @@ def test_a_real_scene_loads(shared_data):
     for frame in scene.train:
         assert frame.image.shape[:2] == (frame.camera.height, frame.camera.width)
         assert len(frame.sparse_depth.depth) > 150
-    found = torch.stack([frame.camera.camera_to_world for frame in video(scene)]).numpy()
+    found = torch.stack([frame.camera.camera_to_world for frame in scene.video]).numpy()
     np.testing.assert_allclose(found, colmap_poses.read(folder / "sparse").camera_to_world, atol=1e-6)

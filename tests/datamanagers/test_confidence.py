@@ -14,7 +14,7 @@ from coliags_plugin.core.scenes import Frame, concatenate_targets
 from coliags_plugin.datamanagers.reading.images import resize_nearest
 from coliags_plugin.datamanagers.recognition import find_format
 from tests.datamanagers.kinds import change_frames, change_json, files
-from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, manager, video
+from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, manager
 from tests.scenes import camera_at
 
 
@@ -48,7 +48,7 @@ def folder(request, copied) -> Path:
 def test_stored_values_are_255ths(folder, keep):
     scene = load(folder, keep_pixels=keep)
     assert scene.provenance["depth_is_estimated"] is True
-    for frame in video(scene):
+    for frame in scene.video:
         expected = torch.from_numpy(stored(frame.index)).float() / 255.0
         for values in (frame.depth_confidence, frame.to("cpu").depth_confidence, frame.target.depth_confidence):
             torch.testing.assert_close(values, expected, rtol=0, atol=1e-7)

@@ -42,7 +42,6 @@ from tests.datamanagers.wall_scenes import (
     off_wall,
     poses,
     seen_from,
-    video,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +57,7 @@ def load(folder: Path, name: str, **options) -> Scene:
 
 def in_order(scene: Scene, name: str) -> list[Frame]:
     """Frames of the video: RotateColon's test frames are of another."""
-    return scene.train if name == "rotatecolon" else video(scene)
+    return scene.train if name == "rotatecolon" else scene.video
 
 
 def to_true_world(name: str) -> np.ndarray:
@@ -338,7 +337,7 @@ def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, 
 def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, walls):
     folder = copied("rgbd")
     remove("rgb/*.png", 3)(folder)
-    found, expected = video(load(folder, "rgbd")), video(load(walls("rgbd"), "rgbd"))
+    found, expected = load(folder, "rgbd").video, load(walls("rgbd"), "rgbd").video
     for frame, other in zip(found, [*expected[:3], *expected[4:]], strict=True):
         assert frame.name == other.name
         assert torch.equal(frame.camera.camera_to_world, other.camera.camera_to_world)
@@ -353,7 +352,7 @@ def test_endogslams_quaternions_may_be_of_any_length(copied, walls, name):
     change_npz(KINDS[name].params, lambda arrays: arrays.update(cam_unnorm_rots=3.0 * arrays["cam_unnorm_rots"]))(
         folder
     )
-    for frame, other in zip(video(load(folder, name)), video(load(walls(name), name)), strict=True):
+    for frame, other in zip(load(folder, name).video, load(walls(name), name).video, strict=True):
         torch.testing.assert_close(frame.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
 
 

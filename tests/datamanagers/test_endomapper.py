@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
-import pytest
 import torch
 
 from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.geometry.lenses.vicalib import read_calibration
 from tests.datamanagers.kinds import edit
-from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, layout_of, manager, video
+from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, layout_of, load_scene
 
-
-@pytest.fixture
-def mine(copied):
-    return copied("endomapper")
-
-
-def load(folder, **options):
-    return manager("endomapper", **options).load(folder)
+KIND = "endomapper"
+load = partial(load_scene, "endomapper")
 
 
 def stored_pixels(camera, folder) -> np.ndarray:
@@ -40,7 +35,7 @@ def test_depth_is_read_to_the_bit(walls):
     points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 1.0), (50, 3))
     np.testing.assert_allclose(calibration.lens.project(points), written.project(points), atol=1e-12)
     pixels = stored_pixels(scene.train[0].camera, folder)
-    for frame in video(scene)[::4]:
+    for frame in scene.video[::4]:
         steps = cv2.imread(str(folder / f"depth/{frame.name}.png"), cv2.IMREAD_UNCHANGED)
         expected = (steps[pixels[..., 1], pixels[..., 0]] / calibration.depth_scale).astype(np.float32)
         np.testing.assert_array_equal(frame.depth, np.where(expected == 0.0, np.nan, expected))

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from dataclasses import astuple, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,6 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
 from coliags_plugin.datamanagers.units import write_unit
@@ -24,7 +24,7 @@ from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, Und
 from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
-from tests.datamanagers.wall_scenes import PINHOLE, look, manager, off_wall, poses, rays, seen_from, video
+from tests.datamanagers.wall_scenes import PINHOLE, load_scene, look, manager, off_wall, poses, rays, seen_from
 
 WIDTH, HEIGHT, COUNT = 64, 48, 9
 SIZE = vars(PINHOLE)
@@ -35,9 +35,7 @@ CAMERA = {"fl_x": PINHOLE.fx, "fl_y": PINHOLE.fy, "cx": PINHOLE.cx, "cy": PINHOL
 NAMES = [f"images/frame_{index + 1:05d}.png" for index in range(COUNT)]
 FILE = "transforms.json"
 
-
-def load(folder: Path, **options) -> Scene:
-    return manager("nerfstudio", **options).load(folder)
+load = partial(load_scene, "nerfstudio")
 
 
 def opened(folder: Path, **options) -> Recording:
@@ -90,7 +88,7 @@ def mine(wall, tmp_path) -> Path:
     ],
 )
 def test_images_of_every_camera_become_pinhole_images(tmp_path, model, bends, lens):
-    for frame in video(load(write(tmp_path, lens, NAMES[:3], camera_model=model, **bends))):
+    for frame in load(write(tmp_path, lens, NAMES[:3], camera_model=model, **bends)).video:
         assert vars(frame.camera.intrinsics) == vars(PINHOLE)
         _, color = seen_from(frame, poses(3)[frame.index])
         off = np.abs(color.astype(int) - frame.image.numpy())[frame.valid.numpy()]
@@ -226,7 +224,7 @@ def test_masks_of_some_frames(mine):
     mask[5:20, 3:9] = 0
     cv2.imwrite(str(mine / "mask.png"), mask)
     change_frames(FILE, lambda index, entry: entry.update({"mask_path": "mask.png"} if index % 2 else {}))(mine)
-    for frame in video(load(mine)):
+    for frame in load(mine).video:
         if frame.index % 2:
             np.testing.assert_array_equal(frame.mask.numpy(), mask > 0)
         else:

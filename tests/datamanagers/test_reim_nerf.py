@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,17 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.core.scenes import Scene
 from coliags_plugin.geometry.lenses.models import LENSES, undistortion_map
 from tests.datamanagers.kinds import change_frames, remove
-from tests.datamanagers.wall_scenes import FAR, look, manager, names, poses, video, write_wall
+from tests.datamanagers.wall_scenes import FAR, load_scene, look, manager, names, poses, write_wall
 
 WIDTH, HEIGHT, FRAMES = 90, 72, 27
 LENS = LENSES["fisheye"].resized(WIDTH, HEIGHT)
 
-
-def load(folder: Path, **options) -> Scene:
-    return manager("reim-nerf", **options).load(folder)
+load = partial(load_scene, "reim-nerf")
 
 
 def content_of(folder: Path, part: str = "test") -> dict:
@@ -67,13 +65,13 @@ def test_its_own_split_leaves_validation_out(folder, scene):
     assert [frame.index for frame in scene.test_sets["test"]] == [i for i in range(FRAMES) if i % 5]
     assert scene.provenance["parts"] == {"train": 5, "val": 1, "test": FRAMES, "true_test": 21}
     other = load(folder, split="every-8th", initial_points="none")
-    assert len(video(other)) == FRAMES
+    assert len(other.video) == FRAMES
     assert [frame.index for frame in other.test_sets["test"]] == [0, 8, 16, 24]
 
 
 def test_test_frames_are_only_needed_by_the_own_split(mine):
     remove("transforms_true_test.json")(mine)
-    assert len(video(load(mine, split="every-8th"))) == 9
+    assert len(load(mine, split="every-8th").video) == 9
     assert manager("reim-nerf").recognise(mine) == "transforms_train.json beside distmaps"
 
 

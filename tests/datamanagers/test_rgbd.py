@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,22 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.datamanagers.kinds import change_lines, files
-from tests.datamanagers.wall_scenes import FRAMES, PINHOLE, look, manager, names, poses, rays, video
+from tests.datamanagers.wall_scenes import FRAMES, PINHOLE, load_scene, look, manager, names, poses, rays
 from tests.datamanagers.wall_scenes import seen_from as expected_from
 
 #: Steps per mm of the layout's depth.
 SCALE = 500.0
 START = 1305031102.0
 
-
-def load(folder: Path, **options) -> Scene:
-    return manager("rgbd", **options).load(folder)
+KIND = "rgbd"  # by time
+load = partial(load_scene, "rgbd")
 
 
 def stamps(times: list[float]) -> list[str]:
@@ -36,12 +36,6 @@ def stamps(times: list[float]) -> list[str]:
 
 
 TIMES = [START + index / 30 for index in range(FRAMES)]
-
-
-@pytest.fixture
-def timed(copied):
-    """A copy to spoil, with times for names."""
-    return copied("rgbd")
 
 
 @pytest.fixture
@@ -71,55 +65,55 @@ def test_a_wall_is_written_as_tum_names_things(walls):
 
 def test_times_are_associated(walls):
     scene = load(walls("rgbd"))
-    assert names(video(scene)) == stamps(TIMES)
+    assert names(scene.video) == stamps(TIMES)
     facts = {"by": "time", "without_pose": 0, "without_depth": 0, "largest_difference_s": 0.0}
     assert scene.provenance["association"] == facts and scene.provenance["depth_scale"] == SCALE
 
 
-def test_clocks_that_nearly_agree(timed):
-    known = tum.read(timed / "groundtruth.txt")
-    tum.write(timed / "groundtruth.txt", Trajectory(known.camera_to_world, timestamps=known.timestamps + 0.009))
-    for path in files(timed, "depth/*.png"):
+def test_clocks_that_nearly_agree(mine):
+    known = tum.read(mine / "groundtruth.txt")
+    tum.write(mine / "groundtruth.txt", Trajectory(known.camera_to_world, timestamps=known.timestamps + 0.009))
+    for path in files(mine, "depth/*.png"):
         path.rename(path.with_name(f"{float(path.stem) - 0.008:.6f}.png"))
-    scene = load(timed)
-    assert_right(video(scene), [*range(FRAMES)])
+    scene = load(mine)
+    assert_right(scene.video, [*range(FRAMES)])
     assert scene.provenance["association"]["largest_difference_s"] == pytest.approx(0.009, abs=1e-6)
 
 
-def test_a_motion_capture_that_is_faster_than_the_camera(timed):
+def test_a_motion_capture_that_is_faster_than_the_camera(mine):
     """Out of order, too: files that were merged are."""
     fine = np.linspace(TIMES[0] - 0.5, TIMES[-1] + 0.5, 1000)
     matrices = np.concatenate([np.tile(np.eye(4), (1000, 1, 1)), poses(FRAMES)])
-    tum.write(timed / "groundtruth.txt", Trajectory(matrices, timestamps=np.concatenate([fine, TIMES])))
-    assert_right(video(load(timed)), [*range(FRAMES)])
+    tum.write(mine / "groundtruth.txt", Trajectory(matrices, timestamps=np.concatenate([fine, TIMES])))
+    assert_right(load(mine).video, [*range(FRAMES)])
 
 
-def test_images_without_a_pose_or_depth_are_left_out_and_counted(timed, caplog):
-    change_lines("groundtruth.txt", lambda rows: [*rows[:3], *rows[4:-1]])(timed)
-    files(timed, "depth/*.png")[4].unlink()
-    scene = load(timed)
+def test_images_without_a_pose_or_depth_are_left_out_and_counted(mine, caplog):
+    change_lines("groundtruth.txt", lambda rows: [*rows[:3], *rows[4:-1]])(mine)
+    files(mine, "depth/*.png")[4].unlink()
+    scene = load(mine)
     kept = [index for index in range(FRAMES) if index not in (2, 4, 10)]
-    assert names(video(scene)) == [stamps(TIMES)[index] for index in kept]
-    assert_right(video(scene), kept)
+    assert names(scene.video) == [stamps(TIMES)[index] for index in kept]
+    assert_right(scene.video, kept)
     assert scene.provenance["association"]["without_pose"] == 2
     assert scene.provenance["association"]["without_depth"] == 1
     assert "of 11 images 2 have no pose and 1 no depth" in caplog.text
 
 
-def test_times_are_sorted_as_numbers(timed):
+def test_times_are_sorted_as_numbers(mine):
     new = [f"{index * 0.5 + 8.5}" for index in range(FRAMES)]
     for part in ("rgb", "depth"):
-        for path, stem in zip(files(timed, f"{part}/*.png"), new, strict=True):
+        for path, stem in zip(files(mine, f"{part}/*.png"), new, strict=True):
             path.rename(path.with_name(f"{stem}.png"))
-    tum.write(timed / "groundtruth.txt", Trajectory(poses(FRAMES), timestamps=np.array(new, float)))
-    scene = load(timed)
-    assert names(video(scene)) == new
-    assert_right(video(scene), [*range(FRAMES)])
+    tum.write(mine / "groundtruth.txt", Trajectory(poses(FRAMES), timestamps=np.array(new, float)))
+    scene = load(mine)
+    assert names(scene.video) == new
+    assert_right(scene.video, [*range(FRAMES)])
 
 
-def test_another_clock_can_be_ignored(timed):
-    tum.write(timed / "groundtruth.txt", Trajectory(poses(FRAMES), timestamps=np.arange(FRAMES) / 30 + 5.0))
-    assert_right(video(load(timed, association="order")), [*range(FRAMES)])
+def test_another_clock_can_be_ignored(mine):
+    tum.write(mine / "groundtruth.txt", Trajectory(poses(FRAMES), timestamps=np.arange(FRAMES) / 30 + 5.0))
+    assert_right(load(mine, association="order").video, [*range(FRAMES)])
 
 
 def test_a_name_that_is_no_time(numbered):
@@ -152,7 +146,7 @@ def test_nearest_in_time(wanted, known, tolerance):
 
 def test_unpadded_names_count_as_people_do(walls):
     scene = load(walls("rgbd-by-order"))
-    assert names(video(scene)) == [str(index) for index in range(FRAMES)]
+    assert names(scene.video) == [str(index) for index in range(FRAMES)]
     assert scene.provenance["association"] == {"by": "order"}
 
 
@@ -162,44 +156,44 @@ def test_whole_numbers_can_be_times(numbered):
         load(numbered)
     kept = [index for index in range(FRAMES) if index != 5]
     scene = load(numbered, association="time")
-    assert names(video(scene)) == [str(index) for index in kept]
-    assert_right(video(scene), kept)
+    assert names(scene.video) == [str(index) for index in kept]
+    assert_right(scene.video, kept)
     # A pose and another image lost: as many poses as images, but not of the same frames.
     for part in ("rgb", "depth"):
         (numbered / part / "7.png").unlink()
-    assert len(video(load(numbered, association="order"))) == 10
-    assert_right(video(load(numbered, association="time")), [index for index in kept if index != 7])
+    assert len(load(numbered, association="order").video) == 10
+    assert_right(load(numbered, association="time").video, [index for index in kept if index != 7])
 
 
 # Depth, cameras and points
 
 
-def test_scales_of_depth(timed):
+def test_scales_of_depth(mine):
     with pytest.raises(InputError, match=r"depth_scale = 500, but the option depth_scale is 5000"):
-        load(timed, depth_scale=5000.0)
-    assert load(timed, depth_scale=SCALE).provenance["depth_scale"] == SCALE
-    path = files(timed, "depth/*.png")[1]
+        load(mine, depth_scale=5000.0)
+    assert load(mine, depth_scale=SCALE).provenance["depth_scale"] == SCALE
+    path = files(mine, "depth/*.png")[1]
     steps = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     steps[:10] = 0
     cv2.imwrite(str(path), steps)
-    frame = load(timed).train[0]
+    frame = load(mine).train[0]
     assert torch.isnan(frame.depth[:10]).all() and torch.isfinite(frame.depth[10:]).all()
     assert frame.depth_at_least is None
 
 
-def test_a_trajectory_may_be_named(timed):
-    (timed / "slam").mkdir()
-    (timed / "groundtruth.txt").rename(timed / "slam/estimate.txt")
-    assert len(load(timed, trajectory="slam/estimate.txt").train) == 9
+def test_a_trajectory_may_be_named(mine):
+    (mine / "slam").mkdir()
+    (mine / "groundtruth.txt").rename(mine / "slam/estimate.txt")
+    assert len(load(mine, trajectory="slam/estimate.txt").train) == 9
     with pytest.raises(InputError, match=r"no file .*slam/other.txt"):
-        load(timed, trajectory="slam/other.txt")
+        load(mine, trajectory="slam/other.txt")
 
 
-def test_other_files_do_not_make_it_a_scene(timed):
+def test_other_files_do_not_make_it_a_scene(mine):
     recognise = manager("rgbd").recognise
-    assert recognise(timed) == "the TUM trajectory groundtruth.txt beside rgb/"
-    (timed / "groundtruth.txt").write_text("1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n")
-    assert [recognise(path) for path in (timed, timed / "rgb", timed / "camera.json")] == [None] * 3
+    assert recognise(mine) == "the TUM trajectory groundtruth.txt beside rgb/"
+    (mine / "groundtruth.txt").write_text("1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n")
+    assert [recognise(path) for path in (mine, mine / "rgb", mine / "camera.json")] == [None] * 3
 
 
 def with_intrinsics(folder: Path, text: str) -> Path:
@@ -209,10 +203,10 @@ def with_intrinsics(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("form", ["{0} {1} {2} {3}\n", "{0}, {1}, {2}, {3}", "{0} 0 {2}\n0 {1} {3}\n0 0 1\n"])
-def test_intrinsics_may_be_in_a_text_file(timed, form):
-    k = json.loads((timed / "camera.json").read_text())
-    scene = load(with_intrinsics(timed, form.format(*(k[key] for key in ("fx", "fy", "cx", "cy")))), depth_scale=SCALE)
-    assert_right(video(scene), [*range(FRAMES)])
+def test_intrinsics_may_be_in_a_text_file(mine, form):
+    k = json.loads((mine / "camera.json").read_text())
+    scene = load(with_intrinsics(mine, form.format(*(k[key] for key in ("fx", "fy", "cx", "cy")))), depth_scale=SCALE)
+    assert_right(scene.video, [*range(FRAMES)])
     assert scene.provenance["intrinsics_from"] == "intrinsics.txt"
 
 
@@ -227,9 +221,9 @@ def test_intrinsics_may_be_in_a_text_file(timed, form):
         ("12 12 10 8", r"principal point \(10, 8\) is far from the middle"),
     ],
 )
-def test_intrinsics_that_do_not_do(timed, text, message):
+def test_intrinsics_that_do_not_do(mine, text, message):
     with pytest.raises(InputError, match=message):
-        load(with_intrinsics(timed, text), depth_scale=SCALE)
+        load(with_intrinsics(mine, text), depth_scale=SCALE)
 
 
 @pytest.fixture
@@ -253,7 +247,7 @@ def pancakes(tmp_path):
 def test_gaussian_pancakes_folder(pancakes):
     assert find_format(pancakes) == "rgbd"
     scene = load(pancakes, depth="none")
-    frames = video(scene)
+    frames = scene.video
     assert names(frames) == [f"{index}_color" for index in range(FRAMES)]
     assert all(frame.depth is None for frame in frames)
     np.testing.assert_allclose(frames[10].camera.camera_to_world, poses(FRAMES)[10], atol=1e-6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,27 +14,20 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.rotatecolon.reader import ExrDepth, read_exr_channel
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.trainer import Trainer
 from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
-from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
+from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, names, poses
 from tests.layouts.rotatecolon import write_exr
 from tests.scenes import SMALL
 
 Z = "ViewLayer.Depth.Z"
 
-
-def load(folder: Path, **options) -> Scene:
-    return manager("rotatecolon", **options).load(folder)
-
-
-@pytest.fixture
-def mine(copied):
-    return copied("rotatecolon")
+KIND = "rotatecolon"
+load = partial(load_scene, "rotatecolon")
 
 
 def test_test_views_have_images_but_no_depth(walls):

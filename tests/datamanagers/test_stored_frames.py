@@ -6,6 +6,7 @@ import gc
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers import stored_frames
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
-from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
+from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses
 
 
 @pytest.fixture
@@ -48,8 +49,7 @@ def frame_of(folder: Path, index: int, keep: bool = True) -> StoredFrame:
     return StoredFrame(replace(recording.shots[index], seen=recording.seen["video"].get(index)), index, keep)
 
 
-def load(folder: Path, **options) -> Scene:
-    return manager("c3vd", **options).load(folder)
+load = partial(load_scene, "c3vd")
 
 
 def test_a_frame_reads_nothing_until_asked_and_then_once(folder, reads):

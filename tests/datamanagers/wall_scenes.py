@@ -75,11 +75,6 @@ def worst_off_wall(frame: Frame) -> float:
     return off_wall(frame.camera.unproject(frame.depth).numpy()).max()
 
 
-def video(scene: Scene) -> list[Frame]:
-    """Training and test frames in the order of the video."""
-    return scene.video
-
-
 def names(frames: list[Frame]) -> list[str]:
     return [frame.name for frame in frames]
 
@@ -88,6 +83,11 @@ def manager(name: str, **options) -> RecordedDataManager:
     """The data manager of a format."""
     kind = datamanagers.get(name)
     return kind(kind.Settings(**options))
+
+
+def load_scene(name: str, folder: Path, **options) -> Scene:
+    """The scene in a folder, by the data manager of a format."""
+    return manager(name, **options).load(folder)
 
 
 def write_undistorted(folder: Path, count: int = 9, width: int = 64, height: int = 48, **options) -> Path:

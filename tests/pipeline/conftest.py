@@ -10,10 +10,10 @@ import pytest
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.video import write_video
+from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
 from coliags_plugin.pipeline.jobs import PartTask, work
 from coliags_plugin.pipeline.procedure import run

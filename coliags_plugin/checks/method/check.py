@@ -455,13 +455,13 @@ def keeps_rows_together(context: CheckContext) -> str:
     with as_in_new_process():
         trainer = context.build("events", method=method)
         trainer.start()
-        lengths = _Lengths(trainer)
-        if not lengths.rows:
+        counts = [trainer.model.field.element_count]
+        if not counts[0]:
             raise CheckFailedError(f"element_count of field '{context.loaded.config.field.name}' is 0: override it")
-        counts = [lengths.rows]
+        # Buffers of the field's parts may be of another kind.
+        of_rows = [name for name, length in _lengths(trainer)[0].items() if length == counts[0]]
         while trainer.step < trainer.steps:
-            lengths.take_step()
-            counts.append(lengths.rows)
+            counts.append(_step_by_rows(trainer, of_rows))
             if not changed_at and counts[-1] != counts[0]:
                 changed_at = trainer.step
                 trainer.save()
@@ -490,55 +490,46 @@ def _spread_out(settings: Settings, steps: int, written_for: int) -> list[str]:
     return [f"strategy.{name}={short if every == shortest else 2 * short}" for name, every in given.items()]
 
 
-class _Lengths:
-    """Lengths of what has a row for each of the field's, compared after each step.
+def _lengths(trainer: Trainer) -> tuple[dict[str, int], dict[str, int]]:
+    """Lengths of the field's groups of one parameter and its own buffers, and of the strategy's counters."""
+    field = trainer.model.field
+    groups = {name: group[0] for name, group in field.parameter_groups().items() if len(group) == 1}
+    parts: dict[str, Tensor] = {f"parameter group '{name}'": value for name, value in groups.items()}
+    parts |= {f"buffer '{name}'": value for name, value in field.named_buffers(recurse=False)}
+    counters = trainer.strategy.state_dict()
+    return tuple(  # type: ignore[return-value]
+        {name: len(value) for name, value in each.items() if value.ndim} for each in (parts, counters)
+    )
 
-    Those are the field's groups of one parameter and its own buffers that have one at the beginning (buffers of its
-    parts may be of another kind), and the strategy's counters.
+
+def _step_by_rows(trainer: Trainer, of_rows: Sequence[str]) -> int:
+    """Take one more step, and compare lengths: of the parts that have a row for each of the field's, and of counters.
+
+    Returns the number of rows.
     """
-
-    def __init__(self, trainer: Trainer) -> None:
-        self._trainer = trainer
-        self.rows = trainer.model.field.element_count
-        self._counters = self._now()[1]
-        self._of_rows = [name for name, length in self._now()[0].items() if length == self.rows]
-
-    def _now(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Lengths of parameters and buffers, and of counters."""
-        field = self._trainer.model.field
-        groups = {name: group[0] for name, group in field.parameter_groups().items() if len(group) == 1}
-        parts: dict[str, Tensor] = {f"parameter group '{name}'": value for name, value in groups.items()}
-        parts |= {f"buffer '{name}'": value for name, value in field.named_buffers(recurse=False)}
-        counters = self._trainer.strategy.state_dict()
-        return tuple(  # type: ignore[return-value]
-            {name: len(value) for name, value in each.items() if value.ndim} for each in (parts, counters)
-        )
-
-    def take_step(self) -> None:
-        """Take one more step, and compare."""
-        trainer, before = self._trainer, self.rows
-        step = trainer.take_step()["step"]
-        self.rows = trainer.model.field.element_count
-        said = f"step {step}, {before} to {self.rows} rows: "
-        for group, parameters in trainer.model.parameter_groups().items():
-            if list(map(id, trainer.optimizers.adam[group].param_groups[0]["params"])) != list(map(id, parameters)):
-                raise CheckFailedError(
-                    f"{said}the optimizer of group '{group}' trains what is no longer the field's; change rows by "
-                    "ParameterRows alone"
-                )
-        try:
-            trainer.optimizers.check_moments()
-        except ValueError as error:
-            raise CheckFailedError(f"{said}{error}; change rows by ParameterRows alone") from error
-        lengths, counters = self._now()
-        for name in self._of_rows:
-            if lengths[name] != self.rows:
-                raise CheckFailedError(f"{said}{name} has {lengths[name]}")
-        for name, length in counters.items():
-            per_row, rest = divmod(self._counters.get(name, 0), before)
-            if per_row and not rest and length not in (0, per_row * self.rows):
-                raise CheckFailedError(f"{said}counter '{name}' of the strategy has {length}")
-        self._counters = counters
+    before, counters_before = trainer.model.field.element_count, _lengths(trainer)[1]
+    step = trainer.take_step()["step"]
+    rows = trainer.model.field.element_count
+    said = f"step {step}, {before} to {rows} rows: "
+    for group, parameters in trainer.model.parameter_groups().items():
+        if list(map(id, trainer.optimizers.adam[group].param_groups[0]["params"])) != list(map(id, parameters)):
+            raise CheckFailedError(
+                f"{said}the optimizer of group '{group}' trains what is no longer the field's; change rows by "
+                "ParameterRows alone"
+            )
+    try:
+        trainer.optimizers.check_moments()
+    except ValueError as error:
+        raise CheckFailedError(f"{said}{error}; change rows by ParameterRows alone") from error
+    lengths, counters = _lengths(trainer)
+    for name in of_rows:
+        if lengths[name] != rows:
+            raise CheckFailedError(f"{said}{name} has {lengths[name]}")
+    for name, length in counters.items():
+        per_row, rest = divmod(counters_before.get(name, 0), before)
+        if per_row and not rest and length not in (0, per_row * rows):
+            raise CheckFailedError(f"{said}counter '{name}' of the strategy has {length}")
+    return rows
 
 
 # Evaluation and images

@@ -16,12 +16,13 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
-from coliags_plugin.datamanagers.reading.images import bits_of, size_of
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import (
     ROTATION,
@@ -337,7 +338,7 @@ def _depth_format(files: PreparedFiles) -> DepthSteps | None:
     """EndoGSLAM's 8-bit or C3VD's 16-bit format, by the first file; all files must have the same."""
     if files.depths is None:
         return None
-    return PREPARED_DEPTH if bits_of(files.depths[0]) == PREPARED_DEPTH.bits else C3VD_DEPTH
+    return PREPARED_DEPTH if decode_image(files.depths[0]).dtype == np.uint8 else C3VD_DEPTH
 
 
 def _map_points(cloud: Path | None, params: EndoGslamParams | None, poses: SequencePoses) -> PointCloud:
@@ -347,10 +348,9 @@ def _map_points(cloud: Path | None, params: EndoGslamParams | None, poses: Seque
         vertices = read_vertices(cloud, ("x", "y", "z", *names))
         positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
         shares = SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
-    elif params is not None:
-        positions, shares = params.means, params.rgb_colors
     else:
-        raise TypeError("there is no map to take points from")
+        assert params is not None
+        positions, shares = params.means, params.rgb_colors
     colors = np.rint(255.0 * np.clip(np.nan_to_num(shares), 0.0, 1.0)).astype(np.uint8)
     if poses.from_slam is not None:
         positions = positions @ poses.from_slam[:3, :3].T + poses.from_slam[:3, 3]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,30 +74,16 @@ class ColmapLens(MappedLens):
 
 
 @dataclass(frozen=True, eq=False)
-class RegisteredImage:
-    """A registered image, its name relative to the folder of images, and COLMAP's ID of its camera.
-
-    ``observed`` are keypoints, pixels, centres at integers + 0.5; ``points`` their rows of
-    :attr:`SparseModel.positions`.
-    """
-
-    name: str
-    camera: int
-    observed: Float[np.ndarray, "K 2"]
-    points: Int[np.ndarray, "K"]
-
-
-@dataclass(frozen=True, eq=False)
 class SparseModel:
     """A sparse model, in its own world frame and unit: poses with OpenCV axes, RGB colours.
 
-    Images are in natural order of their names, 2 before 10; cameras by COLMAP's ID; ``track_lengths`` count
-    observations.
+    Images are in natural order of their names, 2 before 10, and their ``points`` are rows of ``positions``; cameras by
+    COLMAP's ID; ``track_lengths`` count observations.
     """
 
     folder: Path
     files: tuple[Path, ...]  # of cameras, images and points
-    images: Sequence[RegisteredImage]
+    images: Sequence[colmap_files.ColmapImage]
     camera_to_world: Float[np.ndarray, "N 4 4"]
     cameras: Mapping[int, ColmapLens]
     positions: Float[np.ndarray, "P 3"]
@@ -141,8 +127,7 @@ def read_model(folder: Path) -> SparseModel:
             )
         if image.camera not in cameras:
             raise InputError(f"{files[0]} has no camera {image.camera}, which {name} is of", "all cameras of the model")
-        observed = np.array([rows[number] for number in image.points.tolist()], np.int64)
-        images.append(RegisteredImage(name, image.camera, image.observed, observed))
+        images.append(replace(image, points=np.array([rows[number] for number in image.points.tolist()], np.int64)))
     used = sorted({image.camera for image in images})
     return SparseModel(
         folder,
@@ -330,7 +315,7 @@ class ColmapDataManager(RecordedDataManager):
     def _sparse_depth(
         self,
         model: SparseModel,
-        image: RegisteredImage,
+        image: colmap_files.ColmapImage,
         camera_to_world: np.ndarray,
         rectification: Rectification,
     ) -> tuple[SparseDepth | None, int]:

@@ -32,7 +32,7 @@ class DepthFormat(ABC):
 
 @dataclass(frozen=True)
 class DepthSteps(DepthFormat):
-    """Integers proportional to z-depth."""
+    """Numbers proportional to z-depth, unknown where they are not positive: an image of whole steps."""
 
     size: float  # scene units per step
     bits: int = 16  # 8 or 16
@@ -44,8 +44,11 @@ class DepthSteps(DepthFormat):
 
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
-        depth = (stored * self.size).astype(np.float32)
-        depth[(stored == 0) if self.far is None else (stored == 0) | (stored == self.far)] = np.nan
+        with np.errstate(over="ignore"):
+            depth = (stored * self.size).astype(np.float32)
+        depth[~(np.isfinite(stored) & (stored > 0))] = np.nan
+        if self.far is not None:
+            depth[stored == self.far] = np.nan
         return depth
 
     def clipped_at(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
@@ -59,11 +62,8 @@ class DepthSteps(DepthFormat):
 C3VD_DEPTH = DepthSteps(100.0 / 65535.0, 16, 65535)
 
 
-@dataclass(frozen=True)
-class DepthArray(DepthFormat):
+class DepthArray(DepthSteps):
     """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown."""
-
-    size: float  # scene units per stored unit
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
@@ -75,13 +75,6 @@ class DepthArray(DepthFormat):
         if array.ndim != 2 or not array.size or not real:
             raise InputError(f"{path} is an array {list(array.shape)} of {array.dtype}", expected)
         return np.asarray(array)
-
-    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`."""
-        with np.errstate(over="ignore"):
-            depth = (stored * self.size).astype(np.float32)
-        depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
-        return depth
 
 
 def depth_format(path: Path, size: float) -> DepthFormat:

@@ -11,14 +11,16 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, kind_of
 
 
-def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]:
-    """Read a one-channel image of 8 or 16 bits, as stored; ``expected`` is the kind of file, for errors."""
+def read_gray(path: Path, bits: int, expected: str, channels_repeat: bool = False) -> Shaped[np.ndarray, "H W"]:
+    """Read a one-channel image of 8 or 16 bits, as stored; ``expected`` is the kind of file, for errors.
+
+    ``channels_repeat`` tells whether it may have three equal channels instead.
+    """
     image = decode_image(path)
-    _check_gray(path, image, bits, expected)
-    return image
-
-
-def _check_gray(path: Path, image: np.ndarray, bits: int, expected: str) -> None:
+    if channels_repeat and image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.dtype(f"uint{bits}"):
+        if not (image == image[..., :1]).all():
+            raise InputError(f"{path} is a colour image", expected, "Convert it")
+        image = image[..., 0]
     if image.dtype != np.dtype(f"uint{bits}") or image.ndim != 2:
         lost = image.dtype == np.uint8 and bits == 16
         raise InputError(
@@ -26,11 +28,7 @@ def _check_gray(path: Path, image: np.ndarray, bits: int, expected: str) -> None
             expected,
             "Use the original file: depth converted to 8 bits has lost 0.4 mm" if lost else "Convert it",
         )
-
-
-def bits_of(path: Path) -> int:
-    """Bits per channel of an image file."""
-    return 8 * decode_image(path).itemsize
+    return image
 
 
 def size_of(path: Path) -> tuple[int, int]:
@@ -41,15 +39,7 @@ def size_of(path: Path) -> tuple[int, int]:
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
     """Read an 8-bit mask, of one channel or of three equal ones: True where it is not black."""
-    image = decode_image(path)
-    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
-        if not (image == image[..., :1]).all():
-            raise InputError(
-                f"{path} is a colour image", "an 8-bit mask: one channel, or three equal ones", "Convert it"
-            )
-        image = image[..., 0]
-    _check_gray(path, image, 8, "an 8-bit mask: one channel, or three equal ones")
-    return np.asarray(image > 0)
+    return np.asarray(read_gray(path, 8, "an 8-bit mask: one channel, or three equal ones", channels_repeat=True) > 0)
 
 
 def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:

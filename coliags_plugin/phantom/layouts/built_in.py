@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt16
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points
 from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import Lens
@@ -21,6 +21,9 @@ from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, writ
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder
+
+if TYPE_CHECKING:
+    import pycolmap
 
 #: The largest number of 16 bits.
 _LAST = 65_535
@@ -66,6 +69,35 @@ def depth_steps(
     known = np.isfinite(z_depth) & (z_depth > 0.0)
     steps = np.maximum(np.rint(np.where(known, z_depth, 0.0) * per_mm), 1)
     return np.where(known, np.where(steps > _LAST, beyond, steps), 0).astype(np.uint16)
+
+
+class SeenPoints(NamedTuple):
+    """Observations of a model's points, by index from 0, in one image; pixel centres at integers + 0.5."""
+
+    pixels: Float[np.ndarray, "K 2"]
+    points: Int[np.ndarray, "K"]
+
+
+def add_points(
+    model: pycolmap.Reconstruction,
+    seen: Sequence[SeenPoints],
+    positions: Float[np.ndarray, "N 3"],
+    colors: UInt8[np.ndarray, "N 3"],
+) -> None:
+    """Add points, in scene units, to a model of posed images; point k gets COLMAP's ID k + 1.
+
+    ``seen`` are the observations of each image; image i has ID i + 1.
+    """
+    import pycolmap
+
+    tracks = [pycolmap.Track() for _ in range(len(positions))]
+    for number, here in enumerate(seen, start=1):
+        model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in here.pixels])
+        for index, point in enumerate(here.points):
+            tracks[point].add_element(number, index)
+    for position, track, color in zip(positions, tracks, colors, strict=True):
+        model.add_point3D(position, track, color)
+    model.update_point_3d_errors()
 
 
 class ColmapLayout(Layout):

@@ -15,7 +15,7 @@ import torch
 from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.findings import findings_of
-from coliags_plugin.checks.data.matches import FrameMatches, epipolar_agreement, follow, match, supported
+from coliags_plugin.checks.data.matches import FrameMatches, match, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.checks.data.reprojection import CHANGES, Pair, agreement, best_scale
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -345,12 +345,6 @@ def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
     assert "nothing suspect" in capsys.readouterr().out
 
 
-def test_matches_lie_on_their_lines(scene):
-    matches = match(video_pairs(scene.train))
-    assert epipolar_agreement(matches).error < 1.0
-    assert epipolar_agreement(matches, "no motion") is None
-
-
 def test_matches_that_opencv_cannot_explain_are_none(scene, monkeypatch):
     def degenerate(*_):
         raise cv2.error("-215:Assertion failed")
@@ -394,12 +388,6 @@ def test_where_features_contradict_right_poses_points_are_followed(scene, monkey
     assert (check.findings, check.matched_by) == ([], "tracks")
     monkeypatch.setattr("coliags_plugin.checks.data.check.follow", lambda stretches, progress: [])
     assert "images do not agree with the poses" in whats(changed(scene, depth=lambda depth: None))
-
-
-def test_points_are_followed_through_frames(scene):
-    matches = follow([scene.video[:3], scene.video[4:6]])
-    assert [(pair.source.index, pair.target.index) for pair in matches] == [(0, 2), (4, 5)]
-    assert epipolar_agreement(matches).error < 0.5
 
 
 @pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
