@@ -83,7 +83,7 @@ class SparseModel:
 
     folder: Path
     files: tuple[Path, ...]  # of cameras, images and points
-    images: Sequence[colmap_files.ColmapImage]
+    images: Sequence[colmap_poses.ColmapImage]
     camera_to_world: Float[np.ndarray, "N 4 4"]
     cameras: Mapping[int, ColmapLens]
     positions: Float[np.ndarray, "P 3"]
@@ -315,7 +315,7 @@ class ColmapDataManager(RecordedDataManager):
     def _sparse_depth(
         self,
         model: SparseModel,
-        image: colmap_files.ColmapImage,
+        image: colmap_poses.ColmapImage,
         camera_to_world: np.ndarray,
         rectification: Rectification,
     ) -> tuple[SparseDepth | None, int]:
