@@ -65,7 +65,7 @@ def write_sequence(folder: Path, frames: int, width: int, height: int) -> Path:
 
 def load(scene: Path, keep_pixels: bool) -> tuple[float, float, float, float]:
     """Resident memory before reading and at the peak, MiB; and seconds of reading, elapsed and of the processor."""
-    from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
+    from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 
     before = peak_mib()
     clocks = (time.perf_counter, time.process_time)

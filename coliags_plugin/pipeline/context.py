@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.datamanagers.colmap.reader import find_models
+from coliags_plugin.datamanagers.colmap import find_models
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frames import read_blurred
 from coliags_plugin.pipeline.settings import ReconstructionSettings

@@ -13,7 +13,7 @@ from urllib.parse import quote
 from markupsafe import escape
 
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
+from coliags_plugin.datamanagers.atlas import AtlasRecord, read_atlas
 from coliags_plugin.pipeline.context import LARGEST, Submap
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
 from coliags_plugin.pipeline.training_stages import PICTURES, SCENE

@@ -12,7 +12,7 @@ from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager
+from coliags_plugin.datamanagers.c3vd import C3VDDataManager
 from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 

@@ -20,7 +20,7 @@ READ = """if True:
     from coliags_plugin.core.decoder_messages import separate_stderr
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.core.images import decode_image
-    from coliags_plugin.datamanagers.rotatecolon.reader import read_exr_channel
+    from coliags_plugin.datamanagers.rotatecolon import read_exr_channel
     separate_stderr()
     logging.basicConfig(format="log: %(message)s")
     for path in map(Path, sys.argv[1:]):

@@ -17,9 +17,8 @@ from pydantic import ValidationError
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud, Scene
-from coliags_plugin.datamanagers.c3vd.reader import C3VDSettings
-from coliags_plugin.datamanagers.c3vd_v2.reader import CANDIDATE_LENS, ORDER, read_camera_intrinsics
-from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings, read_camera_intrinsics
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.built_in import depth_steps
 from tests.datamanagers.kinds import write

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH
+from coliags_plugin.datamanagers.c3vd_endogslam import PREPARED_DEPTH
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, wxyz_from_rotations
 from coliags_plugin.phantom.layouts.built_in import depth_steps, write_poses
 from tests.datamanagers.kinds import change_npz, files, remove

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.colmap.reader import find_models, read_model
+from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
 from coliags_plugin.datamanagers.units import write_unit

@@ -14,7 +14,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.rotatecolon.reader import ExrDepth, read_exr_channel
+from coliags_plugin.datamanagers.rotatecolon import ExrDepth, read_exr_channel
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained

@@ -15,10 +15,9 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers import stored_frames
-from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.reading.files import parallel_map
-from coliags_plugin.datamanagers.stored_frames import StoredFrame
+from coliags_plugin.datamanagers.reading.images import DepthSteps
+from coliags_plugin.datamanagers.recording import StoredFrame
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses
 
 
@@ -39,14 +38,14 @@ def reads(monkeypatch):
 
         return call
 
-    monkeypatch.setattr(stored_frames, "read_rgb", counted(stored_frames.read_rgb))
+    monkeypatch.setattr(recording, "read_rgb", counted(recording.read_rgb))
     monkeypatch.setattr(DepthSteps, "read", counted(DepthSteps.read))
     return read
 
 
 def frame_of(folder: Path, index: int, keep: bool = True) -> StoredFrame:
-    recording = manager("c3vd").open(folder)
-    return StoredFrame(replace(recording.shots[index], seen=recording.seen["video"].get(index)), index, keep)
+    found = manager("c3vd").open(folder)
+    return StoredFrame(replace(found.shots[index], seen=found.seen["video"].get(index)), index, keep)
 
 
 load = partial(load_scene, "c3vd")

@@ -8,7 +8,7 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.datamanagers.c3vd_endogslam.reader import OPTIMIZED, PARAMS, PREPARED_DEPTH, PREPARED_PINHOLE, SH0
+from coliags_plugin.datamanagers.c3vd_endogslam import OPTIMIZED, PARAMS, PREPARED_DEPTH, PREPARED_PINHOLE, SH0
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse

@@ -8,7 +8,7 @@ import numpy as np
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.reim_nerf.reader import C3VD_RANGE, MASK_FILE, PARTS, ray_cosines
+from coliags_plugin.datamanagers.reim_nerf import C3VD_RANGE, MASK_FILE, PARTS, ray_cosines
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.files import write_json
-from coliags_plugin.datamanagers.colmap.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.datamanagers.atlas import ATLAS_FILE, read_atlas
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table, write_index
 from coliags_plugin.pipeline.stages import StageRecord

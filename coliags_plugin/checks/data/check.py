@@ -12,8 +12,19 @@ import numpy as np
 from coliags_plugin.checks.data import facts
 from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
-from coliags_plugin.checks.data.matches import EpipolarAgreement, FrameMatches, epipolar_agreement, follow, match
-from coliags_plugin.checks.data.reprojection import CHANGES, Agreement, BestScale, Pair, agreement, best_scale
+from coliags_plugin.checks.data.hypotheses import (
+    CHANGES,
+    Agreement,
+    BestScale,
+    EpipolarAgreement,
+    FrameMatches,
+    Pair,
+    agreement,
+    best_scale,
+    epipolar_agreement,
+    follow,
+    match,
+)
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene

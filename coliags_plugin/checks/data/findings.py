@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from coliags_plugin.checks.data.matches import EpipolarAgreement
-from coliags_plugin.checks.data.reprojection import ADVICE, GIVEN, NO_MOTION, Agreement, BestScale
+from coliags_plugin.checks.data.hypotheses import ADVICE, GIVEN, NO_MOTION, Agreement, BestScale, EpipolarAgreement
 from coliags_plugin.core.json_files import JsonObject
 
 #: Largest median depth difference of agreeing frames, relative to the depth, if it is true; and if it is estimated: two

@@ -11,7 +11,7 @@ import torch
 from coliags_plugin.checks.data.check import SceneCheck, is_estimated
 from coliags_plugin.checks.data.facts import angle_across
 from coliags_plugin.checks.data.findings import Finding
-from coliags_plugin.checks.data.reprojection import LEAST_CONFIDENCE, warp_image
+from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.charts import Series

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.colmap.atlas import AtlasRecord, read_atlas
+from coliags_plugin.datamanagers.atlas import AtlasRecord, read_atlas
 from coliags_plugin.datamanagers.units import Unit
 from coliags_plugin.pipeline.frames import IMAGES, MADE, FramesRecord
 from coliags_plugin.pipeline.page import SubmapResults, results_of

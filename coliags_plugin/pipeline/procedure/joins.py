@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.datamanagers.colmap.reader import find_models
+from coliags_plugin.datamanagers.colmap import find_models
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
 from coliags_plugin.pipeline.procedure.record import SegmentJoin
 

@@ -11,9 +11,9 @@ from jaxtyping import Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import first_few
-from coliags_plugin.datamanagers.rotatecolon.reader import read_exr_channel
+from coliags_plugin.datamanagers.reading.images import depth_format
+from coliags_plugin.datamanagers.rotatecolon import read_exr_channel
 from coliags_plugin.reconstruction.depth.views import Map, Mask
 from coliags_plugin.reconstruction.structure.matching import Pose
 

@@ -15,12 +15,11 @@ import torch
 from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.findings import findings_of
-from coliags_plugin.checks.data.matches import FrameMatches, match, supported
+from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, match, supported
 from coliags_plugin.checks.data.page import check_page
-from coliags_plugin.checks.data.reprojection import CHANGES, Pair, agreement, best_scale
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
-from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
 from tests.scenes import write_c3vd_scene

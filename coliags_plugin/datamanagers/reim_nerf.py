@@ -16,8 +16,7 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
+from coliags_plugin.datamanagers.reading.images import DepthFormat, read_gray, read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint, make_shots
 from coliags_plugin.datamanagers.scene_settings import SceneSettings

@@ -16,9 +16,9 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.atlas import model_unit, read_atlas
+from coliags_plugin.datamanagers.atlas import model_unit, read_atlas
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth_formats import depth_format
+from coliags_plugin.datamanagers.reading.images import depth_format
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications

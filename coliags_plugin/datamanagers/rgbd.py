@@ -19,8 +19,7 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
-from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.images import DepthSteps, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings

@@ -21,8 +21,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
-from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH, DepthSteps, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import (
     ROTATION,

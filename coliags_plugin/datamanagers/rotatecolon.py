@@ -21,10 +21,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio.reader import camera_of
-from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
+from coliags_plugin.datamanagers.nerfstudio import camera_of
 from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder, required_file
-from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.images import DepthFormat, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import ROTATION, Recording, Shot, find_seen_masks, fingerprint, make_shots
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings

@@ -1,0 +1,352 @@
+"""C3VD (Bobrow et al., 2023) and C3VDv2: posed colonoscopy of silicone phantoms (docs/layouts/c3vd.md, c3vd-v2.md)."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from abc import abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import read_text
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading import files as reading
+from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import (
+    ROTATION,
+    Recording,
+    Shot,
+    find_seen_masks,
+    fingerprint,
+    make_shots,
+    poses_of_images,
+)
+from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens, PinholeLens, octagon_mask
+from coliags_plugin.geometry.poses import c3vd as c3vd_poses
+
+log = logging.getLogger(__name__)
+
+LAYOUTS = (
+    "the raw release (NNNN_color.png, NNNN_depth.tiff and pose.txt in one folder) "
+    "or the undistorted layout (images/, depths/, camera_pose.txt and camera.json)"
+)
+
+
+@dataclass(frozen=True)
+class SequenceFiles:
+    """The files of one sequence in the layout ``kind``, frame 0 first; depth of all frames or None."""
+
+    kind: str
+    folder: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: Path
+    camera: Path | None = None
+
+
+class SequenceDataManager(RecordedDataManager):
+    """Base class; subclasses find the files and define the rectification.
+
+    A sub-folder ``rotation`` in the same layout becomes the test set of that name. ``seen/NNNN_seen.png`` in it, and
+    ``truth/seen/NNNN_seen.png`` beside the sequence, are the seen masks for :attr:`seen_split`.
+    """
+
+    @abstractmethod
+    def find(self, folder: Path) -> SequenceFiles:
+        """Find the files of the sequence in a folder."""
+
+    @abstractmethod
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
+        """The rectification of a sequence's images, and its provenance."""
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        files = self.find(path)
+        shots, facts = self._shots(files)
+        test_sets, seen = {}, {"video": find_seen_masks(path / "truth", len(shots))}
+        if (path / ROTATION).is_dir():
+            rotation = self.find(path / ROTATION)
+            test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, f"{ROTATION}-")
+            seen[ROTATION] = find_seen_masks(path / ROTATION, len(rotation.images))
+        points = path / POINTS_FILE
+        return Recording(
+            kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
+            shots=shots,
+            facts=facts,
+            fingerprint=fingerprint(path, (*files.images, *(files.depths or ())), (files.poses, files.camera)),
+            test_sets=test_sets,
+            own_points=(lambda: load_points(points)) if points.is_file() else None,
+            points_source=points,
+            seen=seen,
+        )
+
+    def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
+        """The rectification of raw frames like ``image``, optionally masked outside the octagon."""
+        lens = whole_frame(lens, image)
+        shows = octagon_mask(lens.width, lens.height) if mask else None
+        return self.rectification_of(lens, image, shows)
+
+    def _shots(self, files: SequenceFiles, prefix: str = "") -> tuple[list[Shot], dict[str, Any]]:
+        poses = poses_of_images(files.poses, len(files.images))
+        rectification, described = self.rectification(files)
+        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, C3VD_DEPTH, prefix)
+        facts: dict[str, Any] = {
+            "layout": files.kind,
+            **described,
+            **rectification.facts(),
+            "pose_convention": {"order": poses.convention, **poses.evidence},
+        }
+        return shots, facts
+
+
+class C3VDSettings(SceneSettings):
+    """Options of the ``c3vd`` data manager."""
+
+    lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
+        "omnidirectional",
+        description="Lens model to undistort raw frames: 'omnidirectional': that of the rendered ground truth; "
+        "'legacy-pinhole': used for most published numbers, and wrong by degrees (docs/layouts/c3vd.md 2); 'fisheye': "
+        "REIM-NeRF's.",
+    )
+    mask: bool = Field(True, description="Ignore pixels outside the octagon of raw frames.")
+
+
+class C3VDDataManager(SequenceDataManager):
+    """Reads a C3VD sequence in the raw or the undistorted layout.
+
+    See docs/layouts/c3vd.md 1 and 3, and :class:`SequenceDataManager` for test views beside the sequence.
+    """
+
+    Settings = C3VDSettings
+
+    settings: C3VDSettings
+    name = "c3vd"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        if (path / "camera_pose.txt").is_file() and (path / "images").is_dir():
+            return "camera_pose.txt beside images/"
+        if (path / "pose.txt").is_file() and next(path.glob("*_color.png"), None) is not None:
+            return "pose.txt beside NNNN_color.png"
+        return None
+
+    def find(self, folder: Path) -> SequenceFiles:
+        """See :class:`SequenceDataManager`; ``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
+        reading.require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
+        raw = [path for path in folder.iterdir() if re.fullmatch(r"\d+_color\.png", path.name)]
+        camera = None
+        if raw and (folder / "images").is_dir():
+            raise InputError(
+                f"{folder} holds both {raw[0].name} and images/",
+                "one sequence in one layout",
+                "Move one of the two to its own folder",
+            )
+        if raw:
+            kind, poses = "raw", folder / "pose.txt"
+            images = reading.numbered(folder, "color", frozenset({".png"}))
+            depths = reading.numbered(folder, "depth", reading.TIFF_SUFFIXES)
+        elif (folder / "images").is_dir():
+            kind, poses, camera = "undistorted", folder / "camera_pose.txt", folder / "camera.json"
+            images = reading.numbered(folder / "images", "color", reading.IMAGE_SUFFIXES)
+            depths = reading.numbered(folder / "depths", "depth", reading.DEPTH_SUFFIXES)
+        else:
+            do = "Name the sequence's own folder, for instance cecum_t1_a"
+            raise InputError(f"{folder} holds {reading.inventory(folder)}", LAYOUTS, do)
+        if not images:
+            raise InputError(
+                f"{folder / 'images'} holds {reading.inventory(folder / 'images')}", "<number>_color.png files"
+            )
+        for path in filter(None, (poses, camera)):
+            if not path.is_file():
+                raise InputError(f"{folder} has images but no {path.name}", LAYOUTS, f"Add {path.name}")
+        return SequenceFiles(kind, folder, *reading.paired(folder, images, depths), poses, camera)
+
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
+        """See :class:`SequenceDataManager`."""
+        settings = self.settings
+        raw = files.camera is None
+        facts = {
+            "lens": settings.lens if raw else None,
+            "focal_scale": settings.focal_scale if raw else None,
+            "mask": "octagon" if raw and settings.mask else None,
+        }
+        if files.camera is not None:
+            return self.rectification_of(PinholeLens.of(reading.read_intrinsics(files.camera)), files.camera), facts
+        return self.octagon_rectification(LENSES[settings.lens], files.images[0], settings.mask), facts
+
+
+#: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is
+#: what v2 was probably rendered with, and unverified (docs/layouts/c3vd-v2.md 2). It counts pixel centres at integers:
+#: hence + 0.5.
+CANDIDATE_LENS = OmnidirectionalLens(
+    width=1350,
+    height=1080,
+    cx=677.739464094188 + 0.5,
+    cy=543.057997844875 + 0.5,
+    a0=767.733695862103,
+    a2=-0.000592506426558248,
+    a3=-2.69440266600040e-07,
+    a4=-2.16380341010063e-10,
+    c=1.0,
+    d=0.0,
+    e=0.0,
+)
+
+#: Order of the model's parameters on C3VD's page.
+ORDER = ("width", "height", "cx", "cy", "a0", "a1", "a2", "a3", "a4", "c", "d", "e")
+_NEEDED = frozenset({"cx", "cy", "a0", "a2", "a3", "a4"})
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NAMED = re.compile(rf"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*({_NUMBER.pattern})")
+
+
+def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
+    """Read a ``camera_intrinsics.txt``.
+
+    The file's format is not published. Two unambiguous ones are accepted: named numbers (``cx = 677.7``), or twelve
+    bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). The centre must be near
+    the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
+    """
+    text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
+    named, bare = _NAMED.findall(text), _bare(text)
+    if named:
+        values = _by_name(path, [(name.lower(), float(number)) for name, number in named])
+    elif bare is not None and len(bare) in (len(ORDER), len(ORDER) - 2):
+        values = dict(zip(ORDER[-len(bare) :], bare, strict=True))
+    else:
+        count = "text" if bare is None else f"{len(bare)} numbers"
+        raise _unclear(path, f"{count} without names")
+    width, height = values.pop("width", 1350.0), values.pop("height", 1080.0)
+    doubt = _doubt(values, width, height)
+    if doubt:
+        raise _unclear(path, doubt)
+    cx, cy, a0, a2, a3, a4, c, d, e = (values[name] for name in ORDER[2:] if name != "a1")
+    return OmnidirectionalLens(
+        width=round(width), height=round(height), cx=cx + 0.5, cy=cy + 0.5, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
+    )
+
+
+def _bare(text: str) -> list[float] | None:
+    """Numbers of a text; None if it holds anything else."""
+    words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
+    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else None
+
+
+def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
+    names = [name for name, _ in pairs]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    unknown = sorted(set(names) - set(ORDER))
+    missing = sorted(_NEEDED - set(names))
+    if repeated or unknown or missing:
+        faults = [
+            f"{what} {', '.join(listed)}"
+            for what, listed in (("no", missing), ("twice", repeated), ("unknown", unknown))
+            if listed
+        ]
+        raise _unclear(path, "; ".join(faults))
+    return {"a1": 0.0, "c": 1.0, "d": 0.0, "e": 0.0, **dict(pairs)}
+
+
+def _doubt(values: dict[str, float], width: float, height: float) -> str:
+    """Reason why a calibration is implausible for an omnidirectional colonoscope, or an empty string."""
+    if not all(map(math.isfinite, (*values.values(), width, height))) or min(width, height) < 1.0:
+        return f"an image of {width:g} x {height:g}, or numbers that are not finite"
+    off_middle = max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5))
+    doubts = {
+        f"an image of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
+        f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}": off_middle
+        > 0.1,
+        f"a focal length a0 = {values['a0']:g} for {width:g} pixels": not 0.2 < values["a0"] / width < 2.0,
+        f"a1 = {values['a1']:g}, which is 0 in this model": values["a1"] != 0.0,
+        f"c, d, e = {values['c']:g}, {values['d']:g}, {values['e']:g}, far from 1, 0, 0": max(
+            abs(values["c"] - 1.0), abs(values["d"]), abs(values["e"])
+        )
+        > 0.1,
+    }
+    return next((doubt for doubt, holds in doubts.items() if holds), "")
+
+
+def _unclear(path: Path, seen: str) -> InputError:
+    return InputError(
+        f"{path} is ambiguous or implausible: {seen}",
+        f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
+        "Rewrite it in this format, or --set datamanager.lens=v2 (an unverified candidate), or v1 (C3VD's own)",
+    )
+
+
+V2_LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
+#: Announced for the release; its location and format are not documented.
+INTRINSICS = "camera_intrinsics.txt"
+
+
+class C3VDv2Settings(SceneSettings):
+    """Options of the ``c3vd-v2`` data manager."""
+
+    lens: Literal["file", "v2", "v1"] = Field(
+        "file",
+        description="Lens calibration: 'file': from camera_intrinsics.txt, or 'v2' if it is missing; 'v2': a candidate "
+        "calibration, unverified (docs/layouts/c3vd-v2.md 2); 'v1': C3VD's omnidirectional.",
+    )
+    mask: bool = Field(True, description="Ignore pixels outside the octagon of the frames.")
+
+
+class C3VDv2DataManager(SequenceDataManager):
+    """Reads a C3VDv2 sequence; see docs/layouts/c3vd-v2.md.
+
+    Registered videos have depth; deformation and screening videos have images and poses only.
+    """
+
+    Settings = C3VDv2Settings
+
+    settings: C3VDv2Settings
+    name = "c3vd-v2"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        numbers = any(re.fullmatch(r"\d+", image.stem) for image in path.glob("rgb/*.png"))
+        if numbers and (path / "pose.txt").is_file() and c3vd_poses.recognise(path / "pose.txt"):
+            return "pose.txt (16 numbers a line) beside rgb/NNNN.png"
+        return None
+
+    def find(self, folder: Path) -> SequenceFiles:
+        """See :class:`SequenceDataManager`; ``camera`` is the intrinsics file, in it or up to two folders up."""
+        reading.require_folder(folder, f"a C3VDv2 sequence: {V2_LAYOUT}")
+        images = reading.numbered_images(folder / "rgb", "", V2_LAYOUT, "c1_cecum_t1_v1")
+        poses = folder / "pose.txt"
+        if not poses.is_file():
+            raise InputError(f"{folder} has images but no pose.txt", V2_LAYOUT, "Add pose.txt")
+        depths = reading.numbered(folder / "depth", "depth", reading.TIFF_SUFFIXES)
+        here = folder.resolve()
+        camera = next((path / INTRINSICS for path in (here, *here.parents[:2]) if (path / INTRINSICS).is_file()), None)
+        return SequenceFiles("c3vd-v2", folder, *reading.paired(folder, images, depths), poses, camera)
+
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
+        """See :class:`SequenceDataManager`."""
+        settings = self.settings
+        lens, source = self._lens(files)
+        facts = {
+            "lens": settings.lens,
+            "lens_source": source,
+            "focal_scale": settings.focal_scale,
+            "mask": "octagon" if settings.mask else None,
+        }
+        return self.octagon_rectification(lens, files.images[0], settings.mask), facts
+
+    def _lens(self, files: SequenceFiles) -> tuple[Lens, str]:
+        """The lens and the source of its calibration."""
+        if self.settings.lens == "v1":
+            return LENSES["omnidirectional"], "C3VD's omnidirectional calibration"
+        if self.settings.lens == "file" and files.camera is not None:
+            return read_camera_intrinsics(files.camera), str(files.camera)
+        if self.settings.lens == "file" and files.folder.name != ROTATION:
+            log.warning("%s: no %s, so the lens is an unverified candidate (lens: v2)", files.folder, INTRINSICS)
+        return CANDIDATE_LENS, "candidate calibration, unverified"

@@ -1,1 +1,0 @@
-"""C3VD: the raw release and the undistorted layout."""

@@ -1,1 +1,0 @@
-"""C3VD as EndoGSLAM prepared it, and PR-Endo's release."""

@@ -1,1 +1,0 @@
-"""The C3VDv2 dataset."""

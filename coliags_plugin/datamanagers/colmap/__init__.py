@@ -1,1 +1,0 @@
-"""COLMAP models and their images."""

@@ -1,1 +1,0 @@
-"""nerfstudio's ``transforms.json`` format."""

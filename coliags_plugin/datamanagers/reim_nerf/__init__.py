@@ -1,1 +1,0 @@
-"""REIM-NeRF's processed C3VD."""

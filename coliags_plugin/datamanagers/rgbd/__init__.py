@@ -1,1 +1,0 @@
-"""TUM RGB-D: images, depth and a trajectory."""
