@@ -1,4 +1,4 @@
-"""C3VD (Bobrow et al., 2023) and C3VDv2: posed colonoscopy of silicone phantoms (docs/layouts/c3vd.md, c3vd-v2.md)."""
+"""C3VD (Bobrow et al., 2023) and C3VDv2, posed colonoscopy of silicone phantoms (docs/layouts/c3vd.md)."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers import recording
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.reading.images import DepthSteps
 from coliags_plugin.datamanagers.recording import StoredFrame
