@@ -1,10 +1,11 @@
-"""Sub-maps of a video: weak places, parts of models, tests by held-out tracks, and what is written."""
+"""Sub-maps of a video: weak places, parts of models, tests by held-out tracks, rigidity, and what is written."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,12 +16,14 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.reconstruction.structure import joining, sfm
+from coliags_plugin.reconstruction.structure import adjustment, joining, sfm
 from coliags_plugin.reconstruction.structure.adjustment import (
     TEST_EVERY,
     Rays,
     adjust,
     held_out_error,
+    rigid_frames,
+    rigidity,
     widest_between,
 )
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
@@ -296,3 +299,48 @@ def test_the_angle_between_two_rays():
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     found = widest_between(rays, np.array([0, 0, 1]), 2)
     np.testing.assert_allclose(found, [np.degrees(2.0 * np.arctan(2.0 / 30.0)), 0.0], atol=1e-9)
+
+
+def measured(noise=0.0, speed=0.0):
+    """Of points seen with noise, px, each moving through the image in a direction of its own, px a frame."""
+    model, observed = seen_points()
+    rng = np.random.default_rng(0)
+    motion = speed * rng.normal(0.0, 1.0, (len(model.points3D) + 1, 2))
+    tracks = []
+    for index, points in enumerate(observed):
+        moved = points.pixels + rng.normal(0.0, noise, points.pixels.shape) + index * motion[points.points]
+        tracks.append(frame_points(points.points, moved))
+    return rigidity(model, tracks)
+
+
+def test_a_rigid_scene_is_one_to_the_noise():
+    assert set(measured()) == {1, 2}  # farther apart too few points are common
+    assert max(measured().values()) < 1e-3
+    noisy = measured(noise=0.5)
+    # Both ends of a track are noisy, and a part of the distance to the line is fitted: 0.67 times the deviation.
+    assert noisy[1] == pytest.approx(0.34, rel=0.4)
+    assert noisy[2] == pytest.approx(noisy[1], rel=0.5)
+
+
+def test_a_moving_scene_is_farther_off_the_longer_it_moves():
+    moving = measured(speed=1.0)
+    assert moving[1] > 0.3
+    assert moving[2] > 1.4 * moving[1]
+
+
+@pytest.mark.parametrize(
+    ("residuals", "frames"),
+    [
+        ({}, None),
+        ({1: 0.4, 2: 0.8, 4: 1.0, 8: 1.19}, None),
+        # 1.2 px, three times that of neighbours, are reached at 10 frames, which lie on either side of the middle one.
+        ({1: 0.4, 4: 0.9, 8: 1.0, 12: 1.4, 16: 1.0}, 21),
+        ({1: 0.1, 4: 0.3, 8: 0.69}, None),  # below 0.7 px, 0.007 of the focal length, whatever neighbours have
+        ({2: 0.1, 4: 0.6, 8: 0.8}, 13),
+        ({2: 2.0, 4: 9.0}, 7),
+    ],
+)
+def test_a_model_is_as_long_as_what_it_shows_is_rigid(residuals, frames, monkeypatch):
+    monkeypatch.setattr(adjustment, "rigidity", lambda model, tracks: residuals)
+    camera = pycolmap.Camera(model="PINHOLE", width=160, height=128, params=[100.0, 100.0, 80.0, 64.0])
+    assert rigid_frames(SimpleNamespace(cameras={1: camera}), ()) == frames
