@@ -8,16 +8,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d
 import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.phantom.colon import WAVE_LENGTH, WAVE_SPEED, breathing, peristalsis, wall_motion
 from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
 from coliags_plugin.phantom.imaging import Sensor
 from coliags_plugin.phantom.props import Cover
 from coliags_plugin.phantom.settings import IN_VIVO, PhantomSettings, phantom_settings
+from coliags_plugin.phantom.tracing import Tracer
 from coliags_plugin.phantom.trajectory import poses_between, poses_during, rotation
 from tests.phantom.phantom_layouts import TINY
 
@@ -69,9 +71,9 @@ def test_a_motion_of_zero_leaves_the_wall_to_the_bit(living):
 
 
 def test_depth_is_that_of_the_moved_wall_that_the_files_tell(written):
-    mesh = open3d.io.read_triangle_mesh(str(written / "truth" / "mesh.ply"))
+    mesh = read_mesh(written / "truth" / "mesh.ply")
     motion = np.load(written / "truth" / "wall_motion.npz")
-    rest = np.asarray(mesh.vertices).reshape(motion["radial"].shape)
+    rest = mesh.vertices.astype(float).reshape(motion["radial"].shape)
     poses = np.load(written / "truth" / "camera_to_world.npy")
     k = json.loads((written / "camera.json").read_text())
     lens = PinholeLens(k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5, k["w"], k["h"])
@@ -80,12 +82,8 @@ def test_depth_is_that_of_the_moved_wall_that_the_files_tell(written):
     gaps = []
     for frame in (0, 5):
         moved = rest + motion["wave_mm"][frame, :, None, None] * motion["radial"] + motion["shift_mm"][frame, :, None]
-        scene = open3d.t.geometry.RaycastingScene()
-        triangles = open3d.core.Tensor(np.asarray(mesh.triangles).astype(np.uint32))
-        scene.add_triangles(open3d.core.Tensor(moved.reshape(-1, 3).astype(np.float32)), triangles)
-        origins = np.broadcast_to(poses[frame, :3, 3], rays.shape)
-        cast = np.concatenate([origins, rays @ poses[frame, :3, :3].T], axis=1).astype(np.float32)
-        expected = scene.cast_rays(open3d.core.Tensor(cast))["t_hit"].numpy()
+        wall = TriangleMesh(moved.reshape(-1, 3), mesh.triangles)
+        _, expected = wall.rays.cast(poses[frame, :3, 3], rays @ poses[frame, :3, :3].T)
         stored = cv2.imread(str(written / "depths" / f"{frame:04d}_depth.png"), cv2.IMREAD_UNCHANGED)
         depth = stored.ravel() * (100.0 / 65535.0)
         near = expected < 99.0
@@ -175,18 +173,14 @@ def test_an_examination_turns_fast_and_touches_the_moving_wall():
     )
     phantom = prepared(settings)
     clear = [
-        open3d_clearance(phantom.motion.at(frame), pose) for frame, pose in enumerate(phantom.poses) if frame % 2 == 0
+        Tracer(phantom.motion.at(frame)).clearance(pose[None, :3, 3])[0]
+        for frame, pose in enumerate(phantom.poses)
+        if frame % 2 == 0
     ]
     assert 0.5 < min(clear) < 2.0 and np.median(clear) > 3.0
     relative = np.einsum("tji,tjk->tik", phantom.poses[:-1, :3, :3], phantom.poses[1:, :3, :3])
     angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(relative, axis1=1, axis2=2) - 1.0), -1.0, 1.0)))
     assert 8.0 < angle.max() < 30.0
-
-
-def open3d_clearance(surface, pose: np.ndarray) -> float:
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.core.Tensor(surface.vertices), open3d.core.Tensor(surface.triangles))
-    return float(scene.compute_distance(open3d.core.Tensor(pose[None, :3, 3].astype(np.float32))).numpy()[0])
 
 
 def test_a_wall_that_moves_over_the_camera_is_refused(monkeypatch):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import PinholeLens
-from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
+from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy, surface_of
 from coliags_plugin.phantom.imaging import Sensor, World, expose
 from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight, form_factors, make_patches, solve
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
@@ -32,24 +32,9 @@ def lamp(**changes) -> CameraLight:
 
 def grid_surface(grid: np.ndarray, normals: np.ndarray, tangents: np.ndarray) -> ColonSurface:
     """A mesh over a grid of points whose columns close upon themselves."""
-    rows, columns = grid.shape[:2]
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
-    following = (column + 1) % columns
-    a, b = row * columns + column, (row + 1) * columns + column
-    c, d = row * columns + following, (row + 1) * columns + following
-    triangles = np.stack([np.stack([a, b, c], -1), np.stack([d, c, b], -1)], axis=2).reshape(-1, 3)
-    along, across = np.gradient(grid, axis=0), 0.5 * (np.roll(grid, -1, 1) - np.roll(grid, 1, 1))
-    areas = np.linalg.norm(np.cross(along, across), axis=-1)
-    return ColonSurface(
-        vertices=grid.reshape(-1, 3).astype(np.float32),
-        normals=normals.reshape(-1, 3).astype(np.float32),
-        tangents=tangents.reshape(-1, 3).astype(np.float32),
-        triangles=triangles.astype(np.uint32),
-        areas=areas.ravel().astype(np.float32),
-        arc=np.arange(rows, dtype=float),
-        columns=columns,
-        row_length=1.0,
-    )
+    made = surface_of(grid, np.tile(np.eye(3), (len(grid), 1, 1)), np.arange(len(grid), dtype=float), 1.0)
+    normals, tangents = (vectors.reshape(-1, 3).astype(np.float32) for vectors in (normals, tangents))
+    return replace(made, normals=normals, tangents=tangents)
 
 
 def plane_at(z: float) -> ColonSurface:

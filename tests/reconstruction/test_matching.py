@@ -1,25 +1,31 @@
-"""Pairs of a video, and features matched by descriptors alone and along epipolar lines."""
+"""Pairs of a video, features matched by descriptors alone and along epipolar lines, and points followed through it."""
 
 from __future__ import annotations
 
 import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
 from coliags_plugin.reconstruction.structure.matching import (
     alike_pairs,
     epipolar_matches,
     mutual_matches,
 )
-from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
+from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
+from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
 
 #: Error, ratio and distance that leave the decision to the geometry.
 LOOSE = (1.0, 1.0, 2.0)
@@ -157,3 +163,118 @@ def test_the_middle_of_a_video_is_matched_too(count):
     gap = {later - earlier for earlier, later in itertools.pairwise(indices)}
     assert len(gap) == 1
     assert abs((indices[0] + indices[-1]) / 2 - (count - 1) / 2) <= 1.0
+
+
+#: Displacement of every pixel per frame, column and row.
+SHIFT = np.array([1.4, -0.7])
+COUNT = 7
+FEW = TrackSettings(corners=150)
+
+
+def wall(offset=(0.0, 0.0), size=(120, 160)):
+    """A textured wall, moved by an offset."""
+    noise = np.random.default_rng(0).normal(size=(60, 70)).cumsum(axis=0).cumsum(axis=1)
+    noise = (noise - noise.mean()) / noise.std()
+    grain = np.random.default_rng(1).normal(size=(60, 70))
+    row, column = np.mgrid[: size[0], : size[1]].astype(float)
+    at = np.stack([(row - offset[1]) / 3.0 + 8.0, (column - offset[0]) / 3.0 + 8.0])
+    value = 120.0 + 20.0 * map_coordinates(noise, at, order=3) + 15.0 * map_coordinates(grain, at, order=3)
+    return np.repeat(np.clip(value, 10, 230).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def write_video(folder, images):
+    folder.mkdir()
+    for index, image in enumerate(images):
+        write_png(folder / f"{index}.png", image)
+    return sorted(folder.iterdir())
+
+
+def moved(frames, first, second):
+    """Displacements of the points that two frames have in common."""
+    one, other = frames[first], frames[second]
+    _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
+    return other.pixels[b] - one.pixels[a]
+
+
+def test_points_move_as_the_image_does(tmp_path):
+    frames = track_points(write_video(tmp_path / "video", [wall(k * SHIFT) for k in range(COUNT)]), FEW)
+    assert [frame.followed > 80 for frame in frames] == [False] + [True] * (COUNT - 1)
+    shifts = moved(frames, 0, COUNT - 1)
+    assert len(shifts) > 60
+    np.testing.assert_allclose(np.median(shifts, axis=0), (COUNT - 1) * SHIFT, atol=0.1)
+    assert np.percentile(np.linalg.norm(shifts - (COUNT - 1) * SHIFT, axis=1), 90) < 0.5
+    assert frames[3].shift == pytest.approx(np.linalg.norm(SHIFT) / 160, rel=0.05)
+
+
+def test_larger_images_are_reduced_and_pixels_are_theirs_but_masked_ones(tmp_path):
+    paths = write_video(tmp_path / "video", [wall(k * SHIFT).repeat(2, axis=0).repeat(2, axis=1) for k in range(2)])
+    mask = np.ones((240, 320), bool)
+    mask[:, 240:] = False
+    frames, again = (track_points(paths, FEW.model_copy(update={"side": 160}), mask) for _ in range(2))
+    np.testing.assert_allclose(np.median(moved(frames, 0, 1), axis=0), 2 * SHIFT, atol=0.15)
+    assert all(frame.pixels[:, 0].max() < 240 for frame in frames)
+    np.testing.assert_array_equal(again[1].ids, frames[1].ids)
+    np.testing.assert_array_equal(again[1].pixels, frames[1].pixels)
+
+
+def test_points_are_found_again_behind_a_covered_frame(tmp_path):
+    images = [wall(k * SHIFT) for k in range(COUNT)]
+    images[3] = np.full_like(images[3], 90)
+    frames = track_points(write_video(tmp_path / "video", images), FEW)
+    assert frames[3].followed == 0
+    assert frames[3].sharpness == 0.0
+    shifts = moved(frames, 2, 4)
+    assert len(shifts) > 50
+    np.testing.assert_allclose(np.median(shifts, axis=0), 2 * SHIFT, atol=0.1)
+
+
+def test_the_lamp_drops_out_of_the_texture():
+    row = np.linspace(0.4, 1.0, 120)[:, None, None]
+    bright, dim = wall(), np.clip(wall() * row, 0, 255).astype(np.uint8)
+    inner = slice(20, -20)
+    for one, other in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
+        assert np.corrcoef(one[inner, inner].ravel(), other[inner, inner].ravel())[0, 1] > 0.95
+
+
+def test_points_that_fit_no_motion_are_outliers():
+    """Points of a tube, seen from two poses; a fifth of them moved elsewhere."""
+    first, second = tube_frames(2, 4.0)
+    rng = np.random.default_rng(0)
+    pixels = np.stack([rng.uniform(8, WIDTH - 8, 200), rng.uniform(8, HEIGHT - 8, 200)], axis=1)
+    fx, fy, cx, cy = INTRINSICS
+    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(200)], axis=1)
+    depth = first.depth.numpy()[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    one, other = (frame.camera.camera_to_world.double().numpy() for frame in (first, second))
+    local = ((rays * depth[:, None]) @ one[:3, :3].T + one[:3, 3] - other[:3, 3]) @ other[:3, :3]
+    moved_to = local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy)
+    wrong = np.arange(200) % 5 == 0
+    moved_to[wrong] += rng.choice([-25.0, 25.0], (wrong.sum(), 2))
+    inliers = epipolar_inliers(pixels - 0.5, moved_to - 0.5, (HEIGHT, WIDTH), 2.5)
+    assert inliers[~wrong].mean() > 0.95
+    assert inliers[wrong].mean() < 0.3
+    assert not epipolar_inliers(pixels[:14], moved_to[:14], (HEIGHT, WIDTH), 2.5).any()
+
+
+def test_long_videos_are_cut_where_few_points_are_followed():
+    followed = [0, *[300] * 99]
+    followed[40], followed[70] = 20, 30
+    empty = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    frames = [FramePoints(*empty, count, shift=0.0, sharpness=1.0, fineness=3.0) for count in followed]
+    names = tuple(map(str, range(100)))
+    video = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * 100, (), (), {}, tuple(frames))
+    assert video.windows(100) == [range(100)]
+    assert video.windows(80) == [range(40), range(40, 100)]
+    windows = video.windows(50)
+    assert windows[:2] == [range(40), range(40, 70)]
+    assert [frame for window in windows for frame in window] == list(range(100))
+    assert max(map(len, windows)) <= 50
+
+
+def test_fineness_is_that_of_a_known_blur():
+    """Of white noise blurred by s, Laplacians smoothed by t have a power in proportion to (s^2 + t^2)^-3."""
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (384, 384)).astype(np.float32)
+    for blur in (2.0, 3.0, 6.0):
+        image = cv2.GaussianBlur(noise, (0, 0), blur)
+        gray = np.clip(128.0 + 40.0 * image / image.std(), 20, 230).round().astype(np.uint8)
+        assert fineness(gray) == pytest.approx(((blur**2 + 16.0) / (blur**2 + 4.0)) ** 1.5, rel=0.1)
+        assert fineness(gray // 2) == pytest.approx(fineness(gray), rel=0.1)

@@ -20,6 +20,8 @@ from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
 from coliags_plugin.reconstruction.structure.sfm import (
@@ -51,6 +53,24 @@ def atlas(tube):
 @pytest.fixture(scope="module")
 def found(atlas):
     return atlas.largest
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    """A small phantom with enough texture for features."""
+    folder = tmp_path_factory.mktemp("phantom") / "scene"
+    settings = PhantomSettings(
+        frames=12,
+        width=200,
+        height=160,
+        rotation_views=0,
+        mesh_spacing=0.8,
+        texture_spacing=0.2,
+        interreflection=0.0,
+        supersampling=1,
+    )
+    generate(settings, folder)
+    return folder
 
 
 def share_of_path(trajectory, poses):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import pytest
@@ -11,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.lenses.models import LENSES, BrownLens, FisheyeLens
-from coliags_plugin.geometry.lenses.tabulated import MappedLens, OpenCVLens
+from coliags_plugin.datamanagers.colmap import ColmapLens
+from coliags_plugin.geometry.lenses.models import LENSES, BrownLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 
 SIZE = {"width": 1350, "height": 1080}
 VIEW = {"fx": 802.3, "fy": 790.1, "cx": 668.3, "cy": 547.7}
@@ -21,23 +20,6 @@ LENS = OpenCVLens(**SIZE, **VIEW, **FULL)
 MATRIX = LENS.pinhole.opencv_matrix()
 #: As cv2 orders them.
 BENDS = np.array(list(FULL.values()))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Copied(MappedLens):
-    """Another lens, of which only the way from directions to pixels is used, beyond its turning point too."""
-
-    of: BrownLens | FisheyeLens
-
-    @property
-    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
-        return self.of._calibrated_pinhole
-
-    def _bent(self, tangents):
-        radius = self.of._radius_of_tangent(np.linalg.norm(tangents, axis=1))
-        with np.errstate(invalid="ignore"):
-            ratio = np.where(radius > 0, self.of._bent(radius) / np.linalg.norm(tangents, axis=1), 1.0)
-        return tangents * ratio[:, None] * (self.of.fx, self.of.fy) + (self.of.cx, self.of.cy)
 
 
 def grid(step: int) -> np.ndarray:
@@ -101,7 +83,8 @@ def test_where_a_polynomial_turns_back_there_is_nothing(bends):
 
 def test_a_fisheye_is_followed_up_to_its_own_turning_point():
     closed = LENSES["fisheye"]
-    found = Copied(width=1350, height=1080, of=closed)
+    params = (closed.fx, closed.fy, closed.cx, closed.cy, closed.k1, closed.k2, closed.k3, closed.k4)
+    found = ColmapLens(width=1350, height=1080, model="OPENCV_FISHEYE", params=params)
     pixels = grid(17)
     expected, got = closed.unproject(pixels), found.unproject(pixels)
     np.testing.assert_array_equal(np.isnan(got), np.isnan(expected))

@@ -23,6 +23,7 @@ from coliags_plugin.geometry.meshes.truth import (
     sample_surface,
 )
 from tests.surface.coverage.tubes import plane as grid_square
+from tests.surface.coverage.tubes import sphere
 
 
 @pytest.fixture
@@ -222,11 +223,6 @@ COUNT = 40_000
 def plane(z: float = 0.0, size: float = 40.0) -> TriangleMesh:
     """A grid_square about the origin, in 20 x 20 cells."""
     return grid_square(z, size / 2, size / 20)
-
-
-def sphere(radius: float) -> TriangleMesh:
-    made = open3d.geometry.TriangleMesh.create_sphere(radius, 80)
-    return TriangleMesh(np.asarray(made.vertices, np.float32), np.asarray(made.triangles).astype(np.int64))
 
 
 def true(mesh: TriangleMesh, seen: np.ndarray | None = None) -> TrueSurface:
