@@ -406,6 +406,11 @@ def panoramic(_: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return model
 
 
+def with_intrinsics(text: str) -> Spoil:
+    """A camera of intrinsics.txt."""
+    return lambda folder: [remove("camera.json")(folder), write("intrinsics.txt", text)(folder)]
+
+
 def shorten(arrays: dict[str, np.ndarray]) -> None:
     """EndoGSLAM's result without its last frames."""
     arrays |= {key: arrays[key][..., :-2] for key in ("cam_unnorm_rots", "cam_trans")}
@@ -710,6 +715,17 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             change_lines("groundtruth.txt", lambda rows: [row.replace("13050", "13060") for row in rows]),
             r"no pose of .*groundtruth.txt is within 0.02 .*1305031102.000000 .*1306031102",
         ),
+        *(
+            (with_intrinsics(text), message)
+            for text, message in (
+                ("61 55 33", r"intrinsics.txt: '61 55 33'"),
+                ("61 55 33 x", r"intrinsics.txt: '61 55 33 x'"),
+                ("61 2 33 0 55 21 0 0 1", r"without skew"),
+                ("0 55 33 21", r"intrinsics.txt: '0 55 33 21'"),
+                ("48 47 39 32", r"principal point \(39, 32\) is far from the middle of .*png, 40 x 32"),
+                ("12 12 10 8", r"principal point \(10, 8\) is far from the middle"),
+            )
+        ),
         *((change_json("camera.json", depth_scale=scale), "depth_scale") for scale in (0, -5.0, "5000", True)),
         *(
             (change_json("camera.json", depth_scale=scale), "depth reaches from .* scene units")
@@ -766,8 +782,33 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             r"confidence/frame_00003\.png is 20 x 16, but .* says 40 x 32",
         ),
         (confident(dtype="uint16"), r"confidence/frame_00003\.png is an image of 1 channel of uint16.*255 = 1"),
-        (change_json("transforms.json", camera_model="PANORAMA"), "camera_model is PANORAMA"),
-        (change_json("transforms.json", k4=0.1), "OPENCV with k4 = 0.1"),
+        *(
+            (change_json("transforms.json", **content), message)
+            for content, message in (
+                ({"camera_model": "PANORAMA"}, "camera_model is PANORAMA"),
+                ({"k4": 0.1}, "OPENCV with k4 = 0.1"),
+                ({"camera_model": ["PINHOLE"]}, "camera_model is .'PINHOLE'."),
+                ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE with k1 = 0.1"),
+                ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE with p1 = 0.1"),
+                ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
+                ({"fl_x": None, "fl_y": None, "camera_angle_y": 4.0}, "camera_angle_y is 4"),
+                ({"fl_x": -61.0}, "fl_x -61"),
+                ({"fl_x": "wide"}, "fl_x is 'wide'"),
+                ({"cx": np.nan}, "cx is nan"),
+                ({"w": 64.5}, "w = 64.5"),
+                ({"h": None}, "h is None"),
+                ({"ply_file_path": "gone.ply"}, r"no file .*gone\.ply"),
+                ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
+                ({"train_filenames": ["images/frame_0001.png"]}, r"train_filenames names .*Did you mean"),
+                ({"train_filenames": "all"}, "train_filenames is not a list"),
+                ({"depth_estimated_from": ["images/frame_1.png"]}, r"depth_estimated_from names .*Did you mean"),
+                (
+                    {f"{part}_filenames": ["images/frame_00001.png"] for part in ("train", "test")},
+                    "is in train_filenames and test_filenames",
+                ),
+                ({"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "applied_transform"),
+            )
+        ),
     ],
     "reim-nerf": [
         (remove("transforms_true_test.json"), r"has no transforms_true_test\.json.*choose another split"),

@@ -258,37 +258,6 @@ def test_a_scene_whose_images_lie_elsewhere_has_to_be_trusted(mine, tmp_path, st
     assert len(load(mine, outside_files=True).train) == 7
 
 
-# What is refused besides
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"camera_model": ["PINHOLE"]}, "camera_model is .'PINHOLE'."),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE with k1 = 0.1"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE with p1 = 0.1"),
-        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
-        ({"fl_x": None, "fl_y": None, "camera_angle_y": 4.0}, "camera_angle_y is 4"),
-        ({"fl_x": -61.0}, "fx -61"),
-        ({"fl_x": "wide"}, "fl_x is 'wide'"),
-        ({"cx": math.nan}, "cx is nan"),
-        ({"w": 64.5}, "w = 64.5"),
-        ({"h": None}, "h is None"),
-        ({"ply_file_path": "gone.ply"}, r"no file .*gone\.ply"),
-        ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
-        ({"train_filenames": ["images/frame_0001.png"]}, r"train_filenames names .*Did you mean"),
-        ({"train_filenames": "all"}, "train_filenames is not a list"),
-        ({"depth_estimated_from": ["images/frame_1.png"]}, r"depth_estimated_from names .*Did you mean"),
-        ({"train_filenames": NAMES[:1], "test_filenames": NAMES[:1]}, "is in train_filenames and test_filenames"),
-        ({"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "applied_transform"),
-    ],
-)
-def test_what_the_file_may_not_say(mine, content, message):
-    change_json(FILE, **content)(mine)
-    with pytest.raises(InputError, match=message):
-        opened(mine)
-
-
 @pytest.mark.parametrize(
     ("write_bad", "message"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 
@@ -12,17 +11,11 @@ import OpenEXR
 import pytest
 import torch
 
-from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.rotatecolon import ExrDepth, read_exr_channel
-from coliags_plugin.engine.evaluator import evaluate
-from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.engine.trainer import Trainer
 from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, names, poses
 from tests.layouts.rotatecolon import write_exr
-from tests.scenes import SMALL
 
 Z = "ViewLayer.Depth.Z"
 
@@ -59,32 +52,6 @@ def test_another_divisor_scales_depth(walls, divisor):
 def test_without_points_they_come_from_depth(mine):
     (mine / "init_point_cloud.ply").unlink()
     assert load(mine).provenance["points"]["source"] == "depth of the training frames"
-
-
-@pytest.mark.thorough
-def test_depth_figures_of_views_without_depth_are_null_with_a_reason(walls, tmp_path):
-    """Not 0, and not taken against another frame's depth; training has its depth loss all the same."""
-    folder = walls("rotatecolon")
-    method = load_method("coliags", [*SMALL, "schedule.steps=2", "datamanager.name=rotatecolon"])
-    trainer = Trainer(method, load(folder), str(folder), RunFolder(tmp_path / "run"), 0, torch.device("cpu"))
-    trainer.start()
-    trainer.train()
-    rows = [json.loads(line) for line in trainer.run.log_file.read_text().splitlines()]
-    assert rows[-1]["terms"]["depth"] > 0.0
-    trained = load_trained(tmp_path / "run", torch.device("cpu"), folder)
-    for protocol in ("paper", "authors-code"):
-        made = evaluate(trained, protocol)
-        found = json.loads((made / "metrics.json").read_text())
-        depth = [name for name in found["directions"] if name.startswith("depth_")]
-        assert "depth_mse" in depth and found["depth_mse"] is None
-        for name in depth:
-            assert found["sets"]["test"][name] is None
-            assert found["reasons"][name] == "this frame has no ground-truth depth"
-        assert found["psnr"] > 0.0 and found["sets"]["test"]["psnr_seen"] > 0.0
-        assert not (made / "depth").exists() and not (made / "errors").exists()
-        header, *rows = (made / "per_frame.csv").read_text().splitlines()
-        place = header.split(",").index("depth_mse")
-        assert [row.split(",")[place] for row in rows] == ["", ""]
 
 
 def test_alpha_is_dropped(mine):

@@ -75,27 +75,13 @@ def told() -> dict[str, tuple[int, int]]:
     return {name: (int(frames), int(test)) for name, frames, test in rows}
 
 
-@pytest.fixture
-def official(shared_data) -> list[dict[str, str]]:
+def test_sequences_frames_and_names_are_the_official_ones(shared_data):
     path = shared_data / "c3vd_summary_csv" / "C3VD_data_summary_registered.csv"
     with path.open(encoding="utf-8-sig", newline="") as file:
-        return [row for row in csv.DictReader(file) if row["Video Name"]]
-
-
-def test_the_sequences_and_their_frames_are_the_official_ones(official):
-    assert {row["Old Name"]: int(row["Num_frames"]) for row in official} == {
-        name: frames for name, (frames, _) in told().items()
-    }
+        official = [row for row in csv.DictReader(file) if row["Video Name"]]
+    frames = {row["Old Name"]: int(row["Num_frames"]) for row in official}
     assert len(official) == 22
-
-
-def test_test_frames_are_every_eighth_of_the_official_numbers(official):
-    table = told()
-    for row in official:
-        assert held_out("every-8th", int(row["Num_frames"])).sum() == table[row["Old Name"]][1]
-
-
-def test_new_names_follow_from_the_old_ones_as_the_page_says(official):
+    assert told() == {name: (count, held_out("every-8th", count).sum()) for name, count in frames.items()}
     for row in official:
         segment, texture, letter = row["Old Name"].split("_")
         number = "abc".index(letter) + 1
