@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from pathlib import Path
 
 import cv2
@@ -16,21 +15,21 @@ from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.core.scenes import PointCloud, Scene
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.built_in import depth_steps
-from tests.datamanagers.kinds import write
+from tests.datamanagers.kinds import files, remove, repaint, write
 from tests.datamanagers.wall_scenes import (
     colors,
     manager,
     names,
     worst_off_wall,
-    write_undistorted,
     write_wall,
 )
 
+KIND = "c3vd"
 OMNIDIRECTIONAL = LENSES["omnidirectional"]
 
 
@@ -39,19 +38,8 @@ def load(folder: Path, name: str = "c3vd", **options) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def undistorted(tmp_path_factory):
-    return write_undistorted(tmp_path_factory.mktemp("undistorted") / "wall")
-
-
-@pytest.fixture(scope="module")
 def raw(tmp_path_factory):
     return write_wall(tmp_path_factory.mktemp("raw") / "wall", "c3vd-raw", 3, 90, 72)
-
-
-@pytest.fixture
-def mine(undistorted, tmp_path):
-    """A copy to spoil."""
-    return Path(shutil.copytree(undistorted, tmp_path / "wall"))
 
 
 # Depth
@@ -75,15 +63,15 @@ def test_simcol_depth_is_read_whole(shared_data):
 
 
 def test_depth_beyond_its_range_is_unknown_and_bounded(mine):
-    for index in range(9):
-        steps = np.full((48, 64), 65535, np.uint16)
-        steps[:, :32], steps[:, :8] = 30000, 0
-        cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), steps)
+    for path in files(mine, "depths/*"):
+        steps = np.full((32, 40), 65535, np.uint16)
+        steps[:, :20], steps[:, :5] = 30000, 0
+        cv2.imwrite(str(path), steps)
     scene = load(mine)
     depth, bound = scene.train[0].depth, scene.train[0].depth_at_least
-    assert torch.isnan(depth[:, :8]).all() and torch.isnan(depth[:, 32:]).all() and torch.isnan(bound[:, :32]).all()
-    torch.testing.assert_close(depth[:, 8:32], torch.full((48, 24), 30000 * 100 / 65535))
-    torch.testing.assert_close(bound[:, 32:], torch.full((48, 32), 100.0))
+    assert torch.isnan(depth[:, :5]).all() and torch.isnan(depth[:, 20:]).all() and torch.isnan(bound[:, :20]).all()
+    torch.testing.assert_close(depth[:, 5:20], torch.full((32, 15), 30000 * 100 / 65535))
+    torch.testing.assert_close(bound[:, 20:], torch.full((32, 20), 100.0))
     assert scene.provenance["invalid_depth_share"] == pytest.approx(0.625)
 
 
@@ -204,13 +192,13 @@ def test_whatever_else_is_refused_and_the_way_out_named(tmp_path, text, seen):
 @pytest.mark.parametrize(
     ("options", "train", "test"),
     [
-        ({"split": "block", "block": (0.5, 0.8)}, [0, 1, 2, 3, 7, 8], [4, 5, 6]),
+        ({"split": "block", "block": (0.5, 0.8)}, [0, 1, 2, 3, 4, 5, 9, 10], [6, 7, 8]),
         ({"frame_step": 2, "max_frames": 4}, [2, 4, 6], [0]),
-        ({"split": "all-train"}, [*range(9)], []),
+        ({"split": "all-train"}, [*range(11)], []),
     ],
 )
-def test_options_choose_the_split(undistorted, options, train, test):
-    scene = load(undistorted, **options)
+def test_options_choose_the_split(walls, options, train, test):
+    scene = load(walls("c3vd"), **options)
     assert [frame.index for frame in scene.train] == train
     assert [frame.index for frame in scene.test_sets.get("test", [])] == test
     split = scene.provenance["split"]
@@ -227,9 +215,9 @@ def test_options_choose_the_split(undistorted, options, train, test):
         ({"initial_points": "file", "points_file": "nothing.ply"}, r"no file .*nothing\.ply"),
     ],
 )
-def test_options_that_the_scene_does_not_allow(undistorted, options, message):
+def test_options_that_the_scene_does_not_allow(walls, options, message):
     with pytest.raises(InputError, match=message):
-        load(undistorted, **options)
+        load(walls("c3vd"), **options)
 
 
 @pytest.mark.parametrize(
@@ -251,12 +239,14 @@ def test_rotation_views_are_a_test_set_of_their_own(walls):
 
 
 @pytest.mark.parametrize("colored", [True, False])
-def test_points_come_from_the_scenes_ply_where_there_is_no_depth(tmp_path, colored):
-    points = PointCloud(torch.rand(50, 3), torch.randint(0, 256, (50, 3), dtype=torch.uint8) if colored else None)
-    scene = load(write_undistorted(tmp_path / "wall", depths=None, points=points))
+def test_points_come_from_the_scenes_ply_where_there_is_no_depth(mine, colored):
+    positions, colors = np.random.default_rng(0).random((50, 3)), np.arange(150, dtype=np.uint8).reshape(50, 3)
+    write_ply(mine / "points3D.ply", point_properties(positions, colors if colored else None))
+    remove("depths/*")(mine)
+    scene = load(mine)
     assert all(frame.depth is None for frame in scene.train)
-    torch.testing.assert_close(scene.points.positions, points.positions)
-    assert torch.equal(scene.points.colors, points.colors) if colored else scene.points.colors is None
+    np.testing.assert_allclose(scene.points.positions, positions, atol=1e-7)
+    assert (scene.points.colors.numpy() == colors).all() if colored else scene.points.colors is None
     assert scene.provenance["points"]["source"] == "points3D.ply" and "sha256" in scene.provenance["points"]
     assert scene.provenance["invalid_depth_share"] is None
 
@@ -275,17 +265,17 @@ def test_points_come_from_a_named_file(mine, tmp_path):
 
 
 def test_test_frames_leave_no_points(mine):
-    for index in range(1, 8):
-        cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), np.zeros((48, 64), np.uint16))
-    with pytest.raises(InputError, match="none of the 7 training frames has a valid depth"):
+    for index in (*range(1, 8), 9, 10):
+        repaint("depths/*", index, lambda depth: 0 * depth)(mine)
+    with pytest.raises(InputError, match="none of the 9 training frames has a valid depth"):
         load(mine)
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files through /proc")
-def test_no_file_stays_open(undistorted):
-    load(undistorted)
+def test_no_file_stays_open(walls):
+    load(walls("c3vd"))
     before = len(os.listdir("/proc/self/fd"))
-    load(undistorted)
+    load(walls("c3vd"))
     assert len(os.listdir("/proc/self/fd")) <= before
 
 

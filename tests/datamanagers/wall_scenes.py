@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, PhantomFrame, WallPoints
-from tests.scenes import write_c3vd_scene
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])
@@ -88,15 +86,6 @@ def manager(name: str, **options) -> RecordedDataManager:
 def load_scene(name: str, folder: Path, **options) -> Scene:
     """The scene in a folder, by the data manager of a format."""
     return manager(name, **options).load(folder)
-
-
-def write_undistorted(folder: Path, count: int = 9, width: int = 64, height: int = 48, **options) -> Path:
-    """The wall in C3VD's undistorted layout, through :data:`PINHOLE`."""
-    intrinsics = replace(PINHOLE, width=width, height=height)
-    views = [look(pose, rays(intrinsics)) for pose in poses(count)]
-    depths = options.pop("depths", [depth for depth, _ in views])
-    write_c3vd_scene(folder, [color for _, color in views], poses(count), intrinsics, depths=depths, **options)
-    return folder
 
 
 def layout_of(name: str) -> Layout:
