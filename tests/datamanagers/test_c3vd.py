@@ -37,11 +37,6 @@ def load(folder: Path, name: str = "c3vd", **options) -> Scene:
     return manager(name, **options).load(folder)
 
 
-@pytest.fixture(scope="module")
-def raw(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("raw") / "wall", "c3vd-raw", 3, 90, 72)
-
-
 # Depth
 
 
@@ -89,14 +84,6 @@ def test_undistorted_geometry_is_right_through_every_lens_and_no_other(tmp_path,
     assert np.abs(scene.points.colors.numpy().astype(int) - colors(points)).max() < 12
     other = "omnidirectional" if name == "legacy-pinhole" else "legacy-pinhole"
     assert worst_off_wall(load(folder, width=90, height=72, lens=other).train[0]) > 0.3
-
-
-def test_a_wide_view_is_masked_outside_the_octagon(raw):
-    assert load(raw).train[0].mask is None
-    frame, whole = (load(raw, focal_scale=0.4, mask=mask).train[0] for mask in (True, False))
-    assert 0.5 < frame.mask.float().mean() < whole.mask.float().mean() < 0.99
-    assert torch.isnan(frame.depth[~frame.mask]).all()
-    assert frame.image[frame.mask].amax(dim=-1).min() > 0
 
 
 @pytest.mark.parametrize(("layout", "name"), [("c3vd-raw", "c3vd"), ("c3vd-v2", "c3vd-v2")])

@@ -153,6 +153,16 @@ def test_another_size_keeps_the_geometry(walls, name):
         assert frame.depth is None or np.abs(frame.depth.numpy() - depth).max() < 2.5
 
 
+@pytest.mark.parametrize("name", ["c3vd-raw", "c3vd-v2", "reim-nerf", "endomapper"])
+def test_a_wide_view_is_masked_where_the_lens_shows_nothing(walls, name):
+    frame = load(walls(name), name, focal_scale=0.4).train[0]
+    assert 0.15 < frame.mask.float().mean() < 0.95
+    assert torch.isnan(frame.depth[~frame.mask]).all() and frame.image[frame.mask].amax(dim=-1).min() > 0
+    if name != "endomapper":  # whose masks are files
+        whole = load(walls(name), name, focal_scale=0.4, mask=False).train[0]
+        assert whole.mask is None or whole.mask.sum() > frame.mask.sum()
+
+
 # Seen masks
 
 

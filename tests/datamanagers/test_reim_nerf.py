@@ -105,14 +105,6 @@ def test_working_depth_is_that_of_the_nearest_stored_pixel(folder, scene):
     np.testing.assert_allclose(frame.depth.numpy()[known], expected[known], atol=2e-4)
 
 
-def test_outside_the_circle_nothing_counts(folder):
-    frame, whole = (load(folder, focal_scale=0.4, mask=mask).train[0] for mask in (True, False))
-    assert 0.3 < frame.mask.float().mean() < 0.95
-    assert torch.isnan(frame.depth[~frame.mask]).all()
-    assert frame.image[frame.mask].amax(dim=-1).min() > 0
-    assert whole.mask is None or whole.mask.sum() > frame.mask.sum()
-
-
 def test_what_ends_at_c3vds_range_is_there_or_beyond(mine):
     """A wall at C3VD's 100 mm on the left, one just before it in the middle, and none on the right."""
     z = np.full((HEIGHT, WIDTH), 99.9)

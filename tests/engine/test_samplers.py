@@ -43,15 +43,6 @@ def test_every_pixel_comes_up():
     assert len(seen) == sum(width * height for width, height in SIZES)
 
 
-def test_a_queue_and_a_generator_restore_a_sampler():
-    first, second = make(pixels=5, frames=2), make(pixels=5, frames=2, seed=9)
-    first.next()
-    second.queue = list(first.queue)
-    second.generator.set_state(first.generator.get_state())
-    for ours, theirs in zip(first.next(), second.next(), strict=True):
-        assert ours.frame == theirs.frame and torch.equal(ours.pixels, theirs.pixels)
-
-
 def test_targets_at_pixels():
     frames = wall_scene().train[:2]
     pixels = torch.tensor([[3, 1], [30, 20]])

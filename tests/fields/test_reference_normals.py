@@ -10,7 +10,6 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.point_normals import point_normals, wall_normals
 from coliags_plugin.fields.explicit_field import ReferenceNormals
-from tests.fields.made import make_field
 
 
 def cylinder(turns=120, rings=60, radius=20.0):
@@ -64,18 +63,3 @@ def test_new_gaussians_take_the_normal_of_the_nearest_initial_point_and_keep_it(
     references.keep(keep)
     torch.testing.assert_close(references.of_rows[0], references.normals[700])
     torch.testing.assert_close(references.of_rows[-2:], references.normals[[5, 700]])
-
-
-def test_fields_carry_them_through_checkpoints():
-    field = make_field("gaussians", normal_neighbours=10)
-    torch.testing.assert_close(field.references.of_rows[:, 2].abs(), torch.ones(len(field.means)))
-    field.rows_kept(torch.arange(len(field.means)) % 3 == 0)
-    with torch.no_grad():
-        for name in field.row_parameters:
-            setattr(field, name, torch.nn.Parameter(getattr(field, name)[::3]))
-    other = type(field).from_state(field.state_dict(), field.settings)
-    assert torch.equal(other.references.of_rows, field.references.of_rows)
-    assert torch.equal(other.references.points, field.references.points)
-    without = make_field("gaussians")
-    assert without.references is None
-    assert not any(name.startswith("references") for name in without.state_dict())

@@ -435,14 +435,3 @@ def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     assert "Suspect\nposes agree with depth when read as: world-to-camera: " in capsys.readouterr().out
     assert run("data", "check", tmp_path / "inverted", "--json") == 1
     assert json.loads(capsys.readouterr().out)["suspect"] is True
-
-
-def test_bad_input_of_the_command(folder, tmp_path, capsys):
-    for words, told in [
-        (["data", "check", tmp_path / "gone"], "no folder"),
-        (["data", "check", tmp_path], "none of the formats"),
-        (["data", "check", folder, "--format", "c3vb"], "Did you mean 'c3vd'"),
-        (["data", "check", folder, "--set", "lenz=x"], "lenz"),
-    ]:
-        assert run(*words) == 2
-        assert told in capsys.readouterr().err
