@@ -9,6 +9,7 @@ from coliags_plugin.api.training import import_splats
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
@@ -177,11 +178,12 @@ def test_a_scene_is_reconstructed(wall, tmp_path):
 
 
 def test_methods_are_compared(wall, tmp_path):
-    overrides = [f"{key}={value}" for key, value in options_of("3dgs").items()]
-    request = make_request(["3dgs"], [wall], None, 1, "paper", (), 2, overrides)
+    options = CompareOptions((wall,), tmp_path / "compared", steps=2, settings=options_of("3dgs"))
     with pytest.MonkeyPatch.context() as patch, PretendedCuda():
         patch.setattr(compare, "make_executor", lambda options: InlineExecutor())
-        done = carry_out(request, ComparisonFolder(tmp_path / "compared"), ExecutionOptions(device="cuda"))
+        done = carry_out(
+            make_request("3dgs", options), ComparisonFolder(options.output), ExecutionOptions(device="cuda")
+        )
     assert not done.failures
     (result,) = (tmp_path / "compared" / "results").rglob("*.json")
     assert "a pretended device" in result.read_text(encoding="utf-8")

@@ -14,7 +14,6 @@ from coliags_plugin.core.errors import check_name
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
     from coliags_plugin.comparison.named_files import Variant
-    from coliags_plugin.comparison.plan import Request
     from coliags_plugin.reporting.model import Section
 
 
@@ -31,25 +30,13 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
             run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
-    from coliags_plugin.comparison.compare import carry_out
+    from coliags_plugin.comparison.compare import carry_out, make_request
     from coliags_plugin.comparison.folder import ComparisonFolder
     from coliags_plugin.execution.executors import ExecutionOptions
 
     names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
     execution = ExecutionOptions(**{name: getattr(options, name) for name in names})
-    return carry_out(request_of(methods, options), ComparisonFolder(options.output), execution)
-
-
-def request_of(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> Request:
-    """What a comparison is asked for, checked."""
-    from coliags_plugin.comparison.compare import make_request
-    from coliags_plugin.comparison.named_files import Variant
-
-    names = ("scenes", "data", "seeds", "protocol", "splits", "steps", "reference", "primary")
-    chosen = {name: getattr(options, name) for name in names}
-    return make_request(
-        [methods] if isinstance(methods, (str, Variant)) else methods, overrides=options.settings, **chosen
-    )
+    return carry_out(make_request(methods, options), ComparisonFolder(options.output), execution)
 
 
 @takes(CompareOptions)

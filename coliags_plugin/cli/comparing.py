@@ -26,12 +26,12 @@ class ComparisonCommand(options.CompareOptions):
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""
-        from coliags_plugin.api.comparing import compare, request_of
-        from coliags_plugin.comparison.compare import dry_run
+        from coliags_plugin.api.comparing import compare
+        from coliags_plugin.comparison.compare import dry_run, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
 
         if self.dry_run:
-            planned = dry_run(request_of(methods, self), ComparisonFolder(self.output))
+            planned = dry_run(make_request(methods, self), ComparisonFolder(self.output))
             print_summary(str(planned), {"cells": planned.rows}, as_json=self.json)
             return
         done = compare(methods, self)

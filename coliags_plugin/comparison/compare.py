@@ -17,6 +17,7 @@ from coliags_plugin.comparison.runner import CellRuns
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import method_name
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, check_name, check_number, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.progress import progress_callback
@@ -152,43 +153,32 @@ def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCe
     return make_cells(request, folder.recorded_fingerprint)
 
 
-def make_request(
-    methods: Sequence[str | Variant],
-    scenes: Sequence[str | Path],
-    data: str | Path | None = None,
-    seeds: int = 1,
-    protocol: str = "paper",
-    splits: Sequence[str] = (),
-    steps: int | None = None,
-    overrides: Sequence[str] = (),
-    reference: str | None = None,
-    primary: Sequence[str] = (),
-) -> Request:
+def make_request(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> Request:
     """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
+    methods = [methods] if isinstance(methods, (str, Variant)) else methods
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
     if not variants:
         raise InputError("no method", "at least one")
     twice = [name for name, count in Counter(variant.name for variant in variants).items() if count > 1]
     if twice:
         raise InputError(f"more than one method is named {', '.join(twice)}", "methods of different names")
-    if not scenes:
+    if not options.scenes:
         raise InputError("no scene", "at least one", "--scenes phantoms-8 needs no dataset")
-    check_number("seeds", seeds)
-    check_number("steps", steps)
-    for split in splits:
+    check_number("seeds", options.seeds)
+    check_number("steps", options.steps)
+    for split in options.splits:
         check_name("split", split, get_args(Split))
-    _check_decision([variant.name for variant in variants], protocol, reference, primary)
-    sources = find_scenes([str(scene) for scene in scenes], None if data is None else Path(data))
+    _check_decision([variant.name for variant in variants], options.protocol, options.reference, options.primary)
     return Request(
         variants,
-        sources,
-        range(seeds),
-        protocol,
-        tuple(dict.fromkeys(splits)),
-        steps,
-        tuple(overrides),
-        reference,
-        tuple(dict.fromkeys(primary)),
+        find_scenes([str(scene) for scene in options.scenes], options.data),
+        range(options.seeds),
+        options.protocol,
+        tuple(dict.fromkeys(options.splits)),
+        options.steps,
+        options.settings,
+        options.reference,
+        tuple(dict.fromkeys(options.primary)),
     )
 
 

@@ -30,7 +30,7 @@ from coliags_plugin.engine.loggers import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import run_provenance
+from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
@@ -253,10 +253,27 @@ class Trainer:
         )
 
     def provenance(self) -> JsonObject:
-        """Provenance of the run."""
-        path = self.run.relative(self.scene_path)
-        made = run_provenance(self.method, self.scene, path, self.seed, self.device, self.chosen, self.model)
-        return {**made, "plan": self.strategy.plan()}
+        """What the run is and is made with."""
+        scene, footprint = self.scene, self.scene.pixel_footprint
+        return {
+            "method": self.method.name,
+            "seed": self.seed,
+            "steps": self.steps,
+            "device": str(self.device),
+            "renderer": self.chosen.name,
+            "renderer_reason": self.chosen.reason,
+            "untrained_views": {name: module.untrained_views for name, module in self.model.view_modules.items()},
+            **software(),
+            "scene": {
+                "name": scene.name,
+                "path": self.run.relative(self.scene_path),
+                "extent": scene.extent,
+                "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
+                "points": len(scene.points),
+                "provenance": scene.provenance,
+            },
+            "plan": self.strategy.plan(),
+        }
 
     def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
         count, first = self.model.field.element_count, str(error).partition("\n")[0]

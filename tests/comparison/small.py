@@ -16,6 +16,7 @@ from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.worker import CellTask, work
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.execution.executors import ExecutionOptions
 from coliags_plugin.execution.tasks import TaskOutcome
 from tests.task_list import TaskList
@@ -39,10 +40,12 @@ class InlineExecutor(TaskList):
 
 def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=()):
     """A comparison in this process."""
-    request = make_request(methods, scenes, None, seeds, "paper", splits, steps, overrides)
+    options = CompareOptions(scenes, Path(output), seeds=seeds, splits=splits, steps=steps, settings=tuple(overrides))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "make_executor", lambda options: executor or InlineExecutor())
-        return carry_out(request, ComparisonFolder(Path(output)), ExecutionOptions(device="cpu"))
+        return carry_out(
+            make_request(methods, options), ComparisonFolder(options.output), ExecutionOptions(device="cpu")
+        )
 
 
 def hashes(folder: Path) -> dict[str, str]:

@@ -15,6 +15,7 @@ from coliags_plugin.comparison import plan
 from coliags_plugin.comparison.compare import dry_run, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.trainer import Trainer
@@ -73,7 +74,7 @@ def test_a_dry_run_says_what_has_changed_since_a_cell_was_done(wall, folder, mon
     comparison = ComparisonFolder(folder)
 
     def states(overrides=TINY, scene=wall):
-        request = make_request(["coliags"], [scene], steps=3, overrides=overrides)
+        request = make_request("coliags", CompareOptions((scene,), folder, steps=3, settings=tuple(overrides)))
         monkeypatch.setattr(ComparisonFolder, "check_extends", lambda *_: None)
         return [(row["state"], row["changed"]) for row in dry_run(request, comparison).rows]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, timezone
+from pathlib import Path
 
 import pytest
 
@@ -11,14 +12,20 @@ from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.comparison.plan import make_cells
 from coliags_plugin.comparison.scenes import SceneSource
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager
 from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 
 
-def cells(wall, methods=("coliags",), *, seeds=1, protocol="paper", splits=(), steps=5, overrides=(), **decided):
-    return make_cells(make_request(methods, [wall], None, seeds, protocol, splits, steps, overrides, **decided))
+def requested(wall, methods=("coliags",), *, steps=5, overrides=(), **options):
+    chosen = CompareOptions((wall,), Path("unused"), steps=steps, settings=tuple(overrides), **options)
+    return make_request(methods, chosen)
+
+
+def cells(wall, methods=("coliags",), **options):
+    return make_cells(requested(wall, methods, **options))
 
 
 def keys(wall, **options):
@@ -78,7 +85,7 @@ def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
 @pytest.mark.parametrize("layout", ["c3vd", "colmap"])
 def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
     phantom = PhantomSettings(layout=layout, frames=9)
-    request = make_request(["coliags"], [tmp_path], None, 1, "paper", (), 5, ())
+    request = requested(tmp_path)
     request = type(request)(request.variants, [SceneSource("made", tmp_path / "made", phantom=phantom)], steps=5)
     (unknown,) = make_cells(request)
     assert unknown.keys is None and unknown.config.schedule.steps == 5
@@ -106,10 +113,6 @@ def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, 
 def test_what_cannot_be_compared_is_refused(wall, options, told):
     with pytest.raises(InputError, match=told):
         cells(wall, **options)
-
-
-def requested(wall, methods, **options):
-    return make_request(methods, [wall], None, 1, "paper", (), 5, (), **options)
 
 
 def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
