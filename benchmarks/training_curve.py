@@ -23,7 +23,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; re
 import torch
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments
+from coliags_plugin.config.options import Assignments
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.data_formats import load_method_for, load_scene

@@ -19,8 +19,8 @@ import yaml
 
 from coliags_plugin import cli
 from coliags_plugin.checks.method.check import CHECKS
-from coliags_plugin.cli.making_runs import TrainCommand
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
+from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
@@ -29,7 +29,7 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
-from coliags_plugin.engine.randomness import PURPOSES
+from coliags_plugin.engine.samplers import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.results.reading import find_results

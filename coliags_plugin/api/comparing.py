@@ -108,7 +108,7 @@ def report(
 
 
 def _scene_section(of: Run | str | Path) -> Section:
-    from coliags_plugin.export.viewer.saving import scene_page
+    from coliags_plugin.export.viewer.page import scene_page
     from coliags_plugin.reporting.model import Section, Template
 
     run = of if isinstance(of, Run) else Run(of)

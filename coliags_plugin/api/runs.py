@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.export.baking.exporting import Exported
     from coliags_plugin.export.viewer.live import Viewer
-    from coliags_plugin.export.viewer.saving import ScenePage
+    from coliags_plugin.export.viewer.page import ScenePage
     from coliags_plugin.results.record import Result
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
     from coliags_plugin.surface.meshing.fusion import MeshedRun
@@ -264,7 +264,7 @@ class Run:
             InputError: See :meth:`load`; the method has no Gaussians and the run no mesh, there is no such light, the
                 page would hold no Gaussian, or the file cannot be written.
         """
-        from coliags_plugin.export.viewer.saving import save_page
+        from coliags_plugin.export.viewer.page import save_page
 
         size = bytes_of(str(options.size), "--size")
         return save_page(self.load(), options.output or self.path / "scene.html", size, options.light, options.seconds)

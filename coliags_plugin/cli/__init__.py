@@ -13,22 +13,22 @@ import tyro
 from coliags_plugin._version import __version__
 from coliags_plugin.cli.arguments import Runnable
 from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
-from coliags_plugin.cli.depth import DepthCommand
 from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
-from coliags_plugin.cli.making_runs import ImportCommand, TrainCommand
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, ListCommand
 from coliags_plugin.cli.poses import PosesCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
 from coliags_plugin.cli.results import ReportCommand, ResultsCommand
-from coliags_plugin.cli.run_outputs import (
+from coliags_plugin.cli.runs import (
     CoverageCommand,
     EvaluateCommand,
     ExportCommand,
+    ImportCommand,
     MeshCommand,
     RenderCommand,
+    TrainCommand,
     ViewCommand,
 )
-from coliags_plugin.cli.scenes import DataCommand, PhantomCommand
+from coliags_plugin.cli.scenes import DataCommand, DepthCommand, PhantomCommand
 from coliags_plugin.core.decoder_messages import separate_stderr
 from coliags_plugin.core.errors import ReportedError, did_you_mean
 

@@ -17,15 +17,18 @@ from coliags_plugin.core.errors import InputError
 
 R = TypeVar("R")
 
-#: Of options whose help says what is done without them, or which are flags.
-_NO_DEFAULT = ""
 
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
-OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint=_NO_DEFAULT)]
-OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=_NO_DEFAULT)]
-OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM", help_behavior_hint=_NO_DEFAULT)]
+def _flag(metavar: str | None = None, **more: Any) -> Any:
+    """What tyro is told of an option whose help says what is done without it, or which is a flag."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **more)
+
+
+OptionalPath = Annotated[Path | None, _flag("PATH")]
+OptionalText = Annotated[str | None, _flag("TEXT")]
+OptionalInt = Annotated[int | None, _flag("INT")]
+OptionalFloat = Annotated[float | None, _flag("MM")]
 #: What is done by default: ``--no-NAME``, which its help describes, leaves it out.
-DoneByDefault = Annotated[bool, tyro.conf.arg(help_behavior_hint=_NO_DEFAULT)]
+DoneByDefault = Annotated[bool, _flag()]
 #: Texts separated by commas.
 Names = Annotated[
     tuple[str, ...],
@@ -36,33 +39,21 @@ Names = Annotated[
         is_instance=lambda value: isinstance(value, tuple),
         str_from_instance=lambda names: [",".join(names)],
     ),
-    tyro.conf.arg(help_behavior_hint=_NO_DEFAULT),
+    _flag("TEXT"),
 ]
 
 #: ``--output`` or ``-o``: the one spelling of where a command writes.
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
-OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH", help_behavior_hint=_NO_DEFAULT)]
+OptionalOutput = Annotated[Path | None, _flag("PATH", aliases=("-o",))]
 #: ``--set key=value``, repeatable; in Python a mapping.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
 RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
 SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
+_FORMAT_HELP = "Dataset format (`coliags list datamanagers`); default: recognised from the files."
 #: Name of a data manager; None: recognised from the files.
-DataFormat = Annotated[
-    str | None,
-    tyro.conf.arg(
-        name="format",
-        metavar="NAME",
-        help="Dataset format (`coliags list datamanagers`); default: recognised from the files.",
-        help_behavior_hint=_NO_DEFAULT,
-    ),
-]
-MovedData = Annotated[
-    Path | None,
-    tyro.conf.arg(
-        metavar="PATH", help="The scene's folder, where it has moved since training.", help_behavior_hint=_NO_DEFAULT
-    ),
-]
+DataFormat = Annotated[str | None, _flag("NAME", name="format", help=_FORMAT_HELP)]
+MovedData = Annotated[Path | None, _flag("PATH", help="The scene's folder, where it has moved since training.")]
 Device = Annotated[
     str, tyro.conf.arg(metavar="auto|cpu|cuda|cuda:N", help="Device to compute on; cuda is the first CUDA device.")
 ]
@@ -195,7 +186,7 @@ class RenderOptions(Options):
     output: OptionalOutput = None
     frames: str = "test"
     along: Annotated[OptionalPath, tyro.conf.arg(name="path")] = None
-    video: Annotated[DoneByDefault, tyro.conf.arg(help="Do not write trajectory.mp4, rgb beside depth.")] = True
+    video: Annotated[bool, _flag(help="Do not write trajectory.mp4, rgb beside depth.")] = True
     fps: float = 15.0
     depth_kind: Literal["accumulated", "expected", "median"] = "expected"
     depth_tiff: bool = False
@@ -230,6 +221,9 @@ class MeshOptions(Options):
     overwrite: Overwrite = False
 
 
+_MEASURE = "compare each file with the run on the held-out views, for the record and the terminal."
+
+
 @dataclass(frozen=True)
 class ExportOptions(Options):
     """What to export, and how it is baked.
@@ -249,12 +243,7 @@ class ExportOptions(Options):
     output: OptionalOutput = None
     light: Light = "mean"
     seconds: float = 180.0
-    measure: Annotated[
-        DoneByDefault,
-        tyro.conf.arg(
-            help="Do not compare each file with the run on the held-out views, for the record and the terminal."
-        ),
-    ] = True
+    measure: Annotated[bool, _flag(help=f"Do not {_MEASURE}")] = True
     formats: Annotated[tuple[Literal["ply", "spz", "glb"], ...], tyro.conf.arg(name="format")] = ("ply",)
     overwrite: Overwrite = False
 

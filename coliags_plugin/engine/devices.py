@@ -1,14 +1,18 @@
-"""Choice and names of devices to compute on."""
+"""Choice and names of devices to compute on, and versions of the software that does."""
 
 from __future__ import annotations
 
 import platform
 import re
+import subprocess
 from pathlib import Path
 
 import torch
 
+from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.results.hashing import code_key
 
 
 def find_device(wanted: str) -> torch.device:
@@ -57,3 +61,26 @@ def device_name(device: torch.device) -> str:
     except OSError:
         return platform.processor() or platform.machine()
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def software() -> JsonObject:
+    """Versions, the key of the code, and the git state where the package runs from a checkout."""
+    return {
+        "package_version": __version__,
+        "code": code_key(),
+        "git": _git_state(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _git_state() -> str | None:
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -17,10 +17,9 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.checkpoints import checkpoint_folder
 from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_psnr
-from coliags_plugin.engine.devices import device_name
+from coliags_plugin.engine.devices import device_name, software
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth, match_truth

@@ -75,14 +75,9 @@ class RunFolder:
         """One folder per checkpoint."""
         return self.path / "checkpoints"
 
-    @property
-    def lock_file(self) -> Path:
-        """File beside the folder, whose lock the process has that trains the run."""
-        return self.path.with_name(f".{self.path.name}.lock")
-
     def owned(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Keep other processes from training this run; see :func:`coliags_plugin.core.locks.locked`."""
-        return locked(self.lock_file, self.path, wait)
+        return locked(self.path.with_name(f".{self.path.name}.lock"), self.path, wait)
 
     @property
     def evaluations(self) -> Path:

@@ -1,7 +1,8 @@
-"""Samplers of training steps: whole frames, or batches of pixels."""
+"""Random generators of a run, and samplers of training steps: whole frames, or batches of pixels."""
 
 from __future__ import annotations
 
+import hashlib
 from typing import ClassVar
 
 import torch
@@ -9,6 +10,17 @@ from pydantic import Field
 
 from coliags_plugin.contracts import Draw, Sampler
 from coliags_plugin.core.settings import Settings
+
+PURPOSES = ("initialisation", "frame_order", "densification", "rendering")
+
+
+def generators(seed: int) -> dict[str, torch.Generator]:
+    """CPU generators by purpose; a purpose's stream depends on the seed and its own name only."""
+    found = {}
+    for purpose in PURPOSES:
+        digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
+        found[purpose] = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+    return found
 
 
 class FrameSamplerSettings(Settings):

@@ -26,13 +26,13 @@ from coliags_plugin.core.transfers import sent
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
+from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.loggers import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import software
-from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.samplers import generators
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)

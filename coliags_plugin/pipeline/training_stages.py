@@ -142,7 +142,7 @@ def coverage(context: StageContext) -> StageOutcome:
 def show(context: StageContext) -> StageOutcome:
     """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
     from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.export.viewer.saving import save_page
+    from coliags_plugin.export.viewer.page import save_page
 
     trained = load_trained(context.run, context.device, context.scene)
     depth_scale = _write_pictures(trained, context.run / "pictures")

@@ -21,7 +21,7 @@ from coliags_plugin.engine.checkpoints import (
     read_checkpoint,
     take_newest,
 )
-from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from tests.scenes import SMALL, wall_scene

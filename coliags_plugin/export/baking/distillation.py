@@ -19,8 +19,8 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import mean_camera, render_held, splatting_of
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.engine.samplers import generators
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.lighting.lamps import HeldLight

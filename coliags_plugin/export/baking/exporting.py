@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +16,10 @@ from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import refuse_existing, write_json
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import bake
@@ -177,13 +176,26 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
     """
     scorer = Scorer(trained.config.protocol, _METRICS)
     baked = model_of_gaussians(field_of_cloud(cloud), trained)
-    frames = [(name, frame) for name, of_set in trained.scene.test_sets.items() for frame in of_set]
-    rows: dict[str, list[dict[str, dict[str, float]]]] = defaultdict(list)
-    with ProgressReport("compare with the run", len(frames)) as progress:
-        for done, (name, frame) in enumerate(frames, start=1):
-            rows[name].append(_scores(trained, scorer, baked, frame.to(trained.device), light))
-            progress.update(done)
-    return {name: _summary(of_set) for name, of_set in rows.items()}
+    sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
+    found, done = {}, 0
+    with ProgressReport("compare with the run", sum(map(len, sets.values()))) as progress:
+        for name, frames in sets.items():
+            rows = []
+            for frame in frames:
+                rows.append(_scores(trained, scorer, baked, frame.to(trained.device), light))
+                progress.update(done := done + 1)
+            means = {part: _means([row[part] for row in rows]) for part in rows[0]}
+            run, export = means["run"], means["export"]
+            both = [metric for metric in run if metric in export]
+            found[name] = {
+                "frames": len(rows),
+                "run": run,
+                "export": export,
+                "cost": {each: (-1.0 if each == "psnr" else 1.0) * (export[each] - run[each]) for each in both},
+                "psnr_between": means["between"].get("psnr"),
+                "psnr_recorded": means["recorded"].get("psnr"),
+            }
+    return found
 
 
 def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -218,22 +230,7 @@ def _scores(
     }
 
 
-def _summary(rows: list[dict[str, dict[str, float]]]) -> dict[str, Any]:
-    run, export = _means(rows, "run"), _means(rows, "export")
-    signs = {"psnr": -1.0, "depth_mse": 1.0}
-    return {
-        "frames": len(rows),
-        "run": run,
-        "export": export,
-        "cost": {
-            name: sign * (export[name] - run[name]) for name, sign in signs.items() if name in run and name in export
-        },
-        "psnr_between": _means(rows, "between").get("psnr"),
-        "psnr_recorded": _means(rows, "recorded").get("psnr"),
-    }
-
-
-def _means(rows: list[dict[str, dict[str, float]]], part: str) -> Mapping[str, float]:
+def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means of the metrics that some frame has, over the frames that have them."""
-    values_by_name = {name: [row[part][name] for row in rows if name in row[part]] for name in _METRICS}
-    return {name: sum(values) / len(values) for name, values in values_by_name.items() if values}
+    values = {name: [row[name] for row in rows if name in row] for name in _METRICS}
+    return {name: sum(found) / len(found) for name, found in values.items() if found}

@@ -1,10 +1,12 @@
-"""Formats of files of Gaussians, by name and suffix, and glTF, which is only written."""
+"""Files of Gaussians by name and suffix: PLY as 3D Gaussian Splatting has it, SPZ by gsply, and glTF, only written."""
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import struct
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,178 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
-from coliags_plugin.export.splats.spz import read_splat_spz, write_spz
+from coliags_plugin.core.ply import read_vertices, write_ply
+from coliags_plugin.export.splats.cloud import SplatCloud, sigmoid
+from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
+
+log = logging.getLogger(__name__)
+
+#: Third scale of surfels in files, as a share of the smaller other one: small, and a finite logarithm.
+THICKNESS_SHARE = 0.01
+#: Read of a file to know its header: 3DGS's has 1.5 kB.
+_HEADER_BYTES = 65536
+_ROTATIONS = tuple(f"rot_{index}" for index in range(4))
+_SCALES = tuple(f"scale_{index}" for index in range(3))
+_BASES = tuple(f"f_dc_{index}" for index in range(3))
+_NEEDED = ("x", "y", "z", *_BASES, "opacity", *_SCALES[:2], *_ROTATIONS)
+#: Properties of files of other kinds of Gaussians, and what these are.
+_OTHER_KINDS = {
+    "packed_position": "a compressed PLY (quantised in chunks, as SuperSplat writes it)",
+    "f_offset_0": "a PLY of anchors (Scaffold-GS), which are Gaussians only together with their networks",
+    "f_anchor_feat_0": "a PLY of anchors (Scaffold-GS), which are Gaussians only together with their networks",
+    "filter_3D": "a PLY of Mip-Splatting, whose 3D filter is not applied to its scales and opacities",
+    "trbf_center": "a PLY of Gaussians that move with time",
+    "motion_0": "a PLY of Gaussians that move with time",
+    "red": "a point cloud or mesh",
+}
+
+
+def write_splat_ply(path: Path, cloud: SplatCloud, comment: str = "") -> None:
+    """Write Gaussians in 3DGS's order of attributes, binary little-endian, with the comment in the header.
+
+    ``x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*``: normals are 0, ``f_rest`` is channel by channel, opacities
+    are logits, scales logarithms, and rotations w first.
+    """
+    rest = cloud.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(cloud), -1)
+    zeros = np.zeros(len(cloud), np.float32)
+    write_ply(
+        path,
+        {
+            **dict(zip("xyz", cloud.means.T, strict=True)),
+            **dict.fromkeys(("nx", "ny", "nz"), zeros),
+            **dict(zip(_BASES, cloud.harmonics[:, 0].T, strict=True)),
+            **{f"f_rest_{index}": column for index, column in enumerate(rest.T)},
+            "opacity": cloud.logits,
+            **dict(zip(_SCALES, cloud.log_scales.T, strict=True)),
+            **dict(zip(_ROTATIONS, cloud.unit_quats_wxyz.T, strict=True)),
+        },
+        comment=comment,
+    )
+
+
+def read_splat_ply(path: Path) -> SplatCloud:
+    """Read Gaussians, or surfels (without ``scale_2``), of 3DGS's lineage; normals and other properties are ignored.
+
+    Rows may have numbers that are not finite: :meth:`SplatCloud.usable`.
+    """
+    _refuse_other_kinds(path)
+    columns = read_vertices(path, needed=_NEEDED)
+    rest = [name for name in columns if name.startswith("f_rest_")]
+    per_channel = len(rest) // 3
+    counts = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
+    if len(rest) % 3 or per_channel not in counts or set(rest) != {f"f_rest_{index}" for index in range(len(rest))}:
+        known = ", ".join(str(3 * count) for count in counts)
+        raise InputError(f"{path}: {len(rest)} properties f_rest_*", f"f_rest_0 and so on, {known} of them")
+    higher = np.array([columns[f"f_rest_{index}"] for index in range(len(rest))], np.float32)
+    higher = higher.reshape(3, per_channel, len(columns["x"])).transpose(2, 1, 0)
+    scales = _SCALES if "scale_2" in columns else _SCALES[:2]
+    with np.errstate(over="ignore"):
+        return SplatCloud(
+            means=_stacked(columns, ("x", "y", "z")),
+            quats_wxyz=_stacked(columns, _ROTATIONS),
+            scales=np.exp(_stacked(columns, scales)),
+            opacities=sigmoid(columns["opacity"].astype(np.float32)),
+            harmonics=np.concatenate([_stacked(columns, _BASES)[:, None], higher], axis=1),
+        )
+
+
+def _refuse_other_kinds(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a PLY file of Gaussians") from error
+    lines = map(str.split, header.decode("ascii", "replace").splitlines())
+    properties = {words[-1] for words in lines if words and words[0] == "property"}
+    for name, kind in _OTHER_KINDS.items():
+        if name in properties and not (name == "red" and properties.issuperset(_NEEDED)):
+            raise InputError(
+                f"{path} is {kind}",
+                "a PLY of 3D Gaussians in 3DGS's attributes (x y z f_dc_* f_rest_* opacity scale_* rot_*)",
+                "Convert it, for instance with `splat-transform IN OUT.ply`, or export it anew",
+            )
+
+
+def _stacked(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+    """Columns side by side. [N, C]"""
+    return np.stack([columns[name] for name in names], axis=1).astype(np.float32)
+
+
+#: Bits of a coordinate, its sign apart; and the most of them behind the binary point: 1/4096 of a scene unit.
+_COORDINATE_BITS, _MOST_FRACTIONAL_BITS = 23, 12
+#: The container that all readers know: gzip, with rotations of 32 bits.
+_CONTAINER = 3
+#: Signs of the spherical harmonics, degree by degree, under half a turn about x: -1 where odd in y and z together.
+_TURNED = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+#: Of positions and of quaternions' vector parts under the same turn.
+_AXES = np.array([1, -1, -1], np.float32)
+
+
+def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
+    """Write Gaussians quantised: positions to 1/4096 of a unit, log scales to 1/16 in [-10, 5.9], all else to 8 bits.
+
+    SPZ's axes are right, up, back: what is written is turned by half a turn about x, and turned back when read. Clouds
+    of more than 2048 units from the origin get coarser positions. The format has no place for a comment.
+    """
+    import gsply
+
+    reach = float(np.abs(cloud.means).max())
+    bits = min(_MOST_FRACTIONAL_BITS, _COORDINATE_BITS - max(0, math.floor(math.log2(max(reach, 1.0))) + 1))
+    if bits < 1:
+        raise InputError(
+            f"Gaussians {reach:g} scene units from the origin", "at most 2^21 units, SPZ's range", "Write a PLY"
+        )
+    turned = _half_turn(cloud)
+    data = gsply.GSData.from_arrays(
+        means=turned.means,
+        scales=turned.log_scales,
+        quats=turned.unit_quats_wxyz,
+        opacities=turned.logits,
+        sh0=turned.harmonics[:, 0],
+        shN=turned.harmonics[:, 1:] if turned.degree else None,
+        format="ply",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder) / "cloud.spz"
+        gsply.write_spz(scratch, data, version=_CONTAINER, fractional_bits=bits)
+        atomic_write(path, scratch.read_bytes())
+
+
+def read_splat_spz(path: Path) -> SplatCloud:
+    """Read Gaussians, turned from SPZ's axes as :func:`write_spz` turned them."""
+    import gsply
+
+    try:
+        data = gsply.read_spz(path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "an SPZ file") from error
+    except Exception as error:  # gsply and the decompressors beneath raise whatever they like
+        raise InputError(f"{path} cannot be read as SPZ: {error}", "an SPZ file of version 1 to 4") from error
+    first = np.asarray(data.sh0)[:, None]
+    higher = [] if data.shN is None else [np.asarray(data.shN)]
+    return _half_turn(
+        SplatCloud(
+            means=np.asarray(data.means),
+            quats_wxyz=np.asarray(data.quats),
+            scales=np.exp(np.asarray(data.scales)),
+            opacities=sigmoid(np.asarray(data.opacities)),
+            harmonics=np.concatenate([first, *higher], axis=1),
+        )
+    )
+
+
+def _half_turn(cloud: SplatCloud) -> SplatCloud:
+    """The cloud turned by half a turn about x, which is its own inverse up to the sign of quaternions."""
+    w, x, y, z = cloud.quats_wxyz.T
+    return SplatCloud(
+        means=cloud.means * _AXES,
+        # The local axes are turned along, which reverses two of them: an ellipsoid stays what it is.
+        quats_wxyz=np.stack([w, x, -y, -z], axis=1),
+        scales=cloud.scales,
+        opacities=cloud.opacities,
+        harmonics=cloud.harmonics * _TURNED[: cloud.harmonics.shape[1], None],
+    )
+
 
 EXTENSION = "KHR_gaussian_splatting"
 #: glTF's numbers of a primitive of points, of float32 and of a buffer of vertices, and its shapes by their channels.
@@ -78,12 +249,6 @@ def _attributes(cloud: SplatCloud) -> dict[str, np.ndarray]:
             coefficients = cloud.harmonics[:, degree * degree + order]
             named[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = coefficients
     return {name: values.astype(np.float32) for name, values in named.items()}
-
-
-log = logging.getLogger(__name__)
-
-#: Third scale of surfels in files, as a share of the smaller other one: small, and a finite logarithm.
-THICKNESS_SHARE = 0.01
 
 
 #: Writer of path, cloud and comment, and reader where such files are read, by name: the suffix without its dot.

@@ -30,7 +30,7 @@ from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
 from coliags_plugin.engine.trained import TrainedRun, load_newer
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.export.viewer.saving import look_distance, mesh_files
+from coliags_plugin.export.viewer.page import look_distance, mesh_files
 from coliags_plugin.export.viewer.serving import has_display, start_server, stop_server
 from coliags_plugin.geometry.meshes.files import encode_mesh, read_mesh
 from coliags_plugin.outputs.image_files import as_array, eight_bit

@@ -21,8 +21,7 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.exporting import export_cost
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
-from coliags_plugin.export.splats.files import read_splats, write_splats
-from coliags_plugin.export.splats.ply import write_splat_ply
+from coliags_plugin.export.splats.files import read_splats, write_splat_ply, write_splats
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from tests.commands import refused, run

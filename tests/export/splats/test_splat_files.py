@@ -14,10 +14,16 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import write_ply
-from coliags_plugin.export.splats import spz
+from coliags_plugin.export.splats import files
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
-from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
+from coliags_plugin.export.splats.files import (
+    FORMATS,
+    THICKNESS_SHARE,
+    read_splat_ply,
+    read_splats,
+    write_splat_ply,
+    write_splats,
+)
 from coliags_plugin.fields import spherical_harmonics
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
@@ -121,7 +127,7 @@ def test_spz_is_turned_to_its_own_axes(tmp_path):
     path = written(tmp_path, cloud, "spz")
     assert struct.unpack("<II", gzip.decompress(path.read_bytes())[:8]) == (0x5053474E, 3)
     np.testing.assert_allclose(gsply.read_spz(path).means, cloud.means * [1, -1, -1], atol=2e-4)
-    turned, turn = spz._half_turn(cloud), np.diag([1.0, -1.0, -1.0])
+    turned, turn = files._half_turn(cloud), np.diag([1.0, -1.0, -1.0])
     np.testing.assert_allclose(covariances(turned), turn @ covariances(cloud) @ turn, atol=1e-5)
     directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     seen = [

@@ -18,7 +18,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import field_of_cloud
-from coliags_plugin.export.splats.spz import read_splat_spz
+from coliags_plugin.export.splats.files import read_splat_spz
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh

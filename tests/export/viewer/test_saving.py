@@ -13,7 +13,7 @@ import coliags_plugin as cp
 from coliags_plugin.config.options import bytes_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.baking import distillation
-from coliags_plugin.export.viewer.saving import most_visible, scene_page
+from coliags_plugin.export.viewer.page import most_visible, scene_page
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.visibility import Level

@@ -1,4 +1,4 @@
-"""Commands on a run: ``coliags eval``, ``render``, ``coverage``, ``mesh``, ``export``, ``view``."""
+"""Commands on runs: ``train``, ``import``, ``eval``, ``render``, ``coverage``, ``mesh``, ``export``, ``view``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,40 @@ import tyro
 from coliags_plugin.cli.summaries import coliags, print_summary, view_command
 from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class TrainCommand(options.TrainOptions):
+    """Train a method on a scene and write a run folder."""
+
+    view: bool = False
+    """Show the run in a browser while it is trained (extra `viewer`)."""
+    port: int = 8080
+    """Port of --view on this machine; 0: any free one."""
+    json: options.AsJson = False
+
+    def run(self) -> None:
+        """Train, and print the run folder."""
+        from coliags_plugin.api.training import train
+
+        run = train(self, view_port=self.port if self.view else None)
+        facts = {"method": run.method, "scene": run.scene_name, "seed": run.seed, "step": run.step}
+        print_summary(facts=facts, written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)
+
+
+@dataclass(frozen=True)
+class ImportCommand(options.ImportOptions):
+    """Make a run folder of anyone's file of 3D Gaussians, which eval, render, mesh and report take like any other."""
+
+    json: options.AsJson = False
+
+    def run(self) -> None:
+        """Import, and print the run folder."""
+        from coliags_plugin.api.training import import_splats
+
+        run = import_splats(self)
+        print_summary(written=[run.path], then=[coliags("eval", run.path)], as_json=self.json)
+
 
 if TYPE_CHECKING:
     from coliags_plugin.api.runs import Run
