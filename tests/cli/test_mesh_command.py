@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from coliags_plugin.api.runs import Run
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.surface.meshing.fusion import mesh_run
 from tests.commands import refused, run
 from tests.surface.meshing.exact import exact_run
 
@@ -37,17 +33,3 @@ def test_options_are_refused_before_anything_is_made(run_folder, capsys):
     assert "voxel_size" in refused(capsys, "mesh", run_folder, "--voxel", -1)
     assert run("mesh", run_folder, "--format", "stl") == 2
     assert not run_folder.exists()
-
-
-def test_the_command_is_refused_without_a_run(tmp_path, capsys):
-    assert "not a run folder" in refused(capsys, "mesh", tmp_path)
-
-
-def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
-    def full(path: Path, mesh, texture) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("coliags_plugin.surface.meshing.fusion.write_mesh", full)
-    with pytest.raises(InputError, match="No space"):
-        mesh_run(exact_run(frames=9), tmp_path / "mesh")
-    assert not any(tmp_path.iterdir())

@@ -10,7 +10,7 @@ import pytest
 
 import coliags_plugin as cp
 from coliags_plugin.api.scenes import reconstruct
-from coliags_plugin.cli import making_runs, results, run_outputs
+from coliags_plugin.cli import results, runs
 from coliags_plugin.cli.comparing import CompareCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
 from coliags_plugin.config.options import Options, TrainOptions, takes
@@ -26,13 +26,13 @@ def test_an_option_is_an_argument_of_the_function_or_handled_by_the_command():
 @pytest.mark.parametrize(
     ("command", "function", "own"),
     [
-        (making_runs.TrainCommand, cp.train, "view port json"),
-        (making_runs.ImportCommand, cp.import_splats, "json"),
-        (run_outputs.EvaluateCommand, cp.Run.evaluate, "path data device json"),
-        (run_outputs.RenderCommand, cp.Run.write_renders, "path data device json light flatten"),
-        (run_outputs.CoverageCommand, cp.Run.coverage, "path data device json"),
-        (run_outputs.MeshCommand, cp.Run.mesh, "path data device json"),
-        (run_outputs.ViewCommand, cp.Run.save_view, "path data device json host port open"),
+        (runs.TrainCommand, cp.train, "view port json"),
+        (runs.ImportCommand, cp.import_splats, "json"),
+        (runs.EvaluateCommand, cp.Run.evaluate, "path data device json"),
+        (runs.RenderCommand, cp.Run.write_renders, "path data device json light flatten"),
+        (runs.CoverageCommand, cp.Run.coverage, "path data device json"),
+        (runs.MeshCommand, cp.Run.mesh, "path data device json"),
+        (runs.ViewCommand, cp.Run.save_view, "path data device json host port open"),
         (CompareCommand, cp.compare, "dry_run json"),
         (results.ReportCommand, cp.report, "paths json"),
     ],

@@ -105,14 +105,6 @@ def test_a_term_that_would_never_count_is_refused():
         load_method("scaffold-gs", ["losses.l1.from_step=9", "losses.l1.until_step=5"])
 
 
-def test_depth_that_no_frame_has(tmp_path):
-    with pytest.raises(
-        InputError, match=r"loss term 'depth' needs depth, and no training frame.*--set losses\.depth=null"
-    ):
-        start(tmp_path / "run", method="scaffold-gs-depth", scene=wall_scene(depth=False))
-    assert not (tmp_path / "run").exists()
-
-
 def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     scene, points = wall_scene(), SparseDepth(torch.tensor([[3.5, 2.5]]), torch.tensor([20.0]))
     bare = [replace(frame, depth=None) for frame in scene.train]

@@ -239,14 +239,3 @@ def test_marks_agree_with_means_taken_one_by_one(psnr, frames, every):
                 expected[str(mark)] = row["seconds"]
     found = seconds_to_psnr(rows, frames)
     assert found == expected
-
-
-def test_measuring_leaves_the_trained_bits(tmp_path, monkeypatch):
-    """Tensors of the same run with a meter that measures nothing."""
-    measured = final_state(train(tmp_path / "a", steps=4))
-    monkeypatch.setattr(CostMeter, "cost", lambda self: None)
-    unmeasured = final_state(train(tmp_path / "b", steps=4))
-    assert unmeasured.cost is None and measured.cost is not None
-    assert all(torch.equal(value, unmeasured.tensors[name]) for name, value in measured.tensors.items())
-    files = [tmp_path / name / "checkpoints/step-000004/state.safetensors" for name in "ab"]
-    assert files[0].read_bytes() == files[1].read_bytes()

@@ -66,15 +66,6 @@ def test_what_is_no_image_or_no_depth_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_reading_names_the_file(tmp_path, rgb):
-    with pytest.raises(InputError, match=r"cannot read .*none\.png"):
-        read_rgb(tmp_path / "none.png")
-    for name, data in (("empty.png", b""), ("torn.png", encode_png(rgb)[:20]), ("text.png", b"hello")):
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match=rf"{name} .*cannot be decoded"):
-            read_rgb(tmp_path / name)
-
-
 def test_nothing_is_converted_on_reading(tmp_path, rgb):
     cv2.imwrite(str(tmp_path / "grey.png"), rgb[:, :, 0])
     cv2.imwrite(str(tmp_path / "deep.png"), rgb.astype(np.uint16))
