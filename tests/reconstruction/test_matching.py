@@ -21,10 +21,10 @@ from coliags_plugin.reconstruction.structure.matching import (
     epipolar_matches,
     mutual_matches,
 )
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.point_tracks import epipolar_inliers, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
 from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
-from coliags_plugin.reconstruction.structure.video import MatchedVideo
+from coliags_plugin.reconstruction.structure.video import MatchedVideo, cut_where_lost
 from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
 
 #: Error, ratio and distance that leave the decision to the geometry.
@@ -258,13 +258,9 @@ def test_points_that_fit_no_motion_are_outliers():
 def test_long_videos_are_cut_where_few_points_are_followed():
     followed = [0, *[300] * 99]
     followed[40], followed[70] = 20, 30
-    empty = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-    frames = [FramePoints(*empty, count, shift=0.0, sharpness=1.0, fineness=3.0) for count in followed]
-    names = tuple(map(str, range(100)))
-    video = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * 100, (), (), {}, tuple(frames))
-    assert video.windows(100) == [range(100)]
-    assert video.windows(80) == [range(40), range(40, 100)]
-    windows = video.windows(50)
+    assert cut_where_lost(followed, 100) == [range(100)]
+    assert cut_where_lost(followed, 80) == [range(40), range(40, 100)]
+    windows = cut_where_lost(followed, 50)
     assert windows[:2] == [range(40), range(40, 70)]
     assert [frame for window in windows for frame in window] == list(range(100))
     assert max(map(len, windows)) <= 50

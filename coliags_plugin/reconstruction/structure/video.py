@@ -83,7 +83,7 @@ class MatchedVideo:
             if not self.tracks:
                 write_database(database, cameras, named, self.keypoints, self.matches)
                 return map_images(database, folder, settings, len(self.images), progress)
-            windows = self.windows(settings.tracks.longest_window)
+            windows = cut_where_lost([frame.followed for frame in self.tracks], settings.tracks.longest_window)
             if len(windows) > 1:
                 cuts = ", ".join(str(window.start) for window in windows[1:])
                 log.info("the video is mapped in %d windows, cut before frames %s", len(windows), cuts)
@@ -95,10 +95,6 @@ class MatchedVideo:
                 database.unlink()
                 shutil.rmtree(folder)
         return sorted(models, key=lambda model: -model.num_reg_images())
-
-    def windows(self, longest: int) -> list[range]:
-        """Stretches of frames, each mapped by itself: cut where few points are followed, if longer than ``longest``."""
-        return cut_where_lost([frame.followed for frame in self.tracks], longest)
 
 
 def cut_where_lost(followed: Sequence[float], longest: int) -> list[range]:

@@ -243,26 +243,17 @@ def near_pairs(
     return np.stack([first[near], second[np.asarray(nearest)[near]]], axis=1)
 
 
-def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "F"]:
-    """Number of the connected region of each chosen triangle, from 0; -1 for the others. [F]"""
-    both = chosen[pairs[:, 0]] & chosen[pairs[:, 1]]
-    first, second = pairs[both].T
-    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(len(chosen), len(chosen)))
-    _, labels = connected_components(graph, directed=False)
-    numbers = np.full(len(chosen), -1, np.int64)
-    _, numbers[chosen] = np.unique(labels[chosen], return_inverse=True)
-    return numbers
-
-
 def large_regions(
     chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"], areas: Float[np.ndarray, "F"], smallest: float
 ) -> list[Int[np.ndarray, "K"]]:
     """Connected regions above an area, mm^2, the largest first, each as the indices of its triangles."""
-    numbers = connected(chosen, pairs)
-    inside = np.flatnonzero(numbers >= 0)
+    inside = np.flatnonzero(chosen)
     if not len(inside):
         return []
-    area = np.bincount(numbers[inside], areas[inside])
+    first, second = pairs[chosen[pairs].all(axis=1)].T
+    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(len(chosen), len(chosen)))
+    _, labels = connected_components(graph, directed=False)
+    area = np.bincount(labels[inside], areas[inside])
     kept = np.flatnonzero(area > smallest)
     kept = kept[np.argsort(-area[kept], kind="stable")]
-    return [np.flatnonzero(numbers == number) for number in kept]
+    return [inside[labels[inside] == number] for number in kept]
