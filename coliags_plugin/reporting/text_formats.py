@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from rich.cells import cell_len
@@ -58,32 +57,32 @@ _CODE = re.compile("`([^`]+)`")
 _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 
 
-class _PlainText:
+class _Text:
     """Plain text, and what the formats without figures that derive from it share."""
 
     dash: ClassVar[str] = "-"  # stands for a missing value
     plus_minus: ClassVar[str] = "±"
 
-    def text(self, blocks: Sequence[Block], level: int = 2) -> str:
+    def blocks(self, blocks: Sequence[Block], level: int = 2) -> str:
         """Blocks one after the other, without those that have no text; titles are headings of a level and deeper."""
         return "\n\n".join(filter(None, (self._block(block, level) for block in blocks)))
 
     def _block(self, block: Block, level: int) -> str:
         match block:
             case Paragraph():
-                return self._escaped(block.text)
+                return self.escaped(block.text)
             case Bullets():
                 return "\n".join(map(self._item, block.items))
             case FactList():
                 return self._facts([fact for fact in block.facts if fact.text])
             case Table():
-                return self._table(block.only_shown())
+                return self.table(block)
             case Section() | Folded():
-                return self._titled(block.title, self.text(block.blocks, level + 1), level)
+                return self._titled(block.title, self.blocks(block.blocks, level + 1), level)
             case _:
                 return ""
 
-    def _escaped(self, text: str) -> str:
+    def escaped(self, text: str) -> str:
         """Words of a text, none of whose characters has a meaning of its own."""
         return text
 
@@ -91,38 +90,35 @@ class _PlainText:
         return ": ".join(filter(None, (item.href or item.lead, item.text)))
 
     def _facts(self, facts: Sequence[Fact]) -> str:
-        """Facts that have a text: names, and values in a column."""
         return _aligned([[fact.name, fact.text] for fact in facts], "ll")
 
     def _titled(self, title: str, body: str, level: int) -> str:
         return f"{title}\n{body}" if body else ""
 
-    def _table(self, table: Table) -> str:
-        """A table of columns that are all shown, with its title, footnotes and notes."""
-        alignment = "".join("l" if column.words or not index else "r" for index, column in enumerate(table.columns))
-        title = [" ".join(filter(None, (table.title, f"({table.count})" if table.count else "")))] * bool(table.title)
-        notes = [f"{mark.strip()} {text}" for text, mark in self._marks(table).items()]
-        return "\n".join([*title, _aligned(self._rows(table), alignment), *notes, *table.notes])
+    def table(self, table: Table) -> str:
+        """The columns of a table that are shown, with its title, footnotes and notes."""
+        shown = table.only_shown()
+        marks = {text: self._raised(note.mark) for text, note in shown.footnotes.items()}
+        rows = [[self._cell(cell, marks.get(cell.note, "")) for cell in row] for row in shown.cells]
+        notes = [*(f"{mark} {self.escaped(text)}" for text, mark in marks.items()), *map(self.escaped, table.notes)]
+        return self._table(shown, [[*map(self._heading, shown.columns)], *rows], [*map(sentence, notes)])
 
-    def _rows(self, table: Table) -> list[list[str]]:
-        """Texts of the headings, then of the cells of each row."""
-        marks = self._marks(table)
-        cells = [[self._cell(cell, marks.get(cell.note, "")) for cell in row] for row in table.cells]
-        return [[*map(self._heading, table.columns)], *cells]
+    def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
+        """A table of headings and cells as texts, with its notes."""
+        alignment = "".join("l" if column.words or not index else "r" for index, column in enumerate(table.columns))
+        title = " ".join(filter(None, (table.title, f"({table.count})" if table.count else "")))
+        return "\n".join([*filter(None, [title]), _aligned(rows, alignment), *map(str.strip, notes)])
 
     def _heading(self, column: Column) -> str:
         unit = unit_text(column.unit)
         return f"{column.name} ({unit})" if unit else column.name
-
-    def _marks(self, table: Table) -> dict[str, str]:
-        return {text: self._raised(note.mark) for text, note in table.footnotes.items()}
 
     def _raised(self, mark: str) -> str:
         return f" [{mark}]"
 
     def _number(self, cell: TableCell) -> str:
         """Text of a cell that has one, marked by its rank."""
-        return self._escaped(cell.text)
+        return self.escaped(cell.text)
 
     def _stars(self, stars: str) -> str:
         return stars
@@ -134,45 +130,42 @@ class _PlainText:
         return f"{self._number(cell)}{spread}{self._stars(cell.stars) if cell.stars else ''}{mark}"
 
 
-class _Markdown(_PlainText):
+class _Markdown(_Text):
     dash = DASH
 
-    def _escaped(self, text: str) -> str:
+    def escaped(self, text: str) -> str:
         return _MARKDOWN_SPECIAL.sub(r"\\\1", " ".join(text.split()))
 
     def _item(self, item: Bullet) -> str:
-        lead = f"[{self._escaped(item.lead)}]({item.href})" if item.href else self._escaped(item.lead)
-        return f"- {': '.join(filter(None, (lead, self._escaped(item.text))))}"
+        lead = f"[{self.escaped(item.lead)}]({item.href})" if item.href else self.escaped(item.lead)
+        return f"- {': '.join(filter(None, (lead, self.escaped(item.text))))}"
 
     def _facts(self, facts: Sequence[Fact]) -> str:
-        return "\n".join(f"- {self._escaped(fact.name)}: {self._escaped(fact.text)}" for fact in facts)
+        return "\n".join(f"- {self.escaped(fact.name)}: {self.escaped(fact.text)}" for fact in facts)
 
     def _titled(self, title: str, body: str, level: int) -> str:
-        return "\n\n".join(filter(None, (f"{'#' * level} {self._escaped(title)}", body)))
+        return "\n\n".join(filter(None, (f"{'#' * level} {self.escaped(title)}", body)))
 
-    def _table(self, table: Table) -> str:
-        count = f" ({self._escaped(table.count)})" if table.count else ""
-        title = f"**{self._escaped(table.title)}**{count}" if table.title else ""
-        head, *rows = self._rows(table)
+    def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
+        count = f" ({self.escaped(table.count)})" if table.count else ""
+        title = f"**{self.escaped(table.title)}**{count}" if table.title else ""
         rule = ["---" if column.words or not index else "---:" for index, column in enumerate(table.columns)]
-        lines = [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]
-        below = [f"{mark} {self._escaped(text)}  " for text, mark in self._marks(table).items()]
-        below += [f"{sentence(self._escaped(note))}  " for note in table.notes]
-        return "\n\n".join(filter(None, [title, "\n".join(lines), "\n".join(below).rstrip()]))
+        lines = [f"| {' | '.join(cells)} |" for cells in (rows[0], rule, *rows[1:])]
+        return "\n\n".join(filter(None, [title, "\n".join(lines), "  \n".join(notes)]))
 
     def _heading(self, column: Column) -> str:
         unit = unit_text(column.unit)
-        return self._escaped(" ".join(filter(None, (column.name, column.arrow, f"[{unit}]" if unit else ""))))
+        return self.escaped(" ".join(filter(None, (column.name, column.arrow, f"[{unit}]" if unit else ""))))
 
     def _raised(self, mark: str) -> str:
         return f"<sup>{mark}</sup>"
 
     def _number(self, cell: TableCell) -> str:
-        text = self._escaped(cell.text)
+        text = self.escaped(cell.text)
         return {1: f"**{text}**", 2: f"<ins>{text}</ins>"}.get(cell.rank or 0, text)
 
     def _stars(self, stars: str) -> str:
-        return self._escaped(stars)
+        return self.escaped(stars)
 
 
 class _Latex(_Markdown):
@@ -180,33 +173,31 @@ class _Latex(_Markdown):
 
     dash, plus_minus = "--", r"$\pm$"
 
-    def _escaped(self, text: str) -> str:
+    def escaped(self, text: str) -> str:
         """Plain text as LaTeX; what stands between backticks in typewriter type."""
         parts = _CODE.split(" ".join(text.split()))
         plain = [_SPECIAL.sub(lambda match: _ESCAPES[match.group()], part) for part in parts]
         return "".join(rf"\texttt{{{part}}}" if number % 2 else part for number, part in enumerate(plain))
 
-    def _table(self, table: Table) -> str:
+    def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
         count = f" ({table.count})" if table.count else ""
-        below = [f"{mark} {self._escaped(text)}." for text, mark in self._marks(table).items()]
-        below += [sentence(self._escaped(note)) for note in table.notes]
-        head, *rows = (rf"{' & '.join(cells)} \\" for cells in self._rows(table))
+        head, *body = (rf"{' & '.join(cells)} \\" for cells in rows)
         printed = [row[0].published for row in table.cells]
         if True in printed[1:] and not printed[0]:
-            rows.insert(printed.index(True), r"\midrule")
+            body.insert(printed.index(True), r"\midrule")
         lines = [
             r"\begin{table}[t]",
             r"\centering",
-            rf"\caption{{{self._escaped(table.title + count)}}}",
+            rf"\caption{{{self.escaped(table.title + count)}}}",
             rf"\label{{tab:{re.sub('[^A-Za-z0-9:-]', '-', table.name)}}}",
             rf"\begin{{tabular}}{{l{''.join('l' if column.words else 'r' for column in table.columns[1:])}}}",
             r"\toprule",
             head,
             r"\midrule",
-            *rows,
+            *body,
             r"\bottomrule",
             r"\end{tabular}",
-            *([r"\par\smallskip", rf"{{\footnotesize {' '.join(below)}}}"] if below else []),
+            *([r"\par\smallskip", rf"{{\footnotesize {' '.join(notes)}}}"] if notes else []),
             r"\end{table}",
         ]
         return "\n".join(lines)
@@ -218,28 +209,16 @@ class _Latex(_Markdown):
         return self._raised(stars)
 
     def _number(self, cell: TableCell) -> str:
-        text = _MINUS.sub("$-$", self._escaped(cell.text))
+        text = _MINUS.sub("$-$", self.escaped(cell.text))
         return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(cell.rank or 0, text)
 
 
-_PLAIN, _MARKDOWN, _LATEX = _PlainText(), _Markdown(), _Latex()
+_MARKDOWN, _LATEX = _Markdown(), _Latex()
 
-
-@dataclass(frozen=True, repr=False)
-class DisplayTable(Table):
-    """A table that ``print`` shows as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame."""
-
-    def __str__(self) -> str:
-        """The table as text."""
-        return terminal_text([self])
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        """The table as HTML; notebooks ask for it."""
-        from coliags_plugin.reporting.html_page import html_blocks
-
-        return html_blocks([self])
+#: Blocks as text, with empty lines between them.
+terminal_text = _Text().blocks
+#: A table with its title, footnotes and notes as Markdown, or as an environment ``table``: the columns that are shown.
+markdown_table, latex_table = _MARKDOWN.table, _LATEX.table
 
 
 def page_text(page: Page) -> str:
@@ -248,24 +227,14 @@ def page_text(page: Page) -> str:
     return "\n\n".join(filter(None, [head, terminal_text(page.text_sections)]))
 
 
-def terminal_text(blocks: Sequence[Block]) -> str:
-    """Blocks as text, with empty lines between them."""
-    return _PLAIN.text(blocks)
-
-
 def markdown_text(page: Page) -> str:
     """A page without its figures."""
-    escaped = _MARKDOWN._escaped
+    escaped = _MARKDOWN.escaped
     parts = [f"# {escaped(page.title)}", f"> {escaped(page.note)}" if page.note else ""]
-    parts.append(_MARKDOWN.text([FactList([fact for fact in page.facts if not fact.wide])]))
+    parts.append(_MARKDOWN.blocks([FactList([fact for fact in page.facts if not fact.wide])]))
     parts += [f"{fact.name}: {escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
     parts.append("\n".join(f"- **{escaped(caution)}**" for caution in page.cautions))
-    return "\n\n".join(filter(None, [*parts, _MARKDOWN.text(page.text_sections)])) + "\n"
-
-
-def markdown_table(table: Table) -> str:
-    """A table with its title, footnotes and notes: the columns that are shown."""
-    return _MARKDOWN.text([table])
+    return "\n\n".join(filter(None, [*parts, _MARKDOWN.blocks(page.text_sections)])) + "\n"
 
 
 def latex_text(page: Page) -> str:
@@ -280,11 +249,6 @@ def _tables_of(blocks: Sequence[Block]) -> Iterator[Table]:
             yield block
         elif isinstance(block, (Section, Folded)):
             yield from _tables_of(block.blocks)
-
-
-def latex_table(table: Table) -> str:
-    """A ``table`` environment with caption, label, footnotes and notes: the columns that are shown."""
-    return _LATEX.text([table])
 
 
 def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -9,6 +10,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from coliags_plugin.comparison.report.report import Choices, report_page
+from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
@@ -34,15 +37,17 @@ from coliags_plugin.reporting.model import (
 )
 from coliags_plugin.reporting.numbers import DASH
 from coliags_plugin.reporting.text_formats import (
-    DisplayTable,
+    latex_table,
     latex_text,
+    markdown_table,
     markdown_text,
     page_text,
     page_values,
     terminal_text,
 )
+from tests.comparison.report.made import decided, made_scenes, write_comparison
 
-PLAIN = DisplayTable(
+PLAIN = Table(
     "A <title>",
     [Column("method"), Column("n"), Column("psnr", unit="dB")],
     [{"method": "a&b", "n": 12, "psnr": 31.456}, {"method": "c"}],
@@ -60,6 +65,9 @@ MARKED = Table(
     "8 scenes",
     "summary",
 )
+NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
+COLUMNS = [Column("method", "Method"), Column("x", NASTY, "mm^2", "lower")]
+OF_NASTY_NAMES = Table(NASTY, COLUMNS, [{"method": NASTY, "x": TableCell("1", 1.0, note=NASTY)}], name="nasty")
 CHART = Chart([Series("line", 0, [0, 1], [2, 3])], "x", "y", "A chart", legend=True)
 PICTURES = [EncodedImage.png(np.full((2, 3, 3), grey, np.uint8)) for grey in (0, 200)]
 
@@ -82,15 +90,125 @@ def made_page():
     )
 
 
-def test_text_for_the_terminal():
-    assert (
-        str(PLAIN)
-        == repr(PLAIN)
-        == "A <title>\nmethod   n  psnr (dB)\na&b     12      31.46\nc        -          -\na note"
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    """A report with every kind of table."""
+    methods = {"coliags": 2.0, "scaffold-gs": 0.5, "ablations/none": 0.0}
+    folder = write_comparison(tmp_path_factory.mktemp("comparison"), made_scenes(methods, seeds=2)[:-2])
+    return report_page(decided(read_study([folder]), "psnr", "depth_mse"), Choices(note=NASTY))
+
+
+def tables_of(blocks):
+    for block in blocks:
+        if isinstance(block, Table):
+            yield block
+        elif isinstance(block, (Folded, Section)):
+            yield from tables_of(block.blocks)
+
+
+def said(table):
+    """What every rendering must say of the shown cells: rank, text, spread, stars, and mark of the footnote."""
+    table = table.only_shown()
+    marks = {text: f"[{note.mark}]" for text, note in table.footnotes.items()}
+    return [
+        [
+            (f"<{c.rank}>" if c.rank in (1, 2) and c.text else "")
+            + f"{c.text or DASH}{f' ± {c.spread}' if c.spread else ''}{c.stars}{marks.get(c.note, '')}"
+            for c in row
+        ]
+        for row in table.cells
+    ]
+
+
+#: What stands for the marks of each language, in this order.
+MARKDOWN = {r"^\*\*(.+?)\*\*": r"<1>\1", "<ins>(.+?)</ins>": r"<2>\1", r"<sup>(\w+)</sup>": r"[\1]", r"\\(.)": r"\1"}
+LATEX = {
+    r"\\textbf\{(.+?)\}": r"<1>\1",
+    r"\\underline\{(.+?)\}": r"<2>\1",
+    r"\$\^\{(\*+)\}\$": r"\1",
+    r"\$\^\{(\w+)\}\$": r"[\1]",
+    r"\$\\pm\$": "±",
+    r"\$([-<>|])\$": r"\1",
+    "^--": DASH,
+    r"\\textasciitilde\{\}": "~",
+    r"\\textasciicircum\{\}": "^",
+    r"\\textbackslash\{\}": r"\\\\",
+    r"\\texttt\{(.*?)\}": r"`\1`",
+    r"\\(.)": r"\1",
+}
+HTML = {
+    '<span class="best">': "<1>", '<span class="second">': "<2>", r"<sup>(\w+)</sup>": r"[\1]",
+    "<(?![12]>).*?>": "",
+}  # fmt: skip
+
+
+def unmarked(cell, rules):
+    cell = cell.strip()
+    for pattern, text in rules.items():
+        cell = re.sub(pattern, text, cell)
+    return cell
+
+
+def markdown_cells(text):
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[unmarked(cell, MARKDOWN) for cell in re.findall(r"((?:\\.|[^|\\])*)\|", row)[1:]] for row in rows[2:]]
+
+
+def latex_cells(text):
+    body = text.split(r"\midrule", 1)[1].split(r"\bottomrule")[0].replace("\\midrule\n", "")
+    rows = [re.split(r"(?<!\\)&", line.removesuffix("\\\\")) for line in body.strip().splitlines()]
+    return [[unmarked(cell, LATEX) for cell in row] for row in rows]
+
+
+def html_cells(text):
+    rows = re.findall("<tr.*?>(.*?)</tr>", text, re.DOTALL)[1:]
+    cells = [re.findall(r"<t[hd]((?:(?! hidden)[^>])*)>(.*?)</t[hd]>", row, re.DOTALL) for row in rows]
+    return [[html.unescape(unmarked(cell, HTML)) for _, cell in row] for row in cells]
+
+
+def test_all_formats_have_the_same_numbers(report):
+    tables, text, tex = [*tables_of(report.sections)], markdown_text(report), latex_text(report)
+    names = [table.name for table in tables]
+    assert {"summary-test", "summary-rotation", "lead-test-psnr", "costs", "scene-scene-3-test"} < {*names}
+    assert len(names) == len({*names}) == len({*re.findall(r"\\label\{(.*?)\}", tex)})
+    assert sum(cell.stars != "" for table in tables for row in table.cells for cell in row) > 10
+    assert all(markdown_table(table) in text and latex_table(table) in tex for table in tables)
+    for table in (*tables, PLAIN, MARKED, OF_NASTY_NAMES):
+        assert markdown_cells(markdown_table(table)) == said(table)
+        assert latex_cells(latex_table(table)) == said(table)
+        assert html_cells(html_blocks([table])) == said(table)
+
+
+def test_latex_is_tables_and_comments(report):
+    """Nothing but comments stands between the tables, so that the file can be included anywhere."""
+    text = latex_text(report)
+    outside = re.sub(r"\\begin\{table\}.*?\\end\{table\}", "", text, flags=re.DOTALL)
+    assert all(not line or line.startswith("%") for line in outside.splitlines())
+    assert all(caution in outside for caution in report.cautions) and report.cautions
+    for table in re.findall(r"\\begin\{table\}.*?\\end\{table\}", text, flags=re.DOTALL):
+        assert table.count("{") - table.count(r"\{") == table.count("}") - table.count(r"\}")
+        assert (table.count("$") - table.count(r"\$")) % 2 == 0
+        columns = len(re.search(r"\\begin\{tabular\}\{(.*)\}", table).group(1))
+        rows = [line for line in table.splitlines() if line.endswith(r"\\")]
+        assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {columns}
+        assert table.isascii()
+    text = latex_text(made_page())
+    assert r"\caption{Means (8 scenes)}" in text and r"\label{tab:summary}" in text and r"\begin{tabular}{lr}" in text
+    assert "other & --$^{a}$ \\\\\n\\midrule\nprinted" in text and "% A & b\n% careful" in text
+    assert r"{\footnotesize $^{a}$ no weights. $\pm$ over scenes.}" in text
+    nasty = latex_table(OF_NASTY_NAMES)
+    assert r"a\_b \& 50 \% $<$of$>$ \{x\} \$y\$ \#1 \textasciitilde{} \textasciicircum{} \textbackslash{}z $|$" in nasty
+    assert r"\caption{run \texttt{coliags list\_all}, or \textasciigrave{}a}" in latex_table(
+        Table("run `coliags list_all`, or `a", [], [])
     )
+
+
+def test_text_for_the_terminal():
+    printed = "A <title>\nmethod   n  psnr (dB)\na&b     12      31.46\nc        -          -\na note."
+    assert str(PLAIN) == repr(PLAIN) == printed
     text = page_text(made_page())
     assert text.startswith("length  3.142 mm²\nlong    words (a remark)\nResearch <use>\ncareful\n\nTables\nwhy <so>\n")
-    lines = ["coliags 31.20 ± 0.30*", "other - [a]", "printed 30.1", "[a] no weights", "± over scenes"]
+    lines = ["coliags 31.20 ± 0.30*", "other - [a]", "printed 30.1", "[a] no weights.", "± over scenes."]
     assert "\n".join(lines) in re.sub(" +", " ", text)
     assert "what: it is. Mend it" in text and "a/mesh.ply: the mesh" in text
     assert "a.b  yes\na.c  0.25" in text and "/home" not in text and "Images" not in text and "Nothing" not in text
@@ -122,10 +240,7 @@ def test_notebooks_show_what_print_shows_and_text_shows_nothing_there(monkeypatc
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setattr("rich.jupyter.display", lambda *given: shown.append(given))
     assert "31.46" in str(PLAIN) and shown == []
-    html = ET.fromstring(f"<div>{PLAIN._repr_html_().replace(' hidden', '')}</div>")
-    cells = [[" ".join("".join(cell.itertext()).split()) for cell in row] for row in html.iter("tr")]
-    assert cells == [["method", "n", "psnr dB"], ["a&b", "12", "31.46"], ["c", DASH, DASH]]
-    assert "".join(html.find(".//caption").itertext()) == "A <title>" and html.find(".//li").text == "a note."
+    assert PLAIN._repr_html_() == html_blocks([PLAIN])
 
 
 def test_pictures_without_room_are_written_beside_the_page(tmp_path):
@@ -148,15 +263,8 @@ def test_markdown():
         "# A & b\n\n> Research \\<use\\>\n\n- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
     )
     assert "**Means** (8 scenes)\n\n| Method | PSNR ↑ \\[dB\\] |\n| --- | ---: |\n" in text
-    assert "<sup>a</sup> no weights  \n± over scenes." in text and "### Nested\n\n#### More" in text
+    assert "<sup>a</sup> no weights.  \n± over scenes." in text and "### Nested\n\n#### More" in text
     assert "[mesh.ply](a/mesh.ply): the mesh" in text
-
-
-def test_latex():
-    text = latex_text(made_page())
-    assert r"\caption{Means (8 scenes)}" in text and r"\label{tab:summary}" in text and r"\begin{tabular}{lr}" in text
-    assert "other & --$^{a}$ \\\\\n\\midrule\nprinted" in text
-    assert r"{\footnotesize $^{a}$ no weights. $\pm$ over scenes.}" in text and "% A & b\n% careful" in text
 
 
 def test_json_values():

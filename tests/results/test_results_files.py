@@ -85,20 +85,15 @@ def test_any_change_of_one_value_is_found_out(data, result, tmp_path):
     assert "changed or damaged" in refusal(path)
 
 
-def test_the_hash_knows_sets_frames_and_metrics():
-    part = made_set()
-    renamed = made_set(("0000", "0009"))
-    swapped = part.model_copy(update={"values": {**part.values, "psnr": part.values["psnr"][::-1]}})
-    hashes = [metrics_sha256(sets) for sets in ({"test": part}, {"other": part}, {"test": renamed}, {"test": swapped})]
-    assert len(set(hashes)) == 4
-
-
 def test_the_hash_is_of_the_documented_text_whatever_the_order_of_names():
     part = made_set(("f",), (30.1,), (None,))
     turned = part.model_copy(update={"values": dict(reversed(part.values.items()))})
     values = '{"frames":["f"],"values":{"depth_mse":[null],"lpips":[null],"psnr":[30.1]}}'
     expected = hashlib.sha256(f'{{"a":{values},"b":{values}}}'.encode()).hexdigest()
     assert metrics_sha256({"a": part, "b": part}) == metrics_sha256({"b": turned, "a": part}) == expected
+    renamed, changed = made_set(("g",), (30.1,), (None,)), made_set(("f",), (30.2,), (None,))
+    others = ({"a": part}, {"b": part}, {"a": renamed}, {"a": changed})
+    assert len({metrics_sha256(sets) for sets in others}) == 4
 
 
 # Hash of images
@@ -140,16 +135,12 @@ def test_the_hash_of_images_does_not_depend_on_their_memory():
 # Refusals
 
 
-def test_a_missing_file(tmp_path):
-    assert all("cannot read" in refusal(path) for path in (tmp_path / "gone.json", tmp_path))
-
-
 @pytest.mark.parametrize(
     ("content", "part"),
     [
         (b"", "is not JSON"),
         (b"psnr,30", "is not JSON"),
-        (b'{"format": "coliags-result",,}', "is not JSON"),
+        (b'{"format": "coliags-result", "vers', "is not JSON"),  # cut off
         (b"\xff\xfe\x00", "cannot read"),
         (b"[" * 100_000, "result.json is"),
         (b"[]", "is not a results file"),
@@ -159,46 +150,28 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "coliags-result", "version": true}', "version is true"),
         (b'{"format": "coliags-result", "version": 0}', "version is 0"),
         (b'{"format": "coliags-result", "version": 1}', "key: Field required"),
+        (b'{"format": "coliags-result", "version": %d, "x": {}}' % (VERSION + 1), "Update the package"),
     ],
 )
 def test_other_content_is_refused(content, part, tmp_path):
     path = tmp_path / "result.json"
     path.write_bytes(content)
     assert part in refusal(path)
-
-
-@quick
-@given(share=st.floats(0.0, 0.999))
-def test_a_file_that_is_cut_off_is_refused(share, tmp_path):
-    path = tmp_path / "result.json"
-    write_result(path, made_result())
-    whole = path.read_bytes().rstrip()
-    path.write_bytes(whole[: int(share * len(whole))])
-    assert "is not JSON" in refusal(path)
-
-
-def test_a_newer_version_is_refused_whatever_else_it_has(file):
-    change(file, lambda content: content.update(version=VERSION + 1, unheard_of={}))
-    assert "newer version of coliags_plugin" in refusal(file) and "Update the package" in refusal(file)
-
-
-@pytest.mark.parametrize("name", [name for name, field in Result.model_fields.items() if field.is_required()])
-def test_a_missing_field_is_named(name, file):
-    change(file, lambda content: content.pop(name))
-    assert f"{name}: Field required" in refusal(file)
+    assert all("cannot read" in refusal(place) for place in (tmp_path / "gone.json", tmp_path))
 
 
 @pytest.mark.parametrize(
     ("keys", "value", "part"),
     [
+        *(((name,), None, f"{name}: ") for name, field in Result.model_fields.items() if field.is_required()),
         (("seed",), "0", "seed: "),
         (("seed",), 0.5, "seed: "),
-        (("steps",), None, "steps: "),
         (("scene", "size"), [32], "scene.size"),
         (("scene", "fingerprint"), 3, "scene.fingerprint: "),
         (("protocol", "version"), "one", "protocol.version: "),
         (("metrics", "psnr", "direction"), "up", "metrics.psnr.direction: "),
         (("sets", "test", "values", "psnr"), [30.0, "31.5"], "sets.test.values.psnr.1: "),
+        (("sets", "test", "values", "psnr"), [30.0, math.nan], "sets.test.values.psnr.1"),
         (("sets", "test", "values", "psnr"), [30.0], "metric 'psnr' has 1 values for 2 frames"),
         (("sets", "test", "values", "sharpness"), [1.0, 2.0], "values of sharpness, which `metrics`"),
         (("sets", "test", "frames"), ["0000", "0000"], "a frame is listed twice"),
@@ -218,9 +191,7 @@ def test_a_field_of_the_wrong_type_is_named(keys, value, part, file):
     assert part in refusal(file)
 
 
-def test_numbers_that_are_not_finite_are_refused(file):
-    file.write_text(file.read_text().replace("31.5", "NaN"))
-    assert "sets.test.values.psnr.1" in refusal(file)
+def test_what_cannot_be_written_is_refused():
     with pytest.raises(ValidationError, match="finite"):
         made_set(psnr=(30.0, math.inf))
     with pytest.raises(ValidationError, match="rgb_mse has 1 numbers for 2 bins"):
