@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.leads import p_text
 from coliags_plugin.comparison.report.published import _C3VD_FRAMES
 from coliags_plugin.comparison.report.report import Choices, per_frame_csv, report_page
 from coliags_plugin.comparison.report.sources import read_study
@@ -260,11 +259,6 @@ def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
     assert not stars(other, "psnr")
     best = report_page(decided(study, "psnr", reference="2dgs"), Choices())
     assert stars(best, "psnr") == {"coliags": "*", "3dgs": "*"}
-
-
-def test_p_text():
-    texts = {1.0: "1", 0.0625: ".062", 0.03125: ".031", 0.0078125: ".0078", 0.5: ".5", 9e-5: "< .0001"}
-    assert {p: p_text(p) for p in texts} == texts
 
 
 # Cautions
