@@ -23,7 +23,8 @@ from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.executors import ExecutionOptions
 from coliags_plugin.execution.queue import make_executor
-from coliags_plugin.reporting.model import Column, Table, Value
+from coliags_plugin.reporting.model import Column, Value
+from coliags_plugin.reporting.text_formats import DisplayTable
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ class FinishedComparison:
     results: Sequence[Result]  # of the cells that are done, in their order
     failures: Sequence[FailureRecord]  # of those that are not
 
-    def table(self, columns: Sequence[str] = COLUMNS) -> Table:
+    def table(self, columns: Sequence[str] = COLUMNS) -> DisplayTable:
         """Mean of metrics over every method's finished cells, of their main test sets, with the reasons of failures.
 
         Raises:
@@ -58,7 +59,7 @@ class FinishedComparison:
             own = by_method[method]
             means = {name: _mean(own, name) for name in columns}
             rows.append({"method": method, "done": f"{len(own)} of {count}", **means})
-        return Table(
+        return DisplayTable(
             f"{len(self.results)} of {len(self.cells)} cells",
             [Column("method"), Column("done"), *(Column(name, unit=units.get(name, "")) for name in columns)],
             rows,
@@ -112,14 +113,14 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
     return FinishedComparison(folder.path, cells, results, failures)
 
 
-def dry_run(request: Request, folder: ComparisonFolder) -> Table:
+def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:
     """What :func:`carry_out` would do with each cell; writes nothing."""
     cells = _plan_cells(request, folder)
     folder.read_results()
     return _states(cells, folder)
 
 
-def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> Table:
+def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> DisplayTable:
     """Every cell with its state: done, resume, new, same (as an earlier cell), or scene to make."""
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
@@ -142,7 +143,7 @@ def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> Table:
         columns.append(Column("changed", "done before, but changed", words=True))
     counts = Counter(row["state"] for row in rows)
     states = ", ".join(f"{count} {state}" for state, count in counts.items())
-    return Table(f"{len(cells)} cells: {states}", columns, rows)
+    return DisplayTable(f"{len(cells)} cells: {states}", columns, rows)
 
 
 def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCell]:

@@ -93,12 +93,9 @@ class Footnote:
     columns: tuple[str, ...]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Table:
-    """A table: columns, and rows of values or cells by the keys of the columns.
-
-    ``print`` shows it as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame.
-    """
+    """A table: columns, and rows of values or cells by the keys of the columns."""
 
     title: str
     columns: Sequence[Column]  # the first one labels the rows
@@ -111,20 +108,6 @@ class Table:
     def cells(self) -> list[list[TableCell]]:
         """One cell per row and column."""
         return [[as_cell(row.get(column.key)) for column in self.columns] for row in self.rows]
-
-    def __str__(self) -> str:
-        """The table as text."""
-        from coliags_plugin.reporting.text_formats import terminal_text
-
-        return terminal_text([self])
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        """The table as HTML; notebooks ask for it."""
-        from coliags_plugin.reporting.html_page import html_blocks
-
-        return html_blocks([self])
 
     def only_shown(self) -> Table:
         """The table without the columns that are not shown."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from rich.cells import cell_len
@@ -219,6 +220,23 @@ _MARKDOWN, _LATEX = _Markdown(), _Latex()
 terminal_text = _Text().blocks
 #: A table with its title, footnotes and notes as Markdown, or as an environment ``table``: the columns that are shown.
 markdown_table, latex_table = _MARKDOWN.table, _LATEX.table
+
+
+@dataclass(frozen=True, repr=False)
+class DisplayTable(Table):
+    """A table that ``print`` shows as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame."""
+
+    def __str__(self) -> str:
+        """The table as text."""
+        return terminal_text([self])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The table as HTML; notebooks ask for it."""
+        from coliags_plugin.reporting.html_page import html_blocks
+
+        return html_blocks([self])
 
 
 def page_text(page: Page) -> str:

@@ -12,8 +12,9 @@ from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.core.errors import check_name
-from coliags_plugin.reporting.model import Column, Table, Value, value_text
+from coliags_plugin.reporting.model import Column, Value, value_text
 from coliags_plugin.reporting.numbers import Direction
+from coliags_plugin.reporting.text_formats import DisplayTable
 
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1
@@ -200,7 +201,7 @@ class Result(_Part):
             f"protocol {self.protocol.name} v{self.protocol.version}"
         )
 
-    def table(self) -> Table:
+    def table(self) -> DisplayTable:
         """Means of the metrics that a test set has, over every test set, with the reasons of those that are missing."""
         rows: list[dict[str, Value]] = [
             {"metric": name, "unit": metric.unit, **{key: part.mean(name) for key, part in self.sets.items()}}
@@ -211,7 +212,7 @@ class Result(_Part):
         without = {each: [name for name in reasons if reasons[name] == each] for each in reasons.values()}
         warnings = {name: part.transparency_warning for name, part in self.sets.items()}
         sets = [Column(name, f"{name} ({len(part.frames)} frames)") for name, part in self.sets.items()]
-        return Table(
+        return DisplayTable(
             self.title,
             [Column("metric"), Column("unit"), *sets],
             rows,

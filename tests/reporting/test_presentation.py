@@ -37,6 +37,7 @@ from coliags_plugin.reporting.model import (
 )
 from coliags_plugin.reporting.numbers import DASH
 from coliags_plugin.reporting.text_formats import (
+    DisplayTable,
     latex_table,
     latex_text,
     markdown_table,
@@ -47,7 +48,7 @@ from coliags_plugin.reporting.text_formats import (
 )
 from tests.comparison.report.made import decided, made_scenes, write_comparison
 
-PLAIN = Table(
+PLAIN = DisplayTable(
     "A <title>",
     [Column("method"), Column("n"), Column("psnr", unit="dB")],
     [{"method": "a&b", "n": 12, "psnr": 31.456}, {"method": "c"}],
