@@ -112,25 +112,15 @@ def test_the_first_tap_against_numpy():
     assert distance.item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_building_a_network_draws_no_random_numbers():
+def test_building_a_network_draws_no_random_numbers(pair):
     state = torch.random.get_rng_state()
-    LPIPSNetwork("alex", random_backbone("alex"), list(random_heads("alex").values()))
+    network = LPIPSNetwork("vgg", random_backbone("vgg"), list(random_heads("vgg").values()))
     assert torch.equal(torch.random.get_rng_state(), state)
+    image, truth = (x.permute(2, 0, 1)[None] for x in (pair.rgb, pair.true_rgb))
+    assert 0 < network(image, truth, pair.valid).item() < 100
 
 
 # ------------------------------------------------------------------------------------------------- finding the weights
-
-
-@pytest.mark.parametrize("net", NETS)
-def test_torch_hub_s_folder_is_found(net, nowhere, pair):
-    checkpoints = nowhere / "torch" / "hub" / "checkpoints"
-    checkpoints.mkdir(parents=True)
-    lay_out(checkpoints, net, "{}.pth")
-    distance = make("lpips", net=net)(pair)
-    assert 0 < distance < 100
-    plain = LPIPSNetwork(net, random_backbone(net), list(random_heads(net).values()))
-    image, truth = (x.permute(2, 0, 1)[None] for x in (pair.rgb, pair.true_rgb))
-    assert distance == pytest.approx(plain(image, truth, pair.valid).item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("heads", ["{}.pth", "v0.1/{}.pth", "lpips_{}.pth"])

@@ -1,4 +1,4 @@
-"""LPIPS weights are installed where LPIPS finds them, or not at all."""
+"""LPIPS weights are installed where LPIPS finds them, or not at all; a server here stands for the real ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import ast
 import hashlib
 import logging
 import re
+import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,15 +21,22 @@ from coliags_plugin.metrics import lpips_install
 from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
 from coliags_plugin.metrics.lpips_network import LPIPSNetwork
 from coliags_plugin.metrics.lpips_weights import BACKBONE_FILES, DEFAULT_NETS, find_weights, load_network, weights_in
-from tests.file_server import file_server
+from tests.commands import refused, run
 from tests.metrics.made import images, make
 from tests.metrics.weight_files import lay_out, random_backbone, random_heads
 
 NETS = ("alex", "squeeze")
+ALEX = (BACKBONE_FILES["alex"][0], "v0.1/alex.pth")
+SQUEEZE = (BACKBONE_FILES["squeeze"][0], "v0.1/squeeze.pth")
+EVERYTHING = sorted((*ALEX, *SQUEEZE))
 
 
 def sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def files(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 @pytest.fixture(scope="module")
@@ -38,31 +49,42 @@ def made(tmp_path_factory):
 
 
 @pytest.fixture
-def server(made, nowhere, monkeypatch):
-    """A server that has them, which the table of sources names."""
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+def cache(nowhere, monkeypatch):
+    """torch's download cache, on a machine without weights and proxies."""
+    for name in ("http_proxy", "https_proxy", "all_proxy", "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    with file_server() as server:
-        for net in NETS:
-            pair = []
-            for file, path in zip(weights_in(net, [made]), (BACKBONE_FILES[net][0], f"v0.1/{net}.pth"), strict=True):
-                server.files[f"/{path}"] = file.read_bytes()
-                pair.append(Published(f"{server.url}/{path}", {sha256(file): path}))
-            monkeypatch.setitem(SOURCES, net, tuple(pair))
-        yield server
-
-
-@pytest.fixture
-def cache(nowhere):
-    """torch's download cache."""
     return nowhere / "torch" / "hub" / "checkpoints"
 
 
-def files(folder):
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+@pytest.fixture
+def server(made, cache, monkeypatch):
+    """Files, whether responses end half way, and paths asked for, of the server that the table of sources names."""
+    state = SimpleNamespace(files={}, cut=False, requests=[])
 
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *args):
+            pass
 
-EVERYTHING = ["alexnet-owt-7be5be79.pth", "squeezenet1_1-b8a52dc0.pth", "v0.1/alex.pth", "v0.1/squeeze.pth"]
+        def do_GET(self):
+            state.requests.append(self.path)
+            data = state.files.get(self.path)
+            if data is None:
+                return self.send_error(503)
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data[: len(data) // 2] if state.cut else data)
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        state.url = f"http://127.0.0.1:{server.server_port}"
+        for net, paths in zip(NETS, (ALEX, SQUEEZE), strict=True):
+            state.files |= {f"/{path}": (made / path).read_bytes() for path in paths}
+            pair = (Published(f"{state.url}/{path}", {sha256(made / path): path}) for path in paths)
+            monkeypatch.setitem(SOURCES, net, tuple(pair))
+        yield state
+        server.shutdown()
 
 
 def direct(net, pair):
@@ -77,21 +99,15 @@ def direct(net, pair):
 
 @pytest.mark.parametrize("copied", [False, True])
 def test_what_is_downloaded_or_copied_is_found_and_gives_the_same_values(server, cache, made, pair, copied):
+    """Small files come first, and nothing is asked for where nothing is missing."""
     written = install(NETS, None, made if copied else None)
     assert sorted(path.relative_to(cache).as_posix() for path in written) == files(cache) == EVERYTHING
-    assert bool(server.requests) != copied
-    for net in NETS:
-        assert find_weights(net) == (cache / BACKBONE_FILES[net][0], cache / "v0.1" / f"{net}.pth")
+    assert server.requests[:2] == ([] if copied else ["/v0.1/alex.pth", "/v0.1/squeeze.pth"])
+    for net, (backbone, heads) in zip(NETS, (ALEX, SQUEEZE), strict=True):
+        assert find_weights(net) == (cache / backbone, cache / heads)
         assert make("lpips", net=net)(pair) == pytest.approx(direct(net, pair), rel=1e-6)
     assert install(NETS, None, made if copied else None) == []
-
-
-def test_small_files_come_first_and_nothing_is_asked_for_where_nothing_is_missing(server):
-    install(NETS, None, None)
-    assert server.requests[:2] == ["/v0.1/alex.pth", "/v0.1/squeeze.pth"]
-    server.requests.clear()
-    install(NETS, None, None)
-    assert server.requests == []
+    assert len(server.requests) == (0 if copied else 4)
 
 
 def test_only_what_is_missing_is_fetched(server, cache, made, monkeypatch):
@@ -103,16 +119,8 @@ def test_only_what_is_missing_is_fetched(server, cache, made, monkeypatch):
     assert find_weights("alex") == (cache / BACKBONE_FILES["alex"][0], other / "v0.1" / "alex.pth")
 
 
-def test_a_folder_of_one_s_own_gets_everything(server, cache, tmp_path):
-    install(NETS, None, None)
-    folder = tmp_path / "mine"
-    assert len(install(NETS, folder, None)) == 4
-    assert files(folder) == EVERYTHING
-    assert find_weights("alex", folder)[0].parent == folder
-
-
 def test_without_a_connection_all_that_is_missing_is_named(server, cache):
-    server.statuses = {"/v0.1/squeeze.pth": 503}
+    del server.files["/v0.1/squeeze.pth"]
     with pytest.raises(InputError) as caught:
         install(NETS, None, None)
     advice = re.search(r"On a machine with a connection download (.*), and pass --from FOLDER", str(caught.value))
@@ -140,42 +148,36 @@ def test_what_does_not_arrive_whole_is_not_installed(server, cache, spoil, messa
 
 
 def test_heads_beside_the_backbone_are_taken_too(server, cache, made, tmp_path):
-    for name in (BACKBONE_FILES["alex"][0], "v0.1/alex.pth"):
+    for name in ALEX:
         (tmp_path / name.rpartition("/")[2]).write_bytes((made / name).read_bytes())
     install(["alex"], None, tmp_path)
-    assert files(cache) == ["alexnet-owt-7be5be79.pth", "v0.1/alex.pth"]
+    assert files(cache) == [*ALEX]
 
 
-def test_a_copy_under_another_name_gets_that_of_its_checksum(server, cache, made, tmp_path, monkeypatch):
+def test_a_copy_under_another_name_gets_that_of_its_checksum(server, cache, tmp_path, monkeypatch):
     """Features alone must not pass for torchvision's file, wherever they lie."""
     lay_out(tmp_path, "squeeze")
-    file = tmp_path / BACKBONE_FILES["squeeze"][0]
-    torch.save(random_backbone("squeeze"), file)
+    torch.save(random_backbone("squeeze"), tmp_path / SQUEEZE[0])
     backbone, heads = SOURCES["squeeze"]
-    known = {**backbone.known, sha256(file): "squeeze.backbone.pth"}
-    monkeypatch.setitem(
-        SOURCES,
-        "squeeze",
-        (Published(backbone.url, known), Published(heads.url, {sha256(tmp_path / "v0.1/squeeze.pth"): heads.path})),
-    )
+    known = {**backbone.known, sha256(tmp_path / SQUEEZE[0]): "squeeze.backbone.pth"}
+    pair = Published(backbone.url, known), Published(heads.url, {sha256(tmp_path / SQUEEZE[1]): heads.path})
+    monkeypatch.setitem(SOURCES, "squeeze", pair)
     install(["squeeze"], None, tmp_path)
     assert files(cache) == ["squeeze.backbone.pth", "v0.1/squeeze.pth"]
     assert find_weights("squeeze")[0] == cache / "squeeze.backbone.pth"
 
 
-@pytest.mark.parametrize("which", ["backbone", "heads"])
-def test_nothing_is_copied_if_one_file_is_another(server, cache, made, tmp_path, which):
-    lay_out(tmp_path, "alex")
-    name = BACKBONE_FILES["alex"][0] if which == "backbone" else "v0.1/alex.pth"
-    spoiled = bytearray((made / name).read_bytes())
-    spoiled[len(spoiled) // 2] ^= 1
-    (tmp_path / name).write_bytes(spoiled)
-    for other in {BACKBONE_FILES["alex"][0], "v0.1/alex.pth"} - {name}:
-        (tmp_path / other).write_bytes((made / other).read_bytes())
+@pytest.mark.parametrize("name", ALEX)
+def test_nothing_is_copied_if_one_file_is_another(server, cache, made, tmp_path, name):
+    (tmp_path / "v0.1").mkdir()
+    for each in ALEX:
+        data = bytearray((made / each).read_bytes())
+        data[len(data) // 2] ^= each == name
+        (tmp_path / each).write_bytes(data)
     with pytest.raises(InputError) as caught:
         install(["alex"], None, tmp_path)
-    text = str(caught.value)
-    assert str(tmp_path / name) in text and hashlib.sha256(spoiled).hexdigest() in text and sha256(made / name) in text
+    told = (str(tmp_path / name), sha256(tmp_path / name), sha256(made / name))
+    assert all(part in str(caught.value) for part in told)
     assert not cache.exists()
 
 
@@ -183,12 +185,9 @@ def test_a_folder_that_lacks_files_says_which(server, cache, made, tmp_path):
     (tmp_path / "alex.pth").write_bytes((made / "v0.1/alex.pth").read_bytes())
     with pytest.raises(InputError) as caught:
         install(NETS, None, tmp_path)
-    for name in ("alexnet-owt-7be5be79.pth", "v0.1/squeeze.pth", "squeezenet1_1-b8a52dc0.pth"):
-        assert f"{server.url}/{name}" in str(caught.value)
-    assert "v0.1/alex.pth" not in str(caught.value)
+    for name in EVERYTHING:
+        assert (f"{server.url}/{name}" in str(caught.value)) == (name != "v0.1/alex.pth")
     assert not cache.exists()
-    with pytest.raises(InputError, match="is not a folder"):
-        install(NETS, None, tmp_path / "nothing")
 
 
 # What is there already
@@ -218,6 +217,68 @@ def test_weights_of_one_s_own_are_used_with_a_warning(server, cache, made, caplo
     assert [f"{file} is not the published file: its SHA-256 is {sha256(file)}"] == caplog.messages
 
 
+# The command
+
+
+def test_a_newcomer_s_way(server, cache, capsys):
+    """doctor names the command, which installs; then both say that all is there, and where."""
+    where = f"LPIPS squeeze: backbone {cache / SQUEEZE[0]}, linear heads {cache / SQUEEZE[1]}\n"
+
+    def doctor():
+        assert run("doctor") == 0
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if "weights of LPIPS squeeze" in line]
+        return line
+
+    line = doctor()
+    assert line.startswith("-  ") and "run `coliags weights lpips`" in line
+    for told in (where, f"{where}Everything was there already.\n"):
+        assert run("weights", "lpips", "--net", "squeeze") == 0
+        assert capsys.readouterr().out == told
+    assert len(server.requests) == 2
+    line = doctor()
+    assert line.startswith("ok ") and line.endswith(f"{cache / SQUEEZE[0]} and {cache / SQUEEZE[1]}")
+
+
+def test_a_folder_of_one_s_own_gets_everything_and_the_command_says_what_to_set(
+    server, cache, made, tmp_path, monkeypatch, capsys
+):
+    install(NETS, None, made)
+    mine = tmp_path / "mine"
+    argv = ("weights", "lpips", "--net", "squeeze", "--from", made, "--folder", mine)
+    assert run(*argv) == 0
+    assert files(mine) == [*SQUEEZE]
+    assert f"Set COLIAGS_LPIPS_WEIGHTS={mine} " in capsys.readouterr().out
+    monkeypatch.setenv("COLIAGS_LPIPS_WEIGHTS", str(mine))
+    assert run(*argv) == 0
+    assert "Set COLIAGS" not in capsys.readouterr().out
+    assert find_weights("squeeze") == (mine / SQUEEZE[0], mine / SQUEEZE[1])
+    assert not server.requests
+
+
+@pytest.mark.parametrize(
+    ("choice", "nets"),
+    [([], ["vgg", "squeeze"]), (["--net", "alex"], ["alex"]), (["--net", "all"], ["vgg", "alex", "squeeze"])],
+)
+def test_offline_all_files_of_the_nets_are_named(cache, monkeypatch, capsys, choice, nets):
+    def unknown(*args, **options):
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    message = refused(capsys, "weights", "lpips", *choice)
+    assert "cannot download https://raw.githubusercontent.com" in message and "--from FOLDER" in message
+    for net, pair in SOURCES.items():
+        assert all((published.url in message) == (net in nets) for published in pair)
+    assert files(cache) == []
+
+
+def test_bad_input(capsys, cache, tmp_path):
+    assert "is not a folder" in refused(capsys, "weights", "lpips", "--from", tmp_path / "nothing")
+    (tmp_path / "file").write_text("x")
+    assert "cannot write" in refused(capsys, "weights", "lpips", "--folder", tmp_path / "file")
+    assert run("weights") == 2
+    assert run("weights", "lpips", "--net", "resnet") == 2
+
+
 # The table
 
 
@@ -238,8 +299,6 @@ def test_checksums_of_backbones_are_those_in_their_names():
         assert re.fullmatch(rf"https://download\.pytorch\.org/models/[\w-]+-{first(backbone)}\.pth", backbone.url)
         assert backbone.path == backbone.url.rpartition("/")[2] == BACKBONE_FILES[net][0]
         assert re.fullmatch("[0-9a-f]{8}", first(backbone)) and re.fullmatch("[0-9a-f]{64}", first(heads))
-        assert heads.url.endswith(f"/richzhang/PerceptualSimilarity/master/lpips/weights/{heads.path}")
-    assert set(SOURCES["alex"][0].known) == {"7be5be79", "4df8aa71"}
 
 
 # The real files
@@ -250,7 +309,7 @@ def test_the_published_heads_have_the_checksums_of_the_table(shared_data):
         assert sha256(shared_data / "lpips" / heads.path) == first(heads)
 
 
-def test_the_real_squeezenet_is_installed_and_scores_as_where_it_was(shared_data, nowhere, cache, examples):
+def test_the_real_squeezenet_is_installed_and_scores_as_where_it_was(shared_data, cache, examples):
     written = install(["squeeze"], None, shared_data / "lpips")
     assert sorted(written) == sorted(cache / name for name in files(cache)) == sorted(find_weights("squeeze"))
     comparison = images(examples["p0"], examples["ref"])
