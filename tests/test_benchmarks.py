@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 import tyro
 
 from coliags_plugin.comparison.named_files import load_ablation
@@ -36,15 +35,13 @@ SIZE = ("--size", "48x36")
 def run(monkeypatch, capsys):
     """Runs a benchmark in this process and returns what it prints."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    threads = torch.get_num_threads()
 
     def of(name, *argv):
         benchmark = import_module(name)
         benchmark.main(tyro.cli(benchmark.Options, args=list(map(str, argv))))
         return capsys.readouterr().out
 
-    yield of
-    torch.set_num_threads(threads)
+    return of
 
 
 @pytest.mark.parametrize("is_right", [True, False])

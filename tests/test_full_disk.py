@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -89,14 +88,3 @@ def test_a_training_log_that_is_no_file_is_a_message(tmp_path):
     run.log_file.symlink_to("metrics.jsonl")
     with pytest.raises(InputError, match="cannot write"), run.log_writer():
         pass
-
-
-@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
-def test_tensors_have_the_permissions_that_the_umask_leaves(tmp_path, mask):
-    before = os.umask(mask)
-    try:
-        checkpoint(tmp_path / "target", 2)
-    finally:
-        os.umask(before)
-    assert (tmp_path / "target/state.safetensors").stat().st_mode & 0o777 == 0o666 & ~mask
-    assert (tmp_path / "target").stat().st_mode & 0o777 == 0o777 & ~mask

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.config.assignments import assignments, parse_assignments
@@ -27,6 +27,7 @@ plain = st.recursive(
 paths = st.from_regex(r"[a-z_]{1,8}(\.[a-z_]{1,8}){0,2}", fullmatch=True)
 
 
+@settings(max_examples=40, deadline=None)
 @given(settings=st.dictionaries(paths, plain, max_size=4))
 def test_settings_survive_as_texts(settings):
     found = parse_assignments(assignments(settings))

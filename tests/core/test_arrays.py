@@ -37,9 +37,9 @@ def test_wanted_arrays_come_back(tmp_path):
 
 def test_an_archive_that_expands_enormously_is_refused_before_it_does(tmp_path):
     path = tmp_path / "bomb.npz"
-    path.write_bytes(npz_bytes(compressed=True, positions=np.zeros((10_000_000, 3), np.float64)))
+    path.write_bytes(npz_bytes(compressed=True, positions=np.zeros((3_000_000, 3), np.float64)))
     assert path.stat().st_size < 1_000_000
-    with pytest.raises(InputError, match=r"expands to 240,000,\d\d\d"):
+    with pytest.raises(InputError, match=r"expands to 72,000,\d\d\d"):
         read_arrays(path, EXPECTED, ["positions"])
 
 
@@ -110,4 +110,4 @@ def test_threads_read_at_once(tmp_path):
         return float(array.sum() + read_arrays(tmp_path / "a.npz", EXPECTED, ["one"])["one"].sum())
 
     with ThreadPoolExecutor(8) as pool:
-        assert set(pool.map(read, range(1500))) == {132.0}
+        assert set(pool.map(read, range(500))) == {132.0}

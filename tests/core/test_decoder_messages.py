@@ -31,6 +31,7 @@ READ = """if True:
 """
 
 
+@pytest.mark.thorough
 def test_damage_is_told_once_and_a_warning_where_it_is_decoded(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 255, (40, 50, 3)).astype(np.uint8)
     write_exr(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 50)).astype(np.float32)})

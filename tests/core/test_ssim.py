@@ -109,15 +109,6 @@ def test_a_full_mask_is_no_mask_to_the_bit(dtype):
     assert torch.equal(ssim(a, b, full), ssim(a, b))
 
 
-def test_a_hole_leaves_distant_windows_untouched():
-    a, b = images(40, 40)
-    mask = torch.ones(40, 40, dtype=torch.bool)
-    mask[20, 20] = False
-    changed = (ssim_map(a, b, mask) != ssim_map(a, b)).any(-1)
-    assert changed[15:26, 15:26].all()
-    assert changed.sum() == 11 * 11
-
-
 @pytest.mark.parametrize("size", [(1, 6), (3, 50), (33, 64), (65, 97)])
 @pytest.mark.parametrize("with_mask", [False, True])
 def test_the_kernels_agree_with_double_precision(size, with_mask):
@@ -139,29 +130,18 @@ def test_the_kernels_agree_with_double_precision(size, with_mask):
 def test_the_kernels_give_the_same_bits_on_any_number_of_threads():
     a, b = images(37, 41, dtype=torch.float32)
     results = []
-    before = torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         rendered = a.clone().requires_grad_()
         found = ssim_map(rendered, b)
         found.square().sum().backward()
         results.append((found, rendered.grad))
-    torch.set_num_threads(before)
     assert all(torch.equal(x, y) for result in results[1:] for x, y in zip(result, results[0], strict=True))
 
 
 def test_single_precision_is_good_enough_for_training():
     a, b = images(270, 338, dtype=torch.float32)
     assert ssim(a, b).item() == pytest.approx(ssim(a.double(), b.double()).item(), abs=1e-6)
-
-
-def test_no_valid_pixel_gives_zero_with_a_graph():
-    a, b = images(12, 12)
-    a.requires_grad_()
-    value = ssim(a, b, torch.zeros(12, 12, dtype=torch.bool))
-    value.backward()
-    assert value.item() == 0.0
-    assert not a.grad.any()
 
 
 def test_the_kept_weights_survive_a_first_use_in_inference_mode():

@@ -1,19 +1,25 @@
-"""Text files are read up to a size, and long ones line by line."""
+"""Text and JSON are read up to a size, long texts line by line; anything else is a message."""
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
+from coliags_plugin.core.bounds import JSON_BYTES
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.text_files import read_text, text_lines, whole_text
 
 
-def test_text_with_and_without_a_byte_order_mark(tmp_path):
-    (tmp_path / "plain").write_bytes("à\nb\n".encode())
-    (tmp_path / "marked").write_bytes(b"\xef\xbb\xbf" + "à\nb\n".encode())
-    for name in ("plain", "marked"):
-        assert whole_text(tmp_path / name) == read_text(tmp_path / name, "x") == "à\nb\n"
-        assert list(text_lines(tmp_path / name, "x")) == [(1, "à\n"), (2, "b\n")]
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_text_and_json_with_and_without_a_byte_order_mark(tmp_path, mark):
+    file = tmp_path / "a"
+    file.write_bytes(mark + "à\nb\n".encode())
+    assert whole_text(file) == read_text(file, "x") == "à\nb\n"
+    assert list(text_lines(file, "x")) == [(1, "à\n"), (2, "b\n")]
+    file.write_bytes(mark + b'{"a": [1, 2.5]}')
+    assert read_json(file, "x") == {"a": [1, 2.5]}
 
 
 def test_sizes_up_to_the_largest_are_read(tmp_path):
@@ -26,13 +32,34 @@ def test_sizes_up_to_the_largest_are_read(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*a: it has 1,000,001 bytes, and at most 1,000,000 are read"):
         read_text(file, "x")
     assert sum(len(line) for _, line in text_lines(file, "x")) == 1_000_001
+    os.truncate(file, JSON_BYTES + 1)
+    with pytest.raises(InputError, match=r"cannot read .*a: it has 100,000,001 bytes"):
+        read_json(file, "x")
 
 
-@pytest.mark.parametrize("content", [None, b"\xff"])
-def test_what_is_not_text_is_a_message(tmp_path, content):
-    if content is not None:
+@pytest.mark.parametrize("content", [None, "loop", b"\xff\xfe"])
+@pytest.mark.parametrize("read", [read_text, lambda *args: list(text_lines(*args)), read_json])
+def test_what_is_not_text_is_a_message(tmp_path, read, content):
+    if content == "loop":
+        (tmp_path / "a").symlink_to("a")
+    elif content is not None:
         (tmp_path / "a").write_bytes(content)
-    for read in (read_text, lambda *args: list(text_lines(*args))):
-        with pytest.raises(InputError, match="cannot read") as caught:
-            read(tmp_path / "a", "a test")
-        assert caught.value.expected == "a test"
+    with pytest.raises(InputError, match="cannot read") as caught:
+        read(tmp_path / "a", "a test")
+    assert caught.value.expected == "a test"
+
+
+@pytest.mark.parametrize("content", ["", "{", "[" * 100_000, "9" * 5000])
+def test_what_is_not_json_is_a_message(tmp_path, content):
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(InputError, match=r"a\.json is not JSON") as caught:
+        read_json(tmp_path / "a.json", "a test", "Repair it")
+    assert (caught.value.expected, caught.value.do) == ("a test", "Repair it")
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_numbers_that_cannot_be_written_again(tmp_path, number):
+    (tmp_path / "a.json").write_text(f'{{"a": [{number}]}}')
+    assert set(read_json(tmp_path / "a.json", "x")) == {"a"}
+    with pytest.raises(InputError, match=f"{number} is not a finite number"):
+        read_json(tmp_path / "a.json", "x", finite=True)

@@ -15,11 +15,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
 from coliags_plugin.fields.frustum import spheres_in_frustum
+from coliags_plugin.fields.mlp import cosine_embedding
 from tests.fields.made import make_field
 from tests.scenes import camera_at, wall_scene
 
 COLIAGS = {"name": "anchors", "geometry_head": "imve", "appearance_head": "imia"}
 SCAFFOLD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
+#: The embedding of cos theta = 0.5 with five frequencies, computed by hand from the definition.
+HALF = [0.5, 0.479426, 0.877583, 0.841471, 0.540302, 0.909297, -0.416147, -0.756802, -0.653644, 0.989358, -0.145500]
 
 
 def make(node, seed=0, **options):
@@ -61,6 +64,11 @@ def test_imve_without_frequencies_decodes_as_the_plain_head():
     second = make(SCAFFOLD)
     camera = camera_at(0.0, 0.0, 0.0)
     assert torch.equal(first.gaussians(camera).scales, second.gaussians(camera).scales)
+
+
+def test_imia_embedding_of_one_half():
+    embedded = cosine_embedding(torch.tensor([[0.5]], dtype=torch.float64), 5)
+    assert embedded.tolist() == [pytest.approx(HALF, abs=5e-7)]
 
 
 def test_decoding_step_by_step():

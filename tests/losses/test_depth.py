@@ -22,18 +22,13 @@ WEIGHTED = ("depth-l1", "depth-huber", "distance-l1")
 
 
 @pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(0)
-
-
-@pytest.fixture
-def case(generator):
+def case():
     """A rendered depth, and a frame with estimated depth, a mask and unknown pixels."""
-    depth, rendered = 20 + 10 * torch.rand(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    depth, rendered = 20 + 10 * torch.rand(2, HEIGHT, WIDTH, dtype=torch.float64)
     depth[0, :3] = torch.nan
-    mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.7
-    confidence = torch.rand(HEIGHT, WIDTH, generator=generator)
-    lengths = 1 + torch.rand(HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    mask = torch.rand(HEIGHT, WIDTH) < 0.7
+    confidence = torch.rand(HEIGHT, WIDTH)
+    lengths = 1 + torch.rand(HEIGHT, WIDTH, dtype=torch.float64)
     rendered = rendered.requires_grad_()
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_accumulated=rendered, ray_lengths=lengths)
     frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), depth, mask)
@@ -142,8 +137,7 @@ def seen_along(depth, lengths, kind="depth_accumulated"):
 
 def test_it_is_the_distance_between_points_on_the_ray():
     camera = camera_at(1.0, 2.0, 3.0, 6, 5, yaw=0.4)
-    generator = torch.Generator().manual_seed(0)
-    true, drawn = 20 + 5 * torch.rand(2, 5, 6, generator=generator, dtype=torch.float64)
+    true, drawn = 20 + 5 * torch.rand(2, 5, 6, dtype=torch.float64)
     lengths = camera.rays().norm(dim=-1)
     frame = make_frame(torch.zeros(5, 6, 3, dtype=torch.uint8), true)
     found = make_distance()(seen_along(drawn, lengths), frame)
@@ -176,7 +170,7 @@ def test_a_share_of_each_image_counts_and_is_always_the_same():
         assert counted[-1].float().mean().item() == pytest.approx(0.03, abs=0.003)
     assert 0.02 < (counted[0] & counted[1]).sum() / counted[0].sum() < 0.045  # drawn for each frame by itself
     # Pixels of several frames, as of another step: the same ones count.
-    pixels = torch.randint(200, (5000, 2), generator=torch.Generator().manual_seed(0))
+    pixels = torch.randint(200, (5000, 2))
     parts = [frame.target_at(pixels) for frame in scene.train]
     depth = torch.cat([part.depth for part in parts]).requires_grad_()
     seen = concatenate_pixels([seen_along(depth + 1.0, torch.ones_like(depth))])

@@ -11,12 +11,12 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.losses.regularization import depth_normals
 from coliags_plugin.modules.gain import FrameGain
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.losses import terms
 from tests.losses.terms import make, make_output
+from tests.renderers.test_surfels import slanted_plane
 from tests.renderers.test_torch_renderer import rigid
 from tests.scenes import plain_frame as make_frame
 from tests.scenes import wall_scene
@@ -87,19 +87,6 @@ def test_gradients_of_the_normals_of_depth():
 # --- losses -----------------------------------------------------------------------------------------------------------
 
 
-def plane(tilt, count=15, spacing=0.4, dtype=torch.float64):
-    """Surfels over a plane 5 in front of the camera tilted about the x axis, as leaves."""
-    half = math.radians(tilt) / 2
-    steps = spacing * (torch.arange(count, dtype=dtype) - count // 2)
-    x, y = (grid.flatten() for grid in torch.meshgrid(steps, steps, indexing="ij"))
-    means = torch.stack([x, y * math.cos(2 * half), 5 + y * math.sin(2 * half)], dim=-1)
-    n = len(means)
-    quats = torch.tensor([math.cos(half), math.sin(half), 0, 0], dtype=dtype).expand(n, 4).clone()
-    values = (means, quats, torch.full((n, 2), 0.8 * spacing), torch.full((n,), 0.9), torch.ones(n, 3))
-    leaves = [value.to(dtype).requires_grad_() for value in values]
-    return Gaussians(*leaves, torch.arange(n), torch.arange(n))
-
-
 def frame(mask=None):
     return make_frame(torch.zeros(17, 23, 3, dtype=torch.uint8), mask=mask)
 
@@ -109,7 +96,9 @@ def frame(mask=None):
 def test_a_plane_of_surfels_is_consistent(depth, tilt):
     term = make("normal-consistency", depth=depth)
     assert term.loss.wants == {"normals", depth} and term.loss.whole_image
-    output = render_gaussians(plane(tilt), off_centre(), ("normals", depth))
+    turn = math.radians(tilt)
+    _, surfels = slanted_plane([0.0, -math.sin(turn), math.cos(turn)], 5.0 * math.cos(turn), 0.5)
+    output = render_gaussians(surfels, off_centre(), ("normals", depth))
     alpha = output.alpha
     inside = torch.zeros(17, 23, dtype=torch.bool)
     inside[1:-1, 1:-1] = True

@@ -27,13 +27,15 @@ make = partial(terms.make, "sparse-depth")
 
 
 @pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(0)
+def rendered():
+    return (20 + 10 * torch.rand(HEIGHT, WIDTH, dtype=torch.float64)).requires_grad_()
 
 
 @pytest.fixture
-def rendered(generator):
-    return (20 + 10 * torch.rand(HEIGHT, WIDTH, generator=generator, dtype=torch.float64)).requires_grad_()
+def points():
+    """Two hundred places, and their depths."""
+    places = torch.rand(200, 2, dtype=torch.float64) * torch.tensor([WIDTH, HEIGHT])
+    return places, 20 + 10 * torch.rand(200, dtype=torch.float64)
 
 
 @pytest.fixture
@@ -52,16 +54,9 @@ def case():
     return term
 
 
-def random_points(generator, count=200):
-    size = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
-    return torch.rand(count, 2, generator=generator, dtype=torch.float64) * size, 20 + 10 * torch.rand(
-        count, generator=generator, dtype=torch.float64
-    )
-
-
 @pytest.mark.parametrize("huber", [None, 2.5])
-def test_sampling_is_torchs_with_pixel_centres_at_one_half(case, rendered, generator, huber):
-    pixels, depth = random_points(generator)
+def test_sampling_is_torchs_with_pixel_centres_at_one_half(case, rendered, points, huber):
+    pixels, depth = points
     size = torch.tensor([WIDTH, HEIGHT])
     grid = (2 * pixels / size - 1)[None, None]
     sampled = grid_sample(rendered[None, None], grid, padding_mode="border", align_corners=False)[0, 0, 0]
@@ -74,16 +69,16 @@ def test_sampling_is_torchs_with_pixel_centres_at_one_half(case, rendered, gener
     torch.testing.assert_close(rendered.grad, gradient)
 
 
-def test_relative_differences_need_no_unit(case, rendered, generator):
-    pixels, depth = random_points(generator)
+def test_relative_differences_need_no_unit(case, rendered, points):
+    pixels, depth = points
     depth[3] = 0.0  # no point of a surface
     kept = torch.arange(len(depth)) != 3
     for huber in (None, 0.05):
         found = [
             case(unit * rendered, pixels, unit * depth, relative=True, huber=huber).item() for unit in (1.0, 1e-3, 50.0)
         ]
-        points = zip(pixels[kept], depth[kept], strict=True)
-        each = [case(rendered / z, [point.tolist()], [1.0], huber=huber).item() for point, z in points]
+        pairs = zip(pixels[kept], depth[kept], strict=True)
+        each = [case(rendered / z, [pixel.tolist()], [1.0], huber=huber).item() for pixel, z in pairs]
         assert found == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
 
 

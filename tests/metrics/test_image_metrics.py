@@ -3,7 +3,6 @@ import torch
 from scipy.optimize import minimize_scalar
 from skimage.metrics import peak_signal_noise_ratio
 
-from coliags_plugin.config import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.ssim import ssim
 from tests.metrics.made import images, make
@@ -76,13 +75,3 @@ def test_metrics_of_no_pixel_or_of_a_render_that_is_not_finite_are_unavailable(n
 def test_identical_images_have_no_psnr(name, pair):
     with pytest.raises(UnavailableError, match="images are identical"):
         make(name)(images(pair[1], pair[1]))
-
-
-def test_every_metric_says_its_direction_and_unit():
-    metrics = {name: registry.metrics.get(name) for name in registry.metrics}
-    assert {name: (metric.higher_is_better, metric.unit) for name, metric in metrics.items()} == {
-        "psnr": (True, "dB"), "psnr_gain_fitted": (True, "dB"), "ssim": (True, ""), "lpips": (False, ""),
-        "depth_mse": (False, "mm^2"),
-        "depth_mse_inner": (False, "mm^2"), "depth_rmse": (False, "mm"), "depth_mae": (False, "mm"),
-        "depth_median_error": (False, "mm"), "depth_abs_rel": (False, ""), "sparse_depth": (False, "%"),
-    }  # fmt: skip

@@ -30,11 +30,6 @@ def of_frame(scene, row):
     return scene.train[row].view(trained=True)
 
 
-def test_nothing_moves_before_training():
-    scene, module = make()
-    torch.testing.assert_close(module.shade(picture(), of_frame(scene, 0)).rgb, picture().rgb)
-
-
 def test_pixels_are_taken_from_where_scipy_takes_them():
     scene, module = make(cells=1)
     with torch.no_grad():

@@ -118,20 +118,6 @@ def test_held_out_frames_follow_the_frames_around_them():
     assert module.adjust_camera(last.camera, None) is last.camera
 
 
-def test_views_beside_the_video_have_the_correction_of_the_nearest_training_camera():
-    scene = wall_scene()
-    aside = replace(scene.train[4], name="turned-0", index=0)  # taken where the fifth training frame was
-    scene = replace(scene, test_sets={**scene.test_sets, "rotation": [aside]})
-    module = PoseCorrection.from_scene(scene, PoseCorrectionSettings(), torch.Generator())
-    with torch.no_grad():
-        module.translation.copy_(torch.randn(7, 3, generator=torch.Generator().manual_seed(0)))
-    moved, same = (
-        module.adjust_camera(aside.camera, view)
-        for view in (aside.view(trained=False), scene.train[4].view(trained=True))
-    )
-    torch.testing.assert_close(moved.camera_to_world, same.camera_to_world)
-
-
 def test_what_was_learned_is_the_root_mean_square_of_the_corrections():
     _, module = make()
     with torch.no_grad():

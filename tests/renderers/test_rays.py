@@ -44,16 +44,6 @@ def test_refined_places_are_numpys_inverse_of_the_cumulative_weights(seed, sampl
         np.testing.assert_allclose(found[row], np.sort([*places[row], *expected]), rtol=0, atol=1e-9)
 
 
-def test_refined_places_at_random_follow_the_weights():
-    places = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0]]).double()
-    weights = torch.tensor([[9.0, 0.1, 0.6, 0.3, 9.0]]).double()  # the ends do not count
-    drawn = refined_places(places, weights, 10_000, chance())[0]
-    shares = torch.histc(drawn, bins=3, min=1.5, max=4.5) / len(drawn)
-    torch.testing.assert_close(shares, torch.tensor([0.1, 0.6, 0.3]).double(), rtol=0, atol=0.002)
-    assert torch.equal(drawn, refined_places(places, weights, 10_000, chance())[0])
-    assert not torch.equal(drawn, refined_places(places, weights, 10_000, chance(1))[0])
-
-
 def test_an_opaque_end_absorbs_what_is_left_where_there_is_density():
     density = torch.tensor([[0.5, 0.25, 1e-6], [0.5, 0.25, 0.0]], requires_grad=True)
     lengths = torch.tensor([[1.0, 2.0, 3.0]]).expand(2, -1)

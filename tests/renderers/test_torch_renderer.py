@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.contracts import GaussianField
@@ -335,18 +334,6 @@ def test_what_cannot_be_rendered_says_so():
         renderer.render(field, camera)
     with pytest.raises(InputError, match="three scales"):
         render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        *({"tile_size": 0}, {"eps2d": 0.0}, {"alpha_max": 1.0}, {"tile": 8}),
-        *({"surfel_filter": 0.0}, {"distortion_far": 0.0}),
-    ],
-)
-def test_settings_are_checked(options):
-    with pytest.raises(ValidationError):
-        TorchRendererSettings(**options)
 
 
 def test_a_pose_of_another_precision_is_cast():

@@ -68,17 +68,6 @@ def test_depths_of_a_hard_surface_are_z_depths():
     assert not any(empty[kind].any() for kind in kinds)
 
 
-def test_some_pixels_are_those_of_the_whole_image():
-    renderer, field, camera = make(samples=16, rays_at_once=100), Fog(0.05), camera_at(0.3, 0.1, -2.0, yaw=0.2)
-    whole = renderer.render(field, camera, ("depth_expected",))
-    pixels = torch.tensor([[0, 0], [31, 23], [7, 19]])
-    some = renderer.render(field, camera, ("depth_expected",), pixels)
-    column, row = pixels.unbind(1)
-    assert some.rgb.shape == (3, 1, 3) and some.alpha.shape == some["depth_expected"].shape == (3, 1)
-    torch.testing.assert_close(some.rgb[:, 0], whole.rgb[row, column])
-    torch.testing.assert_close(some["depth_expected"][:, 0], whole["depth_expected"][row, column])
-
-
 # --- from coarse to fine ----------------------------------------------------------------------------------------------
 
 
