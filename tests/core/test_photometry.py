@@ -22,14 +22,14 @@ from tests.scenes import camera_at, wall_color, wall_scene
 
 
 def wall(every=3, **options):
-    """The wall with a third of its points, which are enough."""
+    """The wall with every third of its points, which are enough."""
     scene = wall_scene(**options)
     return replace(scene, points=PointCloud(scene.points.positions[::every]))
 
 
-def gained(gains, **options):
+def gained(gains, every=5, **options):
     """The wall, lit by a lamp at the camera, with the images of the training frames multiplied by gains."""
-    scene = wall(width=64, height=48, **options)
+    scene = wall(every, width=64, height=48, **options)
     train = [
         replace(frame, image=(frame.rgb * gain * 255).round().to(torch.uint8))
         for frame, gain in zip(scene.train, gains, strict=True)
