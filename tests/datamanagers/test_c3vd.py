@@ -7,10 +7,8 @@ import os
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import torch
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
@@ -20,7 +18,7 @@ from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings
 from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.built_in import depth_steps
-from tests.datamanagers.kinds import files, remove, repaint, write
+from tests.datamanagers.kinds import remove, repaint, write
 from tests.datamanagers.wall_scenes import (
     colors,
     manager,
@@ -55,19 +53,6 @@ def test_simcol_depth_is_read_whole(shared_data):
     steps = C3VD_DEPTH.read(shared_data / "simcol3d_frames" / "Depth_0000.png")
     assert steps.shape == (475, 475)
     assert (steps.min(), steps.max()) == (2048, 43520)
-
-
-def test_depth_beyond_its_range_is_unknown_and_bounded(mine):
-    for path in files(mine, "depths/*"):
-        steps = np.full((32, 40), 65535, np.uint16)
-        steps[:, :20], steps[:, :5] = 30000, 0
-        cv2.imwrite(str(path), steps)
-    scene = load(mine)
-    depth, bound = scene.train[0].depth, scene.train[0].depth_at_least
-    assert torch.isnan(depth[:, :5]).all() and torch.isnan(depth[:, 20:]).all() and torch.isnan(bound[:, :20]).all()
-    torch.testing.assert_close(depth[:, 5:20], torch.full((32, 15), 30000 * 100 / 65535))
-    torch.testing.assert_close(bound[:, 20:], torch.full((32, 20), 100.0))
-    assert scene.provenance["invalid_depth_share"] == pytest.approx(0.625)
 
 
 # Lenses
@@ -208,7 +193,8 @@ def test_options_that_the_scene_does_not_allow(walls, options, message):
 
 
 @pytest.mark.parametrize(
-    "options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}, {"width": 5}]
+    "options",
+    [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}, {"width": 5}, {"unit": "inch"}],
 )
 def test_settings_that_make_no_sense(options):
     with pytest.raises(ValidationError):

@@ -10,12 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.datamanagers.c3vd_endogslam import PREPARED_DEPTH
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, wxyz_from_rotations
 from coliags_plugin.phantom.layouts.built_in import depth_steps, write_poses
 from tests.datamanagers.kinds import change_npz, files, remove
@@ -215,17 +213,6 @@ def test_depth_may_be_of_16_bits(mine, walls):
     scene = load(mine, poses="ground-truth")
     assert scene.provenance["depth_step_mm"] == 100 / 65535 and worst_off_wall(scene.train[1]) < 0.25
     assert load(walls("c3vd-endogslam")).provenance["depth_step_mm"] == 100 / 255
-
-
-def test_eight_bits_know_nothing_at_0_and_only_a_bound_at_255(mine):
-    steps = np.full((HEIGHT, WIDTH), 100, np.uint8)
-    steps[0], steps[1] = 0, 255
-    cv2.imwrite(str(mine / "depth/0000_depth.tiff"), steps)
-    frame = load(mine).train[0]
-    assert torch.isnan(frame.depth[:2]).all() and torch.isnan(frame.depth_at_least[0]).all()
-    torch.testing.assert_close(frame.depth[2:], torch.full((HEIGHT - 2, WIDTH), 100 / 2.55))
-    torch.testing.assert_close(frame.depth_at_least[1], torch.full((WIDTH,), 100.0))
-    assert PREPARED_DEPTH.z_depth(np.array([[51]], np.uint8))[0, 0] == pytest.approx(20.0)
 
 
 def test_without_a_result_the_camera_is_endogslams(mine):

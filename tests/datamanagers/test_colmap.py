@@ -11,7 +11,6 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from pydantic import ValidationError
 
 from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
@@ -19,7 +18,6 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
-from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 from tests.datamanagers.kinds import change_model
 from tests.datamanagers.wall_scenes import colors, load_scene, look, manager, off_wall, poses, seen_from
@@ -181,17 +179,6 @@ def test_a_rig_of_two_cameras(tmp_path):
         np.testing.assert_allclose(np.linalg.inv(pose)[:3], expected, atol=1e-9)
 
 
-def test_images_come_in_the_order_of_their_numbers(tmp_path):
-    names = ["cam1/10.png", "cam1/9.png", "cam0/100.png", "cam0/20.jpg"]
-    shots = opened(write_colmap(tmp_path / "wall", names=names)).shots
-    assert [shot.name for shot in shots] == ["cam0-20", "cam0-100", "cam1-9", "cam1-10"]
-    for shot, index in zip(shots, (3, 2, 1, 0), strict=True):
-        assert shot.image == tmp_path / "wall/images" / names[index]
-        np.testing.assert_allclose(shot.camera_to_world, poses(4)[index], atol=1e-12)
-    shots = opened(write_colmap(tmp_path / "suffixes", names=["a/1.png", "a/1.jpg"])).shots
-    assert sorted(shot.name for shot in shots) == ["1.jpg", "1.png"]
-
-
 @pytest.mark.parametrize("pattern", ["{}.png.png", "{}.png"])
 def test_masks_in_both_ways_of_naming_them(mine, pattern):
     (mine / "masks").mkdir()
@@ -242,31 +229,6 @@ def test_points_are_initial_points_in_their_colours(wall, walls):
     written = pycolmap.Reconstruction(str(walls("colmap") / "sparse/0"))
     written.update_point_3d_errors()
     assert written.compute_mean_reprojection_error() < 1e-3
-
-
-def test_scale_makes_millimetres(tmp_path):
-    write_colmap(tmp_path, unit=25.0)
-    raw, metric = load(tmp_path), load(tmp_path, scale=25.0)
-    assert off_wall(metric.points.positions.numpy()).max() < 1e-4 and metric.provenance["scale"] == 25.0
-    for frame, given in zip(metric.train, raw.train, strict=True):
-        np.testing.assert_allclose(frame.camera.camera_to_world, poses(COUNT)[frame.index], atol=1e-5)
-        assert off_wall(sparse_points(frame)).max() < 1e-4
-        torch.testing.assert_close(given.sparse_depth.depth * 25.0, frame.sparse_depth.depth)
-        torch.testing.assert_close(given.sparse_depth.pixels, frame.sparse_depth.pixels)
-
-
-def test_the_unit_is_unknown_until_it_is_stated(mine):
-    assert not load(mine).is_metric
-    write_unit(mine, "mm")
-    assert load(mine).is_metric
-    unknown, raw, metric = load(mine, unit="unknown"), load(mine), load(mine, unit="cm")
-    assert not unknown.is_metric and metric.is_metric
-    torch.testing.assert_close(metric.points.positions, 10.0 * raw.points.positions)
-    for frame, given in zip(metric.train, raw.train, strict=True):
-        torch.testing.assert_close(frame.camera.center, 10.0 * given.camera.center)
-        torch.testing.assert_close(frame.sparse_depth.depth, 10.0 * given.sparse_depth.depth)
-    with pytest.raises(ValidationError, match="inch"):
-        load(mine, unit="inch")
 
 
 def test_observations_that_poses_do_not_explain_are_counted(mine):

@@ -153,6 +153,49 @@ def test_another_size_keeps_the_geometry(walls, name):
         assert frame.depth is None or np.abs(frame.depth.numpy() - depth).max() < 2.5
 
 
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "depth", "bound"),
+    [
+        ("c3vd", np.uint16([0, 30000, 65535, 1]), [NAN, 30000 * 100 / 65535, NAN, 100 / 65535], [NAN, NAN, 100.0, NAN]),
+        ("c3vd-endogslam", np.uint8([0, 51, 255, 1]), [NAN, 20.0, NAN, 100 / 255], [NAN, NAN, 100.0, NAN]),
+        ("rgbd", np.uint16([0, 30000, 65535, 1]), [NAN, 60.0, 131.07, 0.002], None),
+    ],
+)
+def test_depth_is_unknown_at_0_and_bounded_at_the_end_of_its_range(copied, name, steps, depth, bound):
+    folder, pattern = copied(name), KINDS[name].depths
+    for place in range(FRAMES):
+        repaint(pattern, place, lambda pixels: np.resize(steps, pixels.shape))(folder)
+    scene = load(folder, name)
+    frame = scene.train[0]
+    expected = torch.tensor(depth).repeat(WIDTH * HEIGHT // 4).reshape(HEIGHT, WIDTH)
+    torch.testing.assert_close(frame.depth, expected, equal_nan=True)
+    if bound is None:
+        assert frame.depth_at_least is None
+    else:
+        torch.testing.assert_close(frame.depth_at_least[0, :4], torch.tensor(bound), equal_nan=True)
+    assert scene.provenance["invalid_depth_share"] == pytest.approx(np.isnan(depth).mean())
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_lengths_are_in_millimetres_where_their_unit_is_known(walls, name):
+    unknown, scene, *larger = (load(walls(name), name, unit=unit) for unit in ("unknown", "mm", "cm"))
+    assert not unknown.is_metric and scene.is_metric and larger[0].is_metric
+    if "scale" in manager(KINDS[name].format).Settings.model_fields:
+        larger.append(load(walls(name), name, unit="mm", scale=10.0))
+    for other in larger:
+        torch.testing.assert_close(other.points.positions, 10.0 * scene.points.positions)
+        for frame, ours in zip(in_order(other, name), in_order(scene, name), strict=True):
+            torch.testing.assert_close(frame.camera.center, 10.0 * ours.camera.center)
+            if ours.depth is not None:
+                torch.testing.assert_close(frame.depth, 10.0 * ours.depth, equal_nan=True)
+            if ours.sparse_depth is not None:
+                torch.testing.assert_close(frame.sparse_depth.depth, 10.0 * ours.sparse_depth.depth)
+                torch.testing.assert_close(frame.sparse_depth.pixels, ours.sparse_depth.pixels)
+
+
 @pytest.mark.parametrize("name", ["c3vd-raw", "c3vd-v2", "reim-nerf", "endomapper"])
 def test_a_wide_view_is_masked_where_the_lens_shows_nothing(walls, name):
     frame = load(walls(name), name, focal_scale=0.4).train[0]
@@ -314,6 +357,8 @@ def _unpadded(pattern: str, *globs: str) -> Spoil:
     def change(index: int, frame: dict) -> None:
         for key in {"file_path", "depth_file_path", "distmap_path"} & frame.keys():
             frame[key] = re.sub(r"0*(\d+)", r"\1", frame[key], count=1)
+        if KINDS["nerfstudio"].poses == pattern:  # which may name images without suffix
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
 
     return lambda folder: [renumber(*globs)(folder), change_frames(pattern, change)(folder)]
 

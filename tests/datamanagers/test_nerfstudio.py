@@ -19,7 +19,6 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
-from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, Undistortion
 from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
@@ -120,25 +119,6 @@ def test_where_pixel_centres_are_counted(wall):
 # Poses and files
 
 
-@pytest.mark.parametrize(
-    ("names", "short", "order"),
-    [
-        (
-            ["./images/frame_10", "./images/frame_9", "./images/frame_100", "./images/frame_1"],
-            ["frame_1", "frame_9", "frame_10", "frame_100"],
-            (3, 1, 0, 2),
-        ),
-        (["images/cam1/2.jpg", "images/cam0/10.jpg", "images/cam0/9.jpg"], ["cam0-9", "cam0-10", "cam1-2"], (2, 1, 0)),
-    ],
-)
-def test_names_in_the_order_of_their_numbers(tmp_path, names, short, order):
-    shots = opened(write(tmp_path, names=names)).shots
-    assert [shot.name for shot in shots] == short
-    for shot, index in zip(shots, order, strict=True):
-        np.testing.assert_allclose(shot.camera_to_world, poses(len(names))[index], atol=1e-12)
-        assert shot.image.with_suffix("").resolve() == (tmp_path / names[index]).with_suffix("").resolve()
-
-
 def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, mine):
     applied = np.array([[0.0, 1.0, 0.0, 3.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, -1.0, 5.0]])
 
@@ -192,31 +172,10 @@ def test_depth_files(tmp_path, unit, content, options, suffix):
     assert off_wall(scene.points.positions.numpy()).max() < unit
 
 
-def test_metres_become_millimetres(tmp_path):
-    folder = write(tmp_path, frame_keys=depth_files(tmp_path, 0.1, ".png"), depth_unit_scale_factor=1e-4)
-    points = load(folder, initial_points="data").points.positions.numpy() / 1000.0
-    write_ply(folder / "metres.ply", point_properties(points, np.zeros(points.shape, np.uint8)))
-
-    def in_metres(index: int, entry: dict) -> None:
-        for row in entry["transform_matrix"][:3]:
-            row[3] /= 1000.0
-
-    change_frames(FILE, in_metres)(folder)
-    change_json(FILE, ply_file_path="metres.ply")(folder)
-    assert not load(folder).is_metric
-    write_unit(folder, "m")
-    scene, scaled = load(folder, initial_points="data"), load(folder, unit="mm", scale=1e3, initial_points="data")
-    assert scene.is_metric
-    for frame in scene.train:
-        np.testing.assert_allclose(frame.camera.camera_to_world, poses(COUNT)[frame.index], atol=1e-5)
-        assert off_wall(frame.camera.unproject(frame.depth).numpy()).max() < 0.06
-    assert off_wall(scene.points.positions.numpy()).max() < 1e-3
-    torch.testing.assert_close(scaled.train[1].depth, scene.train[1].depth, equal_nan=True)
-    torch.testing.assert_close(scaled.points.positions, scene.points.positions)
-    # Without a factor, depth files are in millimetres, whatever the unit.
-    change_json(FILE, depth_unit_scale_factor=None)(folder)
+def test_depth_files_are_in_millimetres_without_a_factor(tmp_path):
+    folder = write(tmp_path, names=NAMES[:3], frame_keys=depth_files(tmp_path, 1.0, ".png"))
     medians = [float(load(folder, unit=unit).train[0].depth.nanmedian()) for unit in ("mm", "m")]
-    assert medians[0] == pytest.approx(medians[1]) and medians[0] > 100.0
+    assert medians[0] == pytest.approx(medians[1])
 
 
 def test_masks_of_some_frames(mine):

@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import named_file
+from coliags_plugin.datamanagers.reading.files import named_file, short_names
 from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 
@@ -89,6 +89,19 @@ def test_names_of_files_within_the_folder_outside_and_of_none(tmp_path, names, r
                 named_file(tmp_path, name, "x.json", outside=False)
         if refused != NO_NAME:
             assert named_file(tmp_path, name, "x.json", outside=refused is not None) == tmp_path / name
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["cam1/10.png", "cam0/20.jpg"], ["cam1-10", "cam0-20"]),
+        (["./images/frame_10", "images/frame_9"], ["frame_10", "frame_9"]),
+        (["images/cam1/2.jpg", "images/cam0/10.jpg"], ["cam1-2", "cam0-10"]),
+        (["a/1.png", "a/1.jpg"], ["1.png", "1.jpg"]),
+    ],
+)
+def test_names_are_as_short_as_they_can_be(paths, names):
+    assert short_names(paths) == names
 
 
 # Initial points
