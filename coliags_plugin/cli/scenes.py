@@ -100,7 +100,7 @@ class DataCommand:
             write_html(page, self.html)
         chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
         chosen += [] if self.format is None else [f"datamanager.name={self.format}"]
-        is_ready = check.depth is not None and not check.findings
+        is_ready = check.facts["depth"] is not None and not check.findings
         print_summary(
             f"{page_text(page)}\n\n{verdict(check)}",
             check.as_json(),

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coliags_plugin.checks.data import facts
 from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import (
@@ -43,10 +42,7 @@ class SceneCheck:
 
     scene: Scene  # the scene checked
     pairs: list[tuple[Frame, Frame]]  # source and target frames of the reprojection or matching
-    depth: JsonObject | None  # statistics, see :mod:`.facts`; None where there is nothing to measure
-    path: JsonObject | None
-    images: JsonObject
-    lamp: JsonObject | None
+    facts: dict[str, Any]  # JSON objects of depth, path, images and lamp; None where there is nothing to measure
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
     #: epipolar errors of matched points, by pose hypothesis; empty where there is depth or too few are matched
@@ -64,10 +60,7 @@ class SceneCheck:
             "undecided": self.undecided,
             "data": self.scene.provenance,
             "initial_points": len(self.scene.points),
-            "depth": self.depth,
-            "path": self.path,
-            "images": self.images,
-            "lamp": self.lamp,
+            **self.facts,
             "pairs": [[source.name, target.name] for source, target in self.pairs],
             "agreement": self.agreement,
             "best_depth_scale": self.scale,
@@ -87,7 +80,7 @@ def check_scene(
     as in patients, or contradict poses with which points followed from frame to frame clearly agree, these count.
     """
     video = scene.video
-    sample = facts.sampled_frames(video)
+    sample = rules.sampled_frames(video)
     pairs = video_pairs(video)
     stored = [(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
     known = {(a, b): pair for a, b in stored if (pair := Pair(a, b)).is_known}
@@ -128,14 +121,14 @@ def check_scene(
             matches = readings
             undecided = list(rules.undecided(matches))
     scale = best_scale(with_depth) if with_depth else None
-    depth, path = facts.depth_facts(sample), facts.path_facts(video)
-    images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
+    depth, path = rules.depth_facts(sample), rules.path_facts(video)
+    images, lamp = rules.image_facts(sample), rules.lamp_facts(sample)
     measured = [
         ("points", scene.provenance),
         ("depth", depth and depth | {"metric": scene.is_metric}),
         ("lamp", lamp),
         ("path", path),
-        *(("camera", camera) for camera in facts.camera_facts(video)),
+        *(("camera", camera) for camera in rules.camera_facts(video)),
         ("images", images | {"repeats": len(images["repeated"])}),
     ]
     findings = [
@@ -143,9 +136,8 @@ def check_scene(
         *rules.match_findings(matches),
         *(finding for about, values in measured for finding in rules.findings_of(about, values)),
     ]
-    return SceneCheck(
-        scene, pairs, depth, path, images, lamp, agreements, scale, matches, matched_by, findings, undecided
-    )
+    facts = {"depth": depth, "path": path, "images": images, "lamp": lamp}
+    return SceneCheck(scene, pairs, facts, agreements, scale, matches, matched_by, findings, undecided)
 
 
 def is_estimated(frames: Sequence[Frame]) -> bool:
@@ -171,7 +163,7 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, 
         return []
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    typical = facts.moving_step(steps)
+    typical = rules.moving_step(steps)
     # A camera that does not move has gone one step a frame, in effect.
     counted = np.minimum(steps, _LONGEST_STEP * typical) if typical > 0.0 else np.ones_like(steps)
     arc = np.concatenate([[0.0], np.cumsum(counted)])

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from coliags_plugin.checks.data.check import SceneCheck, is_estimated
-from coliags_plugin.checks.data.facts import angle_across
-from coliags_plugin.checks.data.findings import Finding
+from coliags_plugin.checks.data.findings import Finding, angle_across
 from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
@@ -68,7 +67,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     unit = scene.length_unit
     stated = "unknown (--set datamanager.unit=mm or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
-    depth, path, lamp = check.depth, check.path, check.lamp
+    depth, path, images, lamp = check.facts.values()
     known = (
         "median {median:.4g}, 1 % to 99 %: {nearest:.4g} to {farthest:.4g} {unit}; {invalid_share:.1%} unknown, of "
         "which {clipped_share:.1%} clipped"
@@ -83,7 +82,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
         "mean {mean:.0f} of 255, frames {darkest_frame:.0f} to {brightest_frame:.0f}, {overexposed_share:.1%} white, "
         "{masked_share:.1%} masked"
     )
-    yield model.Fact("brightness", light.format(**check.images))
+    yield model.Fact("brightness", light.format(**images))
     if lamp:
         correlation = f"rank correlation {lamp['correlation']:.2f} (median of {counted(lamp['frames'], 'frame')})"
         yield model.Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")

@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from coliags_plugin.checks.data.check import check_scene, video_pairs
-from coliags_plugin.checks.data.facts import image_facts, lamp_facts, moving_step, path_facts
-from coliags_plugin.checks.data.findings import findings_of
+from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, match, supported
 from coliags_plugin.checks.data.page import check_page
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -93,7 +92,8 @@ def test_a_sound_scene_is_not_suspected(scene):
     # Depth is stored in steps of 0.0015 mm and sampled at pixel centres: surfaces agree far below a percent.
     assert check.agreement["given"].depth_error < 0.005
     assert check.scale.factor == pytest.approx(1.0, abs=0.02)
-    assert check.depth["nearest"] < check.depth["median"] < check.depth["farthest"] <= 100.0
+    depth = check.facts["depth"]
+    assert depth["nearest"] < depth["median"] < depth["farthest"] <= 100.0
 
 
 @pytest.mark.thorough
@@ -263,7 +263,7 @@ def test_a_camera_that_pauses_is_not_suspected_and_its_pauses_are_not_compared(f
     sound = paused(frames)
     check = check_scene(sound)
     assert (check.findings, check.undecided) == ([], [])
-    assert check.path["moving_step"] > 1.0
+    assert check.facts["path"]["moving_step"] > 1.0
     ways = [(b.camera.center - a.camera.center).norm().item() for a, b in check.pairs]
     assert min(ways) > 2.0
     assert "world-to-camera" in whats(changed(sound, pose=CHANGES["world-to-camera"]))
