@@ -144,6 +144,7 @@ def test_gain_and_light_are_told(phantom):
             assert ratios[0] == pytest.approx(ratios[1], rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypatch):
     monkeypatch.setattr(lighting, "_PATCH", 15.0)  # mm: few pairs of patches, whose light takes most of the time
     small = {**TINY, "frames": 9, "rotation_views": 1, "interreflection": 1.0, "mesh_spacing": 2.5}

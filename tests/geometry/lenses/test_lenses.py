@@ -336,20 +336,6 @@ def test_no_pixel_of_the_dark_corners_gets_in():
     assert (undistortion.nearest(octagon, 0)[undistortion.valid]).all()
 
 
-def test_legacy_pinhole_is_opencvs_undistort(shared_data):
-    frame = cv2.imread(str(shared_data / "c3vd_official_frame" / "color.png"))
-    lens = LENSES["legacy-pinhole"]
-    matrix = lens.pinhole.opencv_matrix()
-    reference = cv2.undistort(frame, matrix, np.array([lens.k1, lens.k2, 0.0, 0.0]))
-    same_size = Undistortion(lens, lens.pinhole)
-    assert same_size.supersampling == 1
-    difference = np.abs(same_size.image(frame).astype(int) - reference.astype(int))
-    assert difference.mean() < 0.1
-    halved = Undistortion(lens, lens.resized(675, 540).pinhole).image(frame)
-    resized = cv2.resize(reference, (675, 540), interpolation=cv2.INTER_AREA)
-    assert np.abs(halved.astype(int) - resized.astype(int)).mean() < 0.5
-
-
 @pytest.mark.thorough
 def test_official_frame_through_the_true_lens_has_no_dark_corner(shared_data):
     frame = cv2.imread(str(shared_data / "c3vd_official_frame" / "color.png"))
