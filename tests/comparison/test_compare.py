@@ -86,27 +86,19 @@ def test_a_dry_run_says_what_has_changed_since_a_cell_was_done(wall, folder, mon
     assert states() == [("new", "code")]
 
 
-def test_what_is_done_is_not_run_again(wall, folder):
+@pytest.mark.parametrize(
+    ("lost", "count"),
+    [((), 0), (("runs", "plan.json"), 0), (("results",), 2)],
+    ids=["nothing", "all but results", "results of finished runs"],
+)
+def test_what_is_done_is_not_run_again(wall, folder, monkeypatch, lost, count):
     before = hashes(folder)
-    done, ran = again(wall, folder)
-    assert ran == [] and hashes(folder) == before
-    assert [result.method for result in done.results] == ["coliags", "scaffold-gs"]
-
-
-def test_results_alone_count_as_done(wall, folder):
-    for path in folder.iterdir():
-        if path.name != "results":
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-    done, ran = again(wall, folder)
-    assert ran == [] and len(done.results) == 2
-
-
-def test_a_lost_result_of_a_finished_run_is_not_trained_again(wall, folder, monkeypatch):
-    before = hashes(folder)
-    shutil.rmtree(folder / "results")
+    for path in (folder / name for name in lost):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
     monkeypatch.setattr(Trainer, "train", None)
     done, ran = again(wall, folder)
-    assert not done.failures and len(ran) == 2 and hashes(folder) == before
+    assert not done.failures and len(ran) == count and hashes(folder) == before
+    assert [result.method for result in done.results] == ["coliags", "scaffold-gs"]
 
 
 def test_a_comparison_is_extended(wall, folder):
@@ -140,44 +132,25 @@ def test_methods_that_are_the_same_are_run_once(wall, tmp_path):
     assert (tmp_path / "new/results/wall/ablations-embedding-10-5").is_dir()
 
 
-def test_a_run_goes_on_from_its_checkpoint(wall, tmp_path, monkeypatch):
-    whole = tmp_path / "whole"
-    compare_inline(["coliags"], [wall], whole, steps=6)
-    steps = Trainer.take_step
-
-    def interrupted(self):
-        row = steps(self)
-        if self.step == 4:
-            self.save()
-            raise KeyboardInterrupt
-        return row
-
-    monkeypatch.setattr(Trainer, "take_step", interrupted)
-    part = tmp_path / "part"
-    executor = InlineExecutor()
-    done = compare_inline(["coliags"], [wall], part, executor, steps=6)
-    assert not done.failures and len(executor.tasks) == 2
-    assert hashes(part) == hashes(whole)
-
-
-def test_a_damaged_checkpoint_is_set_aside(wall, tmp_path, monkeypatch):
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_run_goes_on_from_its_newest_whole_checkpoint(wall, tmp_path, monkeypatch, damaged):
     whole, part = tmp_path / "whole", tmp_path / "part"
     overrides = [*TINY, "schedule.checkpoint_every=2"]
     compare_inline(["coliags"], [wall], whole, steps=6, overrides=overrides)
-    steps = Trainer.take_step
-    lives = []
+    steps, lives, executor = Trainer.take_step, [], InlineExecutor()
 
     def struck(self):
         if self.step == 4 and not lives:
             lives.append(4)
-            (self.run.checkpoints / "step-000004" / "state.safetensors").write_bytes(b"")
+            if damaged:
+                (self.run.checkpoints / "step-000004" / "state.safetensors").write_bytes(b"")
             raise KeyboardInterrupt
         return steps(self)
 
     monkeypatch.setattr(Trainer, "take_step", struck)
-    done = compare_inline(["coliags"], [wall], part, steps=6, overrides=overrides)
-    assert not done.failures and lives and hashes(part) == hashes(whole)
-    assert next(part.glob("runs/wall/coliags/s0-*/checkpoints/damaged-step-000004-*"))
+    done = compare_inline(["coliags"], [wall], part, executor, steps=6, overrides=overrides)
+    assert not done.failures and len(executor.tasks) == 2 and hashes(part) == hashes(whole)
+    assert len(list(part.glob("runs/wall/coliags/s0-*/checkpoints/damaged-step-000004-*"))) == damaged
 
 
 def test_every_cell_that_begins_and_ends_is_told(bare, tmp_path, caplog):
@@ -302,28 +275,23 @@ def test_a_result_of_a_newer_version_is_refused_by_name(wall, folder):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "options", "told"),
     [
-        ('{"format": "coliags-comparison", "version": 99}', "plan.json is from a newer version"),
-        ("{", "plan.json is not JSON"),
-        ('{"cells": 3}', "plan.json: cells"),
+        ('{"format": "coliags-comparison", "version": 99}', {}, "plan.json is from a newer version"),
+        ("{", {}, "plan.json is not JSON"),
+        ('{"cells": 3}', {}, "plan.json: cells"),
+        (None, {"steps": 4}, "compares runs with --steps 3, not --steps 4"),
+        (None, {"steps": None}, "compares runs with --steps 3, not each method's own steps"),
+        (
+            None,
+            {"overrides": ["field.features=4"]},
+            "compares runs with .*--set field.features=8 .*, not --set field.f",
+        ),
     ],
 )
-def test_a_plan_that_cannot_be_read(wall, folder, content, told):
-    (folder / "plan.json").write_text(content)
-    with pytest.raises(InputError, match=told):
-        again(wall, folder)
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"steps": 4}, "compares runs with --steps 3, not --steps 4"),
-        ({"steps": None}, "compares runs with --steps 3, not each method's own steps"),
-        ({"overrides": ["field.features=4"]}, "compares runs with .*--set field.features=8 .*, not --set field.feat"),
-    ],
-)
-def test_runs_of_another_kind_are_not_mixed(wall, folder, options, told):
+def test_plans_that_cannot_be_read_and_runs_of_another_kind(wall, folder, content, options, told):
+    if content is not None:
+        (folder / "plan.json").write_text(content)
     with pytest.raises(InputError, match=told):
         again(wall, folder, **options)
 

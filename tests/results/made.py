@@ -59,49 +59,43 @@ plain = st.recursive(
 )
 
 
-@st.composite
-def profile_records(draw) -> ProfileRecord:
-    """A profile of one to four bins."""
-    bins = draw(st.integers(1, 4))
+def profiles_of(bins: int) -> st.SearchStrategy[ProfileRecord]:
+    """A profile of so many bins."""
     errors = st.tuples(*[st.none() | numbers] * bins)
-    return ProfileRecord(
-        unit="mm",
-        edges=tuple(range(bins + 1)),
-        pixels=draw(st.tuples(*[st.integers(0, 10**9)] * bins)),
-        rgb_mse=draw(errors),
-        depth_mse=draw(errors),
+    pixels = st.tuples(*[st.integers(0, 10**9)] * bins)
+    return st.builds(
+        ProfileRecord,
+        unit=names,
+        edges=st.just(tuple(range(bins + 1))),
+        pixels=pixels,
+        rgb_mse=errors,
+        depth_mse=errors,
     )
 
 
-@st.composite
-def set_records(draw) -> SetRecord:
-    """A test set with any frames, and any of the metrics."""
-    frames = draw(st.lists(names, max_size=4, unique=True))
+def sets_of(frames: list[str]) -> st.SearchStrategy[SetRecord]:
+    """A test set with these frames, and any of the metrics."""
     values = st.tuples(*[st.none() | numbers] * len(frames))
-    listed = draw(st.lists(st.sampled_from(sorted(METRICS)), unique=True))
-    return SetRecord(
-        frames=tuple(frames),
-        values={name: draw(values) for name in listed},
-        reasons=draw(st.dictionaries(names, st.text(max_size=8), max_size=2)),
-        predictions_sha256=PREDICTIONS,
-        truth_sha256=TRUTH,
-        profiles=draw(st.dictionaries(names, profile_records(), max_size=2)),
+    return st.builds(
+        SetRecord,
+        frames=st.just(tuple(frames)),
+        values=st.dictionaries(st.sampled_from(sorted(METRICS)), values),
+        reasons=st.dictionaries(names, st.text(max_size=8), max_size=2),
+        predictions_sha256=st.just(PREDICTIONS),
+        truth_sha256=st.just(TRUTH),
+        profiles=st.dictionaries(names, st.integers(1, 4).flatmap(profiles_of), max_size=2),
     )
 
 
-@st.composite
-def results(draw) -> Result:
+def results() -> st.SearchStrategy[Result]:
     """Any result whose hash fits its values."""
-    cost = CostRecord(
-        device=draw(st.text(max_size=8)),
-        train_seconds=draw(st.none() | numbers),
-        seconds_to_psnr=draw(st.dictionaries(names, st.none() | numbers, max_size=3)),
-    )
-    return made_result(
-        draw(st.dictionaries(names, set_records(), min_size=1, max_size=3)),
-        method=draw(names),
-        seed=draw(st.integers()),
-        cost=cost,
-        config=draw(st.dictionaries(names, plain, max_size=3)),
-        provenance=draw(st.dictionaries(names, plain, max_size=3)),
+    marks = st.dictionaries(names, st.none() | numbers, max_size=3)
+    return st.builds(
+        made_result,
+        st.dictionaries(names, st.lists(names, max_size=4, unique=True).flatmap(sets_of), min_size=1, max_size=3),
+        method=names,
+        seed=st.integers(),
+        cost=st.builds(CostRecord, device=names, train_seconds=st.none() | numbers, seconds_to_psnr=marks),
+        config=st.dictionaries(names, plain, max_size=3),
+        provenance=st.dictionaries(names, plain, max_size=3),
     )
