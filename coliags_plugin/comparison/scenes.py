@@ -159,17 +159,13 @@ def _check_same_phantom(source: SceneSource) -> None:
             f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
         ) from error
     wanted = source.phantom_record or {}
-    if settings.keys() != wanted.keys():
-        raise InputError(
-            f"{source.path} is a phantom of another version: {file.name} has other settings than this one has",
-            "a phantom that this version makes, or no folder",
-            "Remove it, so that it is made again, or choose another --data",
-        )
-    differing = [key for key in wanted if settings[key] != wanted[key]]
+    differing = [key for key in {**wanted, **settings} if settings.get(key, ...) != wanted.get(key, ...)]
     if differing:
-        differences = ", ".join(f"{key} {settings[key]!r} instead of {wanted[key]!r}" for key in differing)
+        differences = ", ".join(
+            f"{key} {settings.get(key, 'missing')!r} instead of {wanted.get(key, 'none')!r}" for key in differing
+        )
         raise InputError(
             f"{source.path} is another phantom than the benchmark's: {differences}",
-            "the benchmark's phantom, or no folder",
-            "Remove it, or choose another --data",
+            "the benchmark's phantom as this version makes it, or no folder",
+            "Remove it, so that it is made again, or choose another --data",
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,17 @@ from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import descriptions
 from coliags_plugin.core.errors import InputError
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Path of a YAML file with a text."""
+
+    def write(text):
+        (tmp_path / "mine.yaml").write_text(text)
+        return str(tmp_path / "mine.yaml")
+
+    return write
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -83,12 +95,9 @@ def test_faults_are_named_by_line_and_key(written, load, text, told):
         load(written(f"description: x\n{text}"))
 
 
-def test_a_description_is_needed(written):
+def test_an_unknown_name_says_which_was_meant(written):
     with pytest.raises(InputError, match=r"mine.yaml:1: description: is missing"):
         load_benchmark(written("scenes: {a: {}}"))
-
-
-def test_an_unknown_name_says_which_was_meant():
     with pytest.raises(InputError, match=r"no benchmark 'c3dv'.*Did you mean 'c3vd'"):
         load_benchmark("c3dv")
     with pytest.raises(InputError, match=r"no ablation 'paper-row'.*Did you mean 'paper-rows'"):
@@ -110,28 +119,18 @@ def heads(variant):
     return field.geometry_head, field.appearance_head
 
 
-def test_the_papers_rows_take_away_what_their_names_lack():
+def test_variants_have_what_their_names_say():
     for variant in load_ablation("paper-rows"):
-        parts = set(variant.name.split("-"))
-        geometry, appearance = heads(variant)
-        assert (geometry.name == "imve") == ("imve" in parts)
-        assert (appearance.name == "imia") == ("imia" in parts)
+        parts, (geometry, appearance) = {*variant.name.split("-")}, heads(variant)
         sees_distance = appearance.name == "plain" and appearance.settings.distance
-        assert sees_distance == ("distance" in parts)
-        losses = load_method(variant.method, variant.overrides).config.losses
-        assert ("depth" in losses) == ("depth" in parts)
-    assert len(load_ablation("paper-rows")) == 8
-
-
-def test_rivals_get_depth_and_gains_as_their_names_say():
+        has_depth = "depth" in load_method(variant.method, variant.overrides).config.losses
+        found = (geometry.name == "imve", appearance.name == "imia", sees_distance, has_depth)
+        assert found == tuple(part in parts for part in ("imve", "imia", "distance", "depth"))
     for variant in load_ablation("rivals"):
         config = load_method(variant.method, variant.overrides).config
         supervised = "depth" in config.losses
         assert supervised != (variant.name.endswith("no-depth") or variant.name in ("scaffold-gs", "3dgs", "2dgs"))
         assert ("exposure" in config.modules) == (variant.name.endswith("gain") or variant.name == "coliags-plus")
-
-
-def test_the_sizes_of_embeddings_are_in_their_names():
     for variant in load_ablation("embedding-sizes"):
         geometry, appearance = heads(variant)
         assert variant.name == f"{geometry.settings.frequencies}-{appearance.settings.frequencies}"
@@ -165,12 +164,6 @@ def test_scenes_that_are_missing_are_all_named_with_the_place(tmp_path):
     assert "cecum_t1_a," not in str(refused.value)
 
 
-def test_folders_by_the_present_names_of_c3vd(tmp_path):
-    (tmp_path / "c0_cecum_t1_v2").mkdir()
-    (scene,) = find_scenes(["c3vd/cecum_t1_b"], tmp_path)
-    assert (scene.name, scene.path, scene.data_format) == ("cecum_t1_b", tmp_path / "c0_cecum_t1_v2", "c3vd")
-
-
 def test_folders_and_scenes_of_a_file(tmp_path, written):
     (tmp_path / "wall").mkdir()
     name = written("description: x\nscenes: {one: {phantom: {seed: 3}}, two: {phantom: {seed: 4}}}")
@@ -178,6 +171,9 @@ def test_folders_and_scenes_of_a_file(tmp_path, written):
     assert [scene.name for scene in scenes] == ["wall", "two"]
     assert scenes[0].is_there and not scenes[1].is_there
     assert scenes[1].phantom.seed == 4 and scenes[1].path == tmp_path / "made" / "two"
+    (tmp_path / "c0_cecum_t1_v2").mkdir()
+    (scene,) = find_scenes(["c3vd/cecum_t1_b"], tmp_path)  # by its present name
+    assert (scene.name, scene.path, scene.data_format) == ("cecum_t1_b", tmp_path / "c0_cecum_t1_v2", "c3vd")
 
 
 @pytest.mark.parametrize(
@@ -197,22 +193,25 @@ def test_scenes_that_cannot_be_meant(tmp_path, names, data, told):
         find_scenes([name.format(tmp=tmp_path) for name in names], None if data is None else Path(data))
 
 
-def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written):
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, None),
+        ({"wave": 2.0}, r"wave 2\.0 instead of 0\.0"),
+        ({"seed": 4}, "another phantom than the benchmark's: seed 4 instead of 3"),
+        (
+            {"tilt": 1.0},
+            r"tilt 1\.0 instead of 'none'\. .*as this version makes it.*Remove it, so that it is made again",
+        ),
+        (None, "is not a phantom"),
+    ],
+)
+def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written, changes, told):
     name = written("description: x\nscenes: {one: {phantom: {seed: 3, frames: 9}}}")
     (scene,) = find_scenes([name], tmp_path / "made")
     (tmp_path / "made" / "one").mkdir(parents=True)
-    with pytest.raises(InputError, match="is not a phantom"):
-        find_scenes([name], tmp_path / "made")
-    file = tmp_path / "made" / "one" / "phantom.json"
-    file.write_text(json.dumps({"settings": scene.phantom_record}))
-    assert find_scenes([name], tmp_path / "made")[0].is_there
-    file.write_text(json.dumps({"settings": {**scene.phantom_record, "wave": 2.0}}))
-    with pytest.raises(InputError, match=r"wave 2\.0 instead of 0\.0"):
-        find_scenes([name], tmp_path / "made")
-    earlier = {key: value for key, value in scene.phantom_record.items() if key != "wave"}
-    file.write_text(json.dumps({"settings": earlier}))
-    with pytest.raises(InputError, match=r"of another version.*Remove it, so that it is made again"):
-        find_scenes([name], tmp_path / "made")
-    file.write_text(json.dumps({"settings": {**scene.phantom_record, "seed": 4}}))
-    with pytest.raises(InputError, match="another phantom than the benchmark's: seed 4 instead of 3"):
-        find_scenes([name], tmp_path / "made")
+    if changes is not None:
+        settings = {"settings": {**scene.phantom_record, **changes}}
+        (tmp_path / "made" / "one" / "phantom.json").write_text(json.dumps(settings))
+    with nullcontext() if told is None else pytest.raises(InputError, match=told):
+        assert find_scenes([name], tmp_path / "made")[0].is_there

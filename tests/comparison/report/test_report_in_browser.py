@@ -36,19 +36,14 @@ def opened(request, browser, page):
     assert browser.run("document.documentElement.scrollWidth <= innerWidth")
 
 
-def column(browser, table, index):
-    """Texts of a column, by the name of its table."""
-    return browser.run(
-        f"[...document.querySelector('table[data-name={table}]').tBodies[0].rows]"
-        f".map(row => row.cells[{index}].firstChild.nextSibling?.textContent ?? row.cells[{index}].textContent)"
-    )
+def cells(browser, table, index, what):
+    """Something of the cells of a column, by the name of its table."""
+    rows = f"[...document.querySelector('table[data-name={table}]').tBodies[0].rows]"
+    return browser.run(f"{rows}.map(row => row.cells[{index}]).map(cell => {what})")
 
 
-def numbers(browser, table, index):
-    return browser.run(
-        f"[...document.querySelector('table[data-name={table}]').tBodies[0].rows]"
-        f".map(row => row.cells[{index}].dataset.value ?? null)"
-    )
+def names(browser):
+    return cells(browser, "summary-test", 0, "cell.textContent")
 
 
 def test_the_page_fits_and_nothing_is_loaded(opened):
@@ -64,33 +59,28 @@ def test_the_page_fits_and_nothing_is_loaded(opened):
     assert opened.run("innerWidth") == PHONE or opened.run(summaries) == [0, 0]
 
 
-def test_sorting_by_mouse(opened):
-    written = column(opened, "summary-test", 0)
-    head = "table[data-name=summary-rotation] th[data-key=psnr] button"
-    values = numbers(opened, "summary-rotation", 1)
-    ordered = sorted(map(float, values), reverse=True)
-    for expected, state in ((ordered, "descending"), (ordered[::-1], "ascending"), (list(map(float, values)), None)):
+def test_sorting_by_mouse_puts_missing_last(opened):
+    written, head = names(opened), "table[data-name=summary-rotation] th[data-key=psnr] button"
+    values = [float(value) for value in cells(opened, "summary-rotation", 1, "cell.dataset.value")]
+    ordered = sorted(values, reverse=True)
+    for expected, state in ((ordered, "descending"), (ordered[::-1], "ascending"), (values, None)):
         opened.click(head)
-        assert list(map(float, numbers(opened, "summary-rotation", 1))) == expected
+        assert [float(value) for value in cells(opened, "summary-rotation", 1, "cell.dataset.value")] == expected
         assert opened.run(f"document.querySelector({head!r}).parentElement.getAttribute('aria-sort')") == state
-    assert column(opened, "summary-test", 0) == written, "another table was sorted"
-
-
-def test_sorting_puts_missing_last(opened):
+    assert names(opened) == written, "another table was sorted"
     # The method without a result of scene 2, in a folded table.
     opened.run("document.querySelectorAll('details').forEach(each => each.open = true)")
     for _ in range(2):
         opened.click("table[data-name=scene-scene-2-test] th[data-key=ssim] button")
-        assert numbers(opened, "scene-scene-2-test", 2)[-1] is None
+        assert cells(opened, "scene-scene-2-test", 2, "cell.dataset.value ?? null")[-1] is None
 
 
 def test_sorting_by_keyboard(opened):
     opened.run("document.querySelector('table[data-name=summary-test] thead button').focus()")
     opened.key("Enter", 13, "\r")
-    names = column(opened, "summary-test", 0)
-    assert names == sorted(METHODS)
+    assert names(opened) == sorted(METHODS)
     opened.key(" ", 32, " ")
-    assert column(opened, "summary-test", 0) == sorted(METHODS, reverse=True)
+    assert names(opened) == sorted(METHODS, reverse=True)
 
 
 def shown_columns(browser, table):
@@ -129,7 +119,7 @@ def at(browser):
     return value
 
 
-def test_the_slider_by_keyboard(opened):
+def test_the_slider_by_keyboard_mouse_and_touch(request, opened):
     opened.run("document.querySelector('.compare input').focus()")
     assert at(opened) == 50
     for key, code, value in (
@@ -142,14 +132,8 @@ def test_the_slider_by_keyboard(opened):
         opened.key(key, code)
         assert at(opened) == value
     assert opened.run("document.querySelector('.compare input').getAttribute('aria-valuetext')") == "100 % coliags"
-
-
-def test_the_slider_by_dragging(browser, page):
-    for width, phone in ((DESKTOP, False), (PHONE, True)):
-        browser.open(page, width, phone=phone)
-        browser.drag(".stage", 0.5, 0.4, 0.3, 0.2, touch=phone)
-        assert at(browser) == pytest.approx(20, abs=1)
-        assert browser.errors() == []
+    opened.drag(".stage", 0.5, 0.4, 0.3, 0.2, touch="phone" in request.node.name)
+    assert at(opened) == pytest.approx(20, abs=1)
 
 
 def choose(browser, name, value):
