@@ -44,9 +44,10 @@ from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
 from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.outputs.video import write_video
+from coliags_plugin.pipeline.contents import SegmentContents, SubmapContents, read_contents
 from coliags_plugin.pipeline.context import Submap
-from coliags_plugin.pipeline.procedure.contents import ProcedureSubmap, SegmentContents, read_procedure
-from coliags_plugin.pipeline.procedure.record import ModelKey, Procedure, SegmentJoin
+from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
+from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.visibility import CoverageView, Level
 
@@ -178,10 +179,10 @@ class Run:
     def _disturb(self, cluster: Any, child: subprocess.Popen[bytes]) -> None:
         """Kill a node while it works, and add another one."""
         while child.poll() is None:
-            procedure = Procedure.read(self.out)
-            posed = len(list(self.out.glob("segment-*/poses")))
-            if procedure is not None and 3 * posed >= len(procedure.segments):
-                print(f"a node is killed after {posed} of {len(procedure.segments)} segments", flush=True)
+            record, posed = Record.of(self.out), len(list(self.out.glob("segment-*/poses")))
+            segments = read_contents(self.out, record).segments if record.is_done("survey") else ()
+            if segments and 3 * posed >= len(segments):
+                print(f"a node is killed after {posed} of {len(segments)} segments", flush=True)
                 cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
                 cluster.add_node(num_cpus=1)
                 return
@@ -248,13 +249,13 @@ class Judge:
 
     def run(self) -> None:
         """Print the tables."""
-        procedure, truth = read_procedure(self.out), Truth(self.folder)
-        models = {one.key: truth.model(self.out, one) for one in procedure.submaps}
-        rows = [truth.row(self.out, one, models[one.key]) for one in procedure.submaps]
-        numbers = np.arange(procedure.record.first, procedure.record.stop)
-        is_tissue, is_posed = truth.phantom(numbers) >= 0, np.isin(numbers, list(procedure.posed))
-        segments = [truth.is_wrong(join, models) for join in procedure.record.joins if join.joined]
-        within = [wrong for one in procedure.segments for wrong in truth.wrong_within(one, models)]
+        contents, truth = read_contents(self.out), Truth(self.folder)
+        models = {one.key: truth.model(self.out, one) for one in contents.submaps}
+        rows = [truth.row(self.out, one, models[one.key]) for one in contents.submaps]
+        numbers = np.arange(contents.video.first, contents.video.stop)
+        is_tissue, is_posed = truth.phantom(numbers) >= 0, np.isin(numbers, list(contents.posed))
+        segments = [truth.is_wrong(join, models) for join in contents.joins if join.joined]
+        within = [wrong for one in contents.segments for wrong in truth.wrong_within(one, models)]
         show(rows, self.json)
         print()
         counts = {
@@ -271,7 +272,7 @@ class Judge:
             "scale of sub-maps, of mm": _spread(rows, "scale"),
             "poses of another phantom": sum(row["of another"] for row in rows),
             "joins of segments": _told(segments),
-            "refused": sum(not join.joined for join in procedure.record.joins),
+            "refused": sum(not join.joined for join in contents.joins),
             "joins within models": _told(within),
             "wall seen that is there, %": _spread(rows, "there, %"),
             "measured - true unseen, %": _spread(rows, "measured - true unseen, %"),
@@ -329,7 +330,7 @@ class Truth:
         poses = [np.load(phantom / "truth" / "camera_to_wall.npy") for phantom in self._folders]
         self._poses = np.concatenate([part for own in poses for part in (own, between)])
 
-    def model(self, out: Path, submap: ProcedureSubmap) -> Model:
+    def model(self, out: Path, submap: SubmapContents) -> Model:
         """A sub-map of a procedure, with its scales."""
         folder = out / submap.segment / "poses" / submap.model
         suffix = model_suffix(folder, ("images", "points3D"))
@@ -362,7 +363,7 @@ class Truth:
         """Number of the phantom that each frame shows; -1 between two. [N]"""
         return np.where(numbers % (FRAMES + BETWEEN) < FRAMES, numbers // (FRAMES + BETWEEN), -1)
 
-    def row(self, out: Path, submap: ProcedureSubmap, model: Model) -> dict[str, Any]:
+    def row(self, out: Path, submap: SubmapContents, model: Model) -> dict[str, Any]:
         """Poses, mesh and coverage of a sub-map, aligned with the phantom that most of its frames show."""
         shown = self.phantom(model.frames)
         most = int(np.bincount(shown[shown >= 0], minlength=1).argmax())

@@ -19,7 +19,7 @@ import tyro
 from coliags_plugin.comparison.named_files import load_ablation
 from coliags_plugin.core.images import read_rgb, write_image
 from tests.comparison.small import InlineExecutor
-from tests.pipeline.procedures import SUBMAPS, join, similarity, write_procedure
+from tests.pipeline.reconstructions import SUBMAPS, join, similarity, write_long
 from tests.scenes import write_wall
 from tests.textured_tube import tube_frames
 
@@ -50,7 +50,7 @@ def test_joins_of_a_procedure_are_judged_by_its_truth(run, monkeypatch, tmp_path
     tube_poses = [frame.camera.camera_to_world.numpy() for frame in tube_frames(14, 1.0, (40, 32))]
     of_both = np.eye(4) if is_right else similarity(1)
     joined = join(["segment-000", "segment-001"], ["sparse/2", "sparse/0"], of_both)
-    out = write_procedure(tmp_path / "out", joins=[joined])
+    out = write_long(tmp_path / "out", joins=[joined])
     phantom = tmp_path / "phantoms" / "phantom-0"
     poses, depths = np.tile(np.eye(4), (58, 1, 1)), np.full(58, 65535, np.uint16)
     for name, frames in reversed(SUBMAPS.items()):  # of frames that two have, the depth is that of the first

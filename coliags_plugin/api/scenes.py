@@ -13,7 +13,6 @@ from coliags_plugin.core.files import refuse_existing
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
-    from coliags_plugin.pipeline.procedure.run import FinishedProcedure
     from coliags_plugin.pipeline.stages import Record
     from coliags_plugin.surface.coverage.visibility import CoverageSettings
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
@@ -102,7 +101,7 @@ def reconstruct(
     jobs: int | None = None,
     threads: int | None = None,
     ray_address: str | None = None,
-) -> Record | FinishedProcedure:
+) -> Record:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
     What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
@@ -121,8 +120,8 @@ def reconstruct(
         ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
 
     Returns:
-        The record: what each stage made, with which options, in what time. Of a video that is longer than a segment
-        (``frames.segment``): its segments, each with a record.
+        The record: what each stage made, with which options, in what time; of a video that is longer than a segment
+        (``frames.segment``), those of each segment behind its folder: ``record.stages["segment-000/poses"]``.
 
     Raises:
         InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,8 +15,7 @@ from coliags_plugin.config import options
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
-    from coliags_plugin.pipeline.procedure.run import FinishedProcedure
-    from coliags_plugin.pipeline.stages import Record
+    from coliags_plugin.pipeline.contents import Contents
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.scenes import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.pipeline.procedure.run import FinishedProcedure
+        from coliags_plugin.pipeline.contents import read_contents
         from coliags_plugin.pipeline.stages import PAGE_FILE
 
         given: dict[str, Any] = {
@@ -89,11 +89,18 @@ class ReconstructCommand:
             "steps": self.steps,
         }
         settings = {key: value for key, value in given.items() if value is not None}
-        made = arguments.call(reconstruct, self, settings={**settings, **parse_assignments(self.set)})
-        told = _procedure(made) if isinstance(made, FinishedProcedure) else _reconstruction(made)
+        record = arguments.call(reconstruct, self, settings={**settings, **parse_assignments(self.set)})
+        contents = read_contents(self.output, record, scene=self.video)
+        is_long = contents.whole is None
         export = coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")
-        then = [export if isinstance(made, FinishedProcedure) else view_command(self.output / "run")]
-        print_summary(*told, written=[self.output / PAGE_FILE], then=then, as_json=self.json)
+        values = {"stages": {name: asdict(stage) for name, stage in record.stages.items()}}
+        print_summary(
+            "\n".join(_segments(contents) if is_long else _stages(contents)),
+            values,
+            written=[self.output / PAGE_FILE],
+            then=[export if is_long else view_command(self.output / "run")],
+            as_json=self.json,
+        )
 
     def _frames(self) -> dict[str, Any]:
         """Settings of which frames are used, None where nothing is given; times by the video's rate."""
@@ -109,36 +116,33 @@ class ReconstructCommand:
         return {"frames.first": first, "frames.last": last, "frames.every": every}
 
 
-def _reconstruction(record: Record) -> tuple[str, dict[str, Any]]:
-    """What a reconstruction came to, in lines and in JSON values."""
-    from coliags_plugin.pipeline.page import held_out_text, remarks, results_of, submap_table
+def _stages(contents: Contents) -> Iterator[str]:
+    """Lines of what a video of one segment came to."""
+    from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table
     from coliags_plugin.reporting.text_formats import terminal_text
 
-    stages, results = record.stages, results_of(record)
-    told = {name: stage for name, stage in stages.items() if "/" not in name}
-    lines = [f"{name}: {stage.summary}" for name, stage in told.items()]
-    lines += [f"{record.folder / path}: {content}" for stage in told.values() for path, content in stage.files.items()]
-    if len(results) > 1:
-        lines += [f"{record.folder / one.submap.folder}: {one.submap.title}, likewise" for one in results[1:]]
-        lines += ["", terminal_text([submap_table(results)]), "", f"held-out PSNR: {held_out_text(results)}"]
-    return "\n".join([*lines, *remarks(record)]), {"stages": {name: asdict(stage) for name, stage in stages.items()}}
+    (segment,), folder = contents.segments, contents.folder
+    told = {name: stage for name, stage in segment.stages.items() if "/" not in name}
+    yield from (f"{name}: {stage.summary}" for name, stage in told.items())
+    yield from (f"{folder / path}: {content}" for stage in told.values() for path, content in stage.files.items())
+    submaps = [submap for submap in segment.submaps if submap.stages]
+    if len(submaps) > 1:
+        yield from (f"{folder / f'submap-{one.number}'}: {one.name}, likewise" for one in submaps[1:])
+        yield from ("", terminal_text([submap_table(submaps)]), "", f"held-out PSNR: {held_out_text(submaps)}")
+    yield from remarks(segment)
 
 
-def _procedure(made: FinishedProcedure) -> tuple[str, dict[str, Any]]:
-    """A line for each segment of a long video and for each join, and the same in JSON values."""
-    from coliags_plugin.pipeline.page import held_out_text, results_of
+def _segments(contents: Contents) -> Iterator[str]:
+    """A line for each segment of a long video, for what was left out, and for each join."""
+    from coliags_plugin.pipeline.page import held_out_text
 
-    lines = []
-    for (name, record), segment in zip(made.segments.items(), made.procedure.segments, strict=True):
-        told = [record.stages["poses"].summary.partition("\n")[0]] if "poses" in record.stages else ["not begun"]
-        told += [f"held-out PSNR: {held_out_text(results_of(record))}"] if "evaluate" in record.stages else []
-        lines.append(f"{name}, frames {segment.first} to {segment.last}: {'; '.join(told)}")
-    lines += [f"frames {each.first} to {each.last} left out: {each.why}" for each in made.procedure.skipped]
-    for each in made.procedure.joins:
-        named = [f"{name}/{Path(model).name}" if model else name for name, model in each.keys]
-        lines.append(f"{' and '.join(named)}: {'joined' if each.joined else f'not joined: {each.reason}'}")
-    segments = {
-        name: {key: asdict(one) for key, one in record.stages.items()} for name, record in made.segments.items()
-    }
-    joins = [each.model_dump(mode="json") for each in made.procedure.joins]
-    return "\n".join(lines), {"segments": segments, "joins": joins}
+    for segment in contents.segments:
+        span, stages = segment.span, segment.stages
+        told = [stages["poses"].summary.partition("\n")[0]] if "poses" in stages else ["not begun"]
+        told += [f"held-out PSNR: {held_out_text(segment.submaps)}"] if "evaluate" in stages else []
+        yield f"{span.name}, frames {span.first} to {span.last}: {'; '.join(told)}"
+    for each in contents.video.skipped:
+        yield f"frames {each.first} to {each.last} left out: {each.why}"
+    for join in contents.joins:
+        named = [f"{name}/{Path(model).name}" if model else name for name, model in join.keys]
+        yield f"{' and '.join(named)}: {'joined' if join.joined else f'not joined: {join.reason}'}"

@@ -58,19 +58,30 @@ def find_submaps(scene: Path, least: int) -> list[Submap]:
 class StageContext:
     """What every stage is given."""
 
-    out: Path  # the reconstruction's folder
+    out: Path  # folder of the segment: the reconstruction's, or of a long video one within it
     source: Path  # the video, folder of images or scene
     settings: ReconstructionSettings
     mask: Path | None  # image that is black where pixels are ignored; None: found from the frames
     data_format: str | None  # of a source that is a scene; None: it is none
     device: torch.device
     progress: Progress | None = None
+    segment: str = ""  # name of the segment's folder; empty: of the whole video
     submap: Submap = LARGEST  # which model of the posed scene is reconstructed
+
+    @property
+    def root(self) -> Path:
+        """The reconstruction's folder."""
+        return self.out.parent if self.segment else self.out
+
+    @property
+    def prefix(self) -> str:
+        """What stages and files of the sub-map are called by in the reconstruction's folder: the way to its folder."""
+        return "".join(f"{name}/" for name in (self.segment, self.submap.folder) if name)
 
     @property
     def places(self) -> tuple[Path, ...]:
         """Files and folders that are given."""
-        return tuple(path for path in (self.out, self.source, self.mask) if path is not None)
+        return tuple(path for path in (self.root, self.source, self.mask) if path is not None)
 
     def submaps(self) -> list[StageContext]:
         """One for every model that is reconstructed, the largest first, as far as poses are there."""

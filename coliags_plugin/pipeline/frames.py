@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool
 from pydantic import BaseModel, ConfigDict, Field
 
 from coliags_plugin.core.errors import InputError
@@ -19,25 +19,21 @@ from coliags_plugin.pipeline.frame_selection import (
     RESTING,
     THINNED,
     blurred_frames,
-    lens_mask,
     motion,
-    overlays,
     reduced,
     sharpest_frames,
 )
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
+from coliags_plugin.pipeline.stages import MADE
+from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.reconstruction.structure.image_files import read_mask
-from coliags_plugin.reconstruction.structure.texture import sharpness
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
-MADE = "what `coliags reconstruct` wrote"
 #: Name of a frame's file without its suffix, within its folder.
 FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
 _KEEP_MORE = ", or keep more frames with --every, --set frames.least_motion=0 or --set frames.least_sharpness=0"
-#: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
-_FEWEST_STILL = 10
 
 
 class _Part(BaseModel):
@@ -64,7 +60,6 @@ class FramesRecord(_Part):
 
     kept: list[KeptFrame]
     dropped: list[DroppedFrame]
-    deinterlaced: bool
 
     @classmethod
     def read(cls, folder: Path) -> FramesRecord | None:
@@ -74,6 +69,7 @@ class FramesRecord(_Part):
 
 def write_frames(
     source: FrameSource,
+    survey: Survey,
     folder: Path,
     settings: FrameSettings,
     mask: Path | None = None,
@@ -81,21 +77,17 @@ def write_frames(
 ) -> str:
     """Choose frames and write them: ``images/NAME.png``, ``frames.json``, and ``mask.png`` where there is a mask.
 
-    The video is read twice: for the sharpness of all frames, and to write those chosen. Without a mask, black
-    surroundings of the lens's image and overlays are found. Replaces the folder; returns a summary of one line.
+    By a survey of these frames, whose mask is used unless one is given. Replaces the folder; returns a summary of one
+    line.
     """
     given = None if mask is None else read_mask(mask)
-    survey = FrameSurvey(source.path)
-    for _, image in watched(source, "look at frames", progress):
-        survey.add(image)
-    found, sharpnesses = survey.mask(), survey.sharpnesses
-    size, total = survey.size, len(sharpnesses)
+    sharpnesses, size, total = survey.sharpness.tolist(), survey.size, len(survey)
     if given is not None and given.shape != size:
         raise InputError(
             f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
             "a mask of the frames' size",
         )
-    used = found if given is None else given
+    used = survey.mask if given is None else given
     chosen, dropped = sharpest_frames(sharpnesses, settings)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
@@ -160,43 +152,3 @@ def read_blurred(folder: Path) -> set[str]:
     """Names of the written frames that are blurred; none where there is no record."""
     record = FramesRecord.read(folder)
     return set() if record is None else {frame.name for frame in record.kept if frame.blurred}
-
-
-class FrameSurvey:
-    """Sharpness of all frames of a video, and the mask that they have in common."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.sharpnesses: list[float] = []
-        self._extremes: list[UInt8[np.ndarray, "H W 3"]] = []
-        self._sum: Float32[np.ndarray, "H W 3"] | None = None
-        self._sizes: set[tuple[int, ...]] = set()
-
-    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
-        """Look at the next frame."""
-        self._sizes.add(image.shape)
-        if len(self._sizes) > 1:
-            return
-        self.sharpnesses.append(sharpness(reduced(image)))
-        if self._sum is None:
-            self._extremes, self._sum = [image.copy(), image.copy()], image.astype(np.float32)
-            return
-        for extreme, of_both in zip(self._extremes, (np.minimum, np.maximum), strict=True):
-            of_both(extreme, image, out=extreme)
-        self._sum += image
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the frames."""
-        return self._extremes[0].shape[0], self._extremes[0].shape[1]
-
-    def mask(self) -> Bool[np.ndarray, "H W"] | None:
-        """False outside of the lens's image and on overlays; None without any, as of frames of several sizes."""
-        if self._sum is None:
-            raise InputError(f"no frames in {self.path}", "a video")
-        darkest, brightest = self._extremes
-        inside, count = lens_mask(brightest.max(axis=2)), len(self.sharpnesses)
-        mask = np.ones(self.size, bool) if inside is None else inside
-        if count >= _FEWEST_STILL:
-            mask &= ~overlays(darkest, brightest, self._sum / count)
-        return None if mask.all() or len(self._sizes) > 1 else mask

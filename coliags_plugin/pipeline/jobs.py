@@ -1,37 +1,47 @@
-"""Parts of a reconstruction as jobs for worker processes: what all sub-maps need, then each sub-map by itself.
+"""Parts of a reconstruction as jobs: of each segment what all its sub-maps need, then each sub-map by itself.
 
     python -m coliags_plugin.pipeline.jobs TASK
 
-is such a process; TASK is a :class:`PartTask` as JSON.
+is a worker process for one; TASK is a :class:`PartTask` as JSON.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-from coliags_plugin.core.errors import InterruptedRunError, NotWritableError
+from coliags_plugin.core.errors import (
+    InputError,
+    InterruptedRunError,
+    NotFiniteError,
+    NothingDrawnError,
+    NotWritableError,
+    ReportedError,
+)
 from coliags_plugin.core.locks import locked
 from coliags_plugin.execution.executors import ExecutionOptions, Executor
 from coliags_plugin.execution.queue import Job, JobQueue
 from coliags_plugin.execution.tasks import Ending, Task, TaskOutcome, attempt, run_worker
-from coliags_plugin.pipeline.chain import stages_of
+from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.page import write_index
+from coliags_plugin.pipeline.page import write_page
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import (
-    LOCK_FILE,
     LOCK_SECONDS,
     Part,
     Record,
     Stage,
+    StageRecord,
     check_options,
-    part_name,
     run_stages,
+    worker_lock,
 )
+from coliags_plugin.pipeline.steps import stages_of
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, has_known_camera
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
@@ -42,164 +52,204 @@ LOGS = "logs"
 _PLAN_SHARE = 0.2
 
 
-def run_jobs(executor: Executor, options: ExecutionOptions, jobs: Sequence[Job], total: int) -> None:
-    """Do jobs, whose sizes are shares of ``total``, and tell which run.
+@dataclass(frozen=True)
+class Workers:
+    """Processes that do jobs, and how."""
 
-    Raises:
-        InterruptedRunError: Ctrl-C; what is done is kept.
-        NotWritableError: The disk is full, or cannot be written; likewise.
-    """
-    queue = JobQueue(executor, options.retries, jobs, total)
-    try:
-        queue.run("reconstruct", lambda running: ", ".join(job.doing for job in running))
-    except KeyboardInterrupt as error:
-        raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
+    executor: Executor
+    options: ExecutionOptions
 
 
-class PartJobs:
-    """A reconstruction whose parts are jobs; its page is written when the last has ended.
+class Reconstruction:
+    """Jobs of segments, first those of one that tells the camera of the others if it is not known.
 
     Args:
-        context: Of the reconstruction.
-        executor: Where the jobs run.
-        options: How.
+        record: Of the reconstruction.
+        segments: Contexts and sizes; if the first gets no poses, the next one is tried.
         overwrite: Whether stages that were made with other options are removed.
-        size: Of all jobs together, in the queue's unit.
-        then: Gives other jobs that are to be done once the stages that all sub-maps need have ended.
-
-    Raises:
-        InputError: A stage was made with other options, and ``overwrite`` is not given; or a worker of an earlier call
-            does not end.
+        workers: Processes that do the jobs; None: this one.
     """
 
     def __init__(
-        self,
-        context: StageContext,
-        executor: Executor,
-        options: ExecutionOptions,
-        overwrite: bool,
-        size: int,
-        then: Callable[[PartJobs], list[Job]] | None = None,
+        self, record: Record, segments: Sequence[tuple[StageContext, int]], overwrite: bool, workers: Workers | None
     ) -> None:
-        self.context, self.executor, self.options, self._overwrite = context, executor, options, overwrite
-        self.record = Record.of(context.out)
-        self.record.places = context.places
-        self.record.write()
-        self.record.take_over_all()
-        self.failures: dict[Part, str] = {}
-        self._left, self._size, self._then = set[Part](), size, then
-        check_options(stages_of(context), self.record, overwrite)
+        self.record, self.workers, self._overwrite = record, workers, overwrite
+        self.failures: dict[tuple[str, Part], ReportedError] = {}
+        self._left, self._open = list(segments), Counter[str]()  # not begun; jobs by segments
 
-    def jobs(self) -> list[Job]:
-        """What is to be done now: the stages that all need, or where these are done each sub-map.
+    def run(self) -> None:
+        """Do all jobs.
 
-        Their sizes are what is left of that of all jobs.
+        Raises:
+            InputError: A stage was made with other options, and may not be removed.
+            InterruptedRunError: Ctrl-C; what is done is kept.
+            NotWritableError: The disk is full, or cannot be written; likewise.
         """
-        parts: dict[Part, list[Stage]] = {}
-        for stage in stages_of(self.context):
-            parts.setdefault(stage.part, []).append(stage)
-        waiting = [
-            part for part, stages in parts.items() if not all(self.record.is_done(stage.name) for stage in stages)
-        ]
+        total, waiting = sum(size for _, size in self._left), self._next()
+        if self.workers is None:
+            while waiting:
+                waiting[:0] = waiting.pop(0).run_here()
+            return
+        queue = JobQueue(self.workers.executor, self.workers.options.retries, waiting, total)
+        try:
+            queue.run("reconstruct", lambda running: ", ".join(job.doing for job in running))
+        except KeyboardInterrupt as error:
+            raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
+
+    def _next(self, before: StageContext | None = None) -> list[PartJob]:
+        """Jobs of all segments that are left, by the camera that is known or ``before`` has found, or else of one."""
+        if not self._left:
+            return []
+        camera = self._left[0][0].settings.sfm.camera
+        if before is not None and not has_known_camera(camera):
+            camera = _camera_of(before.posed) or camera
+        count = len(self._left) if has_known_camera(camera) else 1
+        chosen, self._left = self._left[:count], self._left[count:]
+        found = list[PartJob]()
+        for context, size in sorted(chosen, key=lambda one: one[0].segment):
+            sfm = context.settings.sfm.model_copy(update={"camera": camera})
+            found += self._begin(replace(context, settings=context.settings.model_copy(update={"sfm": sfm})), size)
+        return found
+
+    def _begin(self, context: StageContext, size: int) -> list[PartJob]:
+        """Jobs of a segment: the stages that all its sub-maps need, or where these are done each sub-map."""
+        stages = stages_of(context)
+        check_options(stages, self.record, self._overwrite)
+        waiting = list(dict.fromkeys(stage.part for stage in stages if not self.record.is_done(stage.name)))
         if None in waiting:
             waiting = [None]
-        self._left = set(waiting)
-        others = [] if None in waiting else self._others()
+        self._open[context.segment] = len(waiting)
         if not waiting:
-            self.write_page()
-            return others
-        frames = {context.submap.number: context.submap.frames or 1 for context in self.context.submaps()}
-        shares = {part: 1.0 if part is None else frames[part] / sum(frames.values()) for part in waiting}
-        whole = self._size * (_PLAN_SHARE if None in waiting else 1.0)
-        own = [PartJob(self, part, parts[part], round(shares[part] * whole)) for part in waiting]
-        return [*own, *others]
+            self._write_page(context)
+        frames = {inside.submap.number: inside.submap.frames or 1 for inside in context.submaps()}
+        shares = {part: _PLAN_SHARE if part is None else frames[part] / sum(frames.values()) for part in waiting}
+        own = [PartJob(self, context, part, stages, round(shares[part] * size)) for part in waiting]
+        return own if None in waiting else [*own, *self._next(context)]
 
-    def _others(self) -> list[Job]:
-        """Those that are to be done after the stages that all need, once."""
-        then, self._then = self._then, None
-        return [] if then is None else then(self)
-
-    def end(self, job: PartJob, reason: str = "") -> list[Job]:
-        """Take what the worker of a part has written, or why it failed; returns what is to be done after it."""
-        self.record.take_over(part_name(job.part))
-        for stage in job.stages:
-            if (record := self.record.stages.get(stage.name)) is not None:
-                if reason and record.state == "begun":  # its process died
-                    record = replace(record, state="failed", summary=reason)
-                    self.record.put(stage.name, record)
-                what = record.state if record.state != "done" else f"took {duration(record.seconds)}"
-                log.info("%s: %s; %s", stage.name, record.summary, what)
-        self._left.discard(job.part)
-        self._size -= job.size
-        if reason:
-            self.failures[job.part] = reason
+    def end(self, job: PartJob, error: ReportedError | None = None) -> list[PartJob]:
+        """Take that a job has ended, or why it failed; returns what is to be done after it."""
+        context = job.context
+        self._open[context.segment] -= 1
+        if error is not None:
+            self.failures[context.segment, job.part] = error
         elif job.part is None:
-            check_options(stages_of(self.context), self.record, self._overwrite)
-            return self.jobs()
-        if not self._left:
-            self.write_page()
-        return self._others() if job.part is None else []
+            return self._begin(context, round(job.size / _PLAN_SHARE) - job.size)
+        if not self._open[context.segment]:
+            self._write_page(context)
+        return self._next(context) if job.part is None else []
 
-    def write_page(self) -> None:
-        """Write the page of the reconstruction, and the record in the order of its stages."""
-        context, record = self.context, self.record
-        places = {stage.name: place for place, stage in enumerate(stages_of(context))}
-        record.stages = dict(sorted(record.stages.items(), key=lambda item: places.get(item[0], len(places))))
-        record.write()
-        write_index(record, context.posed, f"Reconstruction of {context.source.resolve().name}")
+    def _write_page(self, context: StageContext) -> None:
+        self.record.refresh()
+        write_page(context.root, self.record, context.segment, context.source)
+
+
+def _camera_of(scene: Path) -> CameraSettings | None:
+    """The camera of the largest model of a scene; None where there is none."""
+    folder = scene / "sparse" / "0"
+    suffix = model_suffix(folder, ("images", "cameras"))
+    if suffix is None:
+        return None
+    number = read_images(folder / f"images{suffix}", observations=False)[0].camera
+    camera = read_cameras(folder / f"cameras{suffix}")[number]
+    return CameraSettings(model=camera.model, params=tuple(map(float, camera.params)), refine=False)
 
 
 class PartJob(Job):
-    """One part of a reconstruction."""
+    """One part of a segment."""
 
-    def __init__(self, jobs: PartJobs, part: Part, stages: Sequence[Stage], size: int) -> None:
-        self._jobs, self.part, self.stages, self.size = jobs, part, stages, size
-        context, out = jobs.context, jobs.context.out.resolve()
+    def __init__(
+        self, work: Reconstruction, context: StageContext, part: Part, stages: Sequence[Stage], size: int
+    ) -> None:
+        self._work, self.context, self.part, self.stages, self.size = work, context, part, stages, size
+        out, workers = context.out.resolve(), work.workers
         self.task = PartTask(
             title=f"{out.name}, {'poses' if part is None else f'sub-map {part}'}",
-            key=f"{out} {part_name(part)}",
-            device=jobs.options.device,
-            log=str(out / LOGS / f"{part_name(part)}.log"),
-            threads=jobs.executor.threads,
+            key=f"{out} {worker_name(context, part)}",
+            device=str(context.device) if workers is None else workers.options.device,
+            log=str(out / LOGS / f"{_part_name(part)}.log"),
+            threads=1 if workers is None else workers.executor.threads,
             source=str(context.source.resolve()),
             out=str(out),
+            segment=context.segment,
             settings=context.settings.model_dump_json(),
             mask=None if context.mask is None else str(context.mask.resolve()),
             data_format=context.data_format,
             part=part,
         )
 
+    def run_here(self) -> list[PartJob]:
+        """Do it in this process; returns what is to be done after it.
+
+        Raises:
+            NotWritableError: The disk is full, or cannot be written.
+        """
+        try:
+            run_stages(self.stages, self._work.record, self.part)
+        except NotWritableError:
+            raise
+        except (InputError, NotFiniteError, NothingDrawnError) as error:
+            if any(stage.part not in (None, self.part) for stage in self.stages):
+                log.warning("%s; the others go on", str(error).rstrip("."))
+            return self._work.end(self, error)
+        return self._work.end(self)
+
     def progress(self) -> int:
         """Share of the stages that are done; the rest is over when the process has ended."""
-        record = Record.of(self._jobs.context.out)
-        done = sum(record.is_done(stage.name) for stage in self.stages)
-        return self.size * done // (len(self.stages) + 1)
+        states = self._states()
+        return self.size * sum(stage.state == "done" for stage in states.values()) // (len(states) + 1)
 
     @property
     def doing(self) -> str:
         """See :class:`Job`: with the stage that its worker is at."""
-        stages = Record.of(self._jobs.context.out).stages
-        begun = [stage.name for stage in self.stages if stage.name in stages and stages[stage.name].state == "begun"]
+        begun = [name for name, stage in self._states().items() if stage.state == "begun"]
         return " ".join([self.task.title, *(name.rpartition("/")[2] for name in begun)])
+
+    def _states(self) -> dict[str, StageRecord]:
+        """Its stages, as far as they are recorded; else failed ones without a word."""
+        record = self._work.record
+        record.refresh()
+        names = [stage.name for stage in self.stages if stage.part == self.part]
+        return {name: record.stages.get(name, StageRecord({}, "failed")) for name in names}
 
     def finish(self) -> Sequence[Job]:
         """See :class:`Job`."""
-        return self._jobs.end(self)
+        return self._end()
 
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
         """See :class:`Job`; a disk that cannot be written is that of the other parts, too."""
         if ending == "unwritable":
             raise NotWritableError(f"{self.task.title}: {reason}", do="What is done is kept")
-        return self._jobs.end(self, reason or "it failed")
+        return self._end(InputError(reason or "it failed"))
+
+    def _end(self, error: InputError | None = None) -> Sequence[Job]:
+        """Tell what the worker has written; a stage at which its process died has failed."""
+        for name, stage in self._states().items() if error is not None else ():
+            if stage.state == "begun":
+                self._work.record.put(name, replace(stage, state="failed", summary=str(error)))
+        for name, stage in self._states().items():
+            if stage.summary:
+                what = stage.state if stage.state != "done" else f"took {duration(stage.seconds)}"
+                log.info("%s: %s; %s", name, stage.summary, what)
+        return self._work.end(self, error)
+
+
+def worker_name(context: StageContext, part: Part) -> str:
+    """The worker of a part, for keys and files."""
+    return "-".join(filter(None, (context.segment, _part_name(part))))
+
+
+def _part_name(part: Part) -> str:
+    return "plan" if part is None else str(part)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PartTask(Task):
-    """The stages of one part of a reconstruction."""
+    """The stages of one part of a segment."""
 
     worker: ClassVar[str] = "coliags_plugin.pipeline.jobs"
     source: str
     out: str
+    segment: str
     settings: str  # JSON
     mask: str | None
     data_format: str | None
@@ -223,16 +273,16 @@ def complete(task: PartTask) -> None:
 
     torch.set_num_threads(task.threads)
     settings = ReconstructionSettings.model_validate_json(task.settings, strict=False)  # of lists
-    mask, out = None if task.mask is None else Path(task.mask), Path(task.out)
+    mask = None if task.mask is None else Path(task.mask)
     device = choose_device(task.device)
-    context = StageContext(out, Path(task.source), settings, mask, task.data_format, device)
-    name = part_name(task.part)
-    with locked(out / f"{LOCK_FILE}-{name}", out, LOCK_SECONDS):
-        record = Record.of(out, name)
+    context = StageContext(
+        Path(task.out), Path(task.source), settings, mask, task.data_format, device, segment=task.segment
+    )
+    name = worker_name(context, task.part)
+    with locked(worker_lock(context.root, name), context.root, LOCK_SECONDS):
+        record = Record.of(context.root)
         record.places = context.places
-        failure = run_stages(stages_of(context), record, plan=lambda: stages_of(context), parts={task.part})
-        if failure is not None:
-            raise failure
+        run_stages(stages_of(context), record, task.part)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
-"""From a video, a folder of images or a posed scene to mesh and report, in stages that a repeated call goes on with."""
+"""From a video, a folder of images or a posed scene to mesh and report, in stages that a repeated call goes on with.
+
+A long video is cut into segments, which are reconstructed each by itself and joined.
+"""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -15,16 +18,28 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.execution.executors import ExecutionOptions
 from coliags_plugin.execution.queue import make_executor
-from coliags_plugin.pipeline.chain import stages_of
+from coliags_plugin.pipeline.contents import figures_as
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source, opened_recording
-from coliags_plugin.pipeline.jobs import PartJobs, run_jobs
-from coliags_plugin.pipeline.page import write_index
-from coliags_plugin.pipeline.procedure.run import FinishedProcedure, reconstruct_procedure
+from coliags_plugin.pipeline.frame_sources import FrameSource, Span, chosen_frames, frame_source, opened_recording
+from coliags_plugin.pipeline.jobs import Reconstruction, Workers
+from coliags_plugin.pipeline.joins import find_joins
+from coliags_plugin.pipeline.page import write_page
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
-from coliags_plugin.pipeline.stages import LOCK_FILE, Record, run_stages
+from coliags_plugin.pipeline.stages import (
+    LOCK_FILE,
+    PAGE_FILE,
+    Record,
+    Stage,
+    StageOutcome,
+    StageRecord,
+    check_options,
+    run_stages,
+    wait_for_workers,
+)
+from coliags_plugin.pipeline.steps import identity_of, stages_of
+from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, survey_and_cut
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
-from coliags_plugin.reporting.numbers import duration, file_size
+from coliags_plugin.reporting.numbers import counted, duration, file_size
 
 log = logging.getLogger(__name__)
 
@@ -41,13 +56,14 @@ def reconstruct(
     overwrite: bool = False,
     progress: Progress | None = None,
     execution: ExecutionOptions | None = None,
-) -> Record | FinishedProcedure:
+) -> Record:
     """Reconstruct a video, or go on with what was begun; arguments as in :func:`coliags_plugin.reconstruct`.
 
     Raises:
         InputError: The source cannot be read; a stage cannot be done; ``out`` is something else, or was made with
             other settings; or another process works on it.
-        InterruptedRunError: Ctrl-C in training, after the state was saved.
+        NotWritableError: The disk is full, or cannot be written; all that is done is kept.
+        InterruptedRunError: Ctrl-C, after the state was saved.
     """
     refuse_overlap(out, source)
     if mask is not None and not mask.is_file():
@@ -63,35 +79,87 @@ def reconstruct(
     else:
         _refuse_unused(source, settings, mask)
     context = StageContext(out, source, settings, mask, data_format, device, progress)
-    if is_long:
-        with locked(out / LOCK_FILE, out):
-            return reconstruct_procedure(context, execution or ExecutionOptions(jobs=1, device=str(device)), overwrite)
-    Record.of(out)  # refuses another folder before anything is written
-    stages = stages_of(context)
+    stages_of(context)  # finds out wrong settings before anything is written
+    Record.of(out)  # refuses another folder
+    if is_long and execution is None:
+        execution = ExecutionOptions(jobs=1, device=str(device))
+    workers = None if execution is None else Workers(make_executor(execution), execution)
+    if workers is not None:
+        workers.executor.check(out, [path for path in (source, mask) if path is not None])
     with locked(out / LOCK_FILE, out):
-        if execution is not None:
-            return _by_workers(context, execution, overwrite)
+        wait_for_workers(out)
         record = Record.of(out)
         record.places = context.places
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
-        record.take_over_all()
-        failure = run_stages(stages, record, overwrite, lambda: stages_of(context))
-        write_index(record, context.posed, f"Reconstruction of {source.resolve().name}")
-    if failure is not None:
-        raise failure
+        parts = [(context, _UNITS)] if data_format is not None else _segments(context, record, overwrite, is_long)
+        work = Reconstruction(record, parts, overwrite, workers)
+        work.run()
+        if is_long:
+            _join(context, record)
+    for part in (None, 0):
+        if ("", part) in work.failures:
+            raise work.failures["", part]
     return record
 
 
-def _by_workers(context: StageContext, execution: ExecutionOptions, overwrite: bool) -> Record:
-    """Run the stages as tasks of worker processes: one for those that all need, then one for each sub-map."""
-    executor = make_executor(execution)
-    executor.check(context.out, [path for path in (context.source, context.mask) if path is not None])
-    jobs = PartJobs(context, executor, execution, overwrite, _UNITS)
-    run_jobs(executor, execution, jobs.jobs(), _UNITS)
-    for part in (None, 0):
-        if part in jobs.failures:
-            raise InputError(jobs.failures[part])
-    return jobs.record
+def _segments(context: StageContext, record: Record, overwrite: bool, is_long: bool) -> list[tuple[StageContext, int]]:
+    """Survey the video and cut it, or read what was found before; where nothing was found, options may change.
+
+    Returns contexts of the segments and their frames, first the one in which most is followed.
+    """
+    out, settings, chosen, least = context.out, context.settings, context.settings.frames, context.settings.least_submap
+    cutting = chosen.model_dump(include={"first", "last", "every", "segment", "deinterlace"})
+    options = {"source": identity_of(context.source), "frames": cutting} | ({"least_submap": least} if is_long else {})
+
+    def run() -> StageOutcome:
+        source = chosen_frames(context.source, chosen)
+        survey, video = survey_and_cut(source, chosen, least if is_long else None, context.progress)
+        survey.write(out)
+        summary = f"{counted(video.frames, 'frame')} in {counted(len(video.segments), 'segment')}"
+        made = {SURVEY_FILE: "sharpness and motion of every frame"}
+        return StageOutcome(summary, made, figures=video.model_dump(mode="json"))
+
+    others = [name for name in record.stages if name not in ("survey", "joins")]
+    outputs = [SURVEY_FILE, *{name.partition("/")[0] for name in others if name.startswith("segment-")}]
+    outputs += [path for stage in stages_of(context) for path in stage.outputs]
+    stage = Stage("survey", options, run, outputs)
+    if not others:
+        record.forget(["survey"], [])
+    check_options([stage], record, overwrite)
+    if "survey" not in record.stages:  # but as it was before, with other options
+        record.forget(list(record.stages), [])
+    if not (out / SURVEY_FILE).is_file():
+        record.forget(["survey"], [])
+    run_stages([stage], record)
+    video, survey = figures_as(record.stages, "survey", Video, out), Survey.read(out)
+    found = []
+    for segment in sorted(video.segments, key=lambda own: -survey.part(own.first, own.last).followed.sum()):
+        span = {"first": segment.first, "last": segment.last, "seek": video.seek, "deinterlace": video.deinterlace}
+        own = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
+        found.append((replace(context, out=out / segment.name, segment=segment.name, settings=own), segment.count))
+    return found
+
+
+def _join(context: StageContext, record: Record) -> None:
+    """Join the segments, and write the page over them.
+
+    Raises:
+        InputError: None has poses; the page shows why.
+    """
+    out, video = context.out, figures_as(record.stages, "survey", Video, context.out)
+    joins = find_joins(out, video.segments)
+    summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
+    figures = {"joins": [join.model_dump(mode="json") for join in joins]}
+    record.put("joins", StageRecord({}, "done", summary, figures=figures))
+    write_page(out, record)
+    if any(record.is_done(f"{segment.name}/poses") for segment in video.segments):
+        return
+    why = next((stage.summary for stage in record.stages.values() if stage.state == "failed"), "no stage was begun")
+    seen = f"none of {len(video.segments)} segments of {context.source} has poses: {why}"
+    if not video.segments:
+        least = context.settings.least_submap
+        seen = f"no stretch of {context.source} of {least} frames in which points can be followed"
+    raise InputError(seen, "a video of a camera that moves along tissue it sees", f"{out / PAGE_FILE} shows why")
 
 
 def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:

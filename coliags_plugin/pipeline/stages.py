@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 import time
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter
 
 from coliags_plugin._version import __version__
-from coliags_plugin.core.errors import (
-    InputError,
-    NotFiniteError,
-    NothingDrawnError,
-    NotWritableError,
-    ReportedError,
-)
+from coliags_plugin.core.errors import InputError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
@@ -30,25 +25,17 @@ from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
 #: Name of the file, and version of the schema of what a reconstruction records.
-RECORD_FILE, FORMAT = "reconstruction.json", 1
+RECORD_FILE, FORMAT = "reconstruction.json", 2
+MADE = "what `coliags reconstruct` wrote"
 #: Page that leads to everything a reconstruction has made.
 PAGE_FILE = "index.html"
 #: Lock that a process holds while it works in the folder.
 LOCK_FILE = ".lock"
 #: For a worker that was asked to end, seconds.
 LOCK_SECONDS = 120.0
-#: How the names of records by workers begin.
-_WORKER_FILES = ".reconstruction-"
-#: A part of the stages that one process works on: those that all others need (None), or those of one sub-map.
+#: A part of a segment's stages that one process works on: those that all others need (None), or those of one sub-map.
 Part = int | None
-
-
-def part_name(part: Part) -> str:
-    """For keys and files: the number of a sub-map, or ``plan`` of the stages that all need."""
-    return "plan" if part is None else str(part)
 
 
 @dataclass(frozen=True)
@@ -64,77 +51,75 @@ class StageRecord:
     figures: Mapping[str, Any] = field(default_factory=dict)  # numbers of the summary, by name
 
 
-_StageName = Annotated[str, Field(pattern=r"^(submap-[0-9]{1,6}/)?[a-z]+$")]
+#: Of a long video, behind the folder of the segment; of other sub-maps than the largest, behind theirs.
+_StageName = Annotated[str, Field(pattern=r"^(segment-[0-9]{1,6}/)?(submap-[0-9]{1,6}/)?[a-z]+$")]
 _RECORDED = TypeAdapter(dict[_StageName, StageRecord])
 
 
 class Record:
     """The record in a folder, written after every change: its stages by their names.
 
-    That of a worker, which works on one part beside others, has a file of its own for the stages that it puts.
+    Several processes, each of which works on a part, change one file: what others have written is read before.
     """
 
-    def __init__(
-        self, folder: Path, stages: Mapping[str, StageRecord] | None = None, worker: str | None = None
-    ) -> None:
+    def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
         self.folder, self.stages = folder, dict(stages or {})
         self.places: Sequence[Path] = (folder,)  # files and folders whose places are kept out of what stages say
-        self._is_worker, self._own = worker is not None, set[str]()
-        self._file = folder / (RECORD_FILE if worker is None else _worker_file(worker))
+        self._file, self._read = folder / RECORD_FILE, (0, 0)
 
     @classmethod
-    def of(cls, folder: Path, worker: str | None = None) -> Record:
+    def of(cls, folder: Path) -> Record:
         """The record of a folder; empty for one that is new or empty, and refused for one of something else."""
-        if (folder / RECORD_FILE).is_file():
-            record = cls(folder, worker=worker)
-            for file in (folder / RECORD_FILE, *sorted(folder.glob(_worker_file("*")))):
-                stages = _read(file)
-                record.stages |= stages
-                if file == record._file:
-                    record._own |= set(stages)
-            return record
-        if folder.exists() and (not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir())):
-            raise InputError(
-                f"{folder} already exists and is no reconstruction",
-                "a new or empty folder, or one that `coliags reconstruct` made",
-                "Choose another --output",
+        record = cls(folder)
+        if not record.refresh() and folder.exists():
+            if not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir()):
+                raise InputError(
+                    f"{folder} already exists and is no reconstruction",
+                    "a new or empty folder, or one that `coliags reconstruct` made",
+                    "Choose another --output",
+                )
+        return record
+
+    def refresh(self) -> bool:
+        """Read what others have written; returns whether there is a file.
+
+        Raises:
+            InputError: It is damaged, or of another version of the package.
+        """
+        if not self._file.is_file():
+            return False
+        if (known := self._status()) != self._read:
+            self.stages, self._read = _read(self._file), known
+        return True
+
+    def _status(self) -> tuple[int, int]:
+        """What differs after every writing."""
+        status = self._file.stat()
+        return status.st_ino, status.st_mtime_ns
+
+    def within(self, segment: str) -> dict[str, StageRecord]:
+        """The stages of a segment, named and with files as in its folder; of a short video's, '', all."""
+        prefix = f"{segment}/" if segment else ""
+        return {
+            name.removeprefix(prefix): replace(
+                stage, files={path.removeprefix(prefix): what for path, what in stage.files.items()}
             )
-        return cls(folder, worker=worker)
+            for name, stage in self.stages.items()
+            if name.startswith(prefix)
+        }
 
     def is_done(self, name: str) -> bool:
         """Whether a stage is."""
         return name in self.stages and self.stages[name].state == "done"
 
-    def take_over_all(self) -> None:
-        """Take what the workers of an earlier call have written; one that has not ended is waited for.
-
-        Raises:
-            LockedError: It does not end.
-        """
-        for file in sorted(self.folder.glob(_worker_file("*"))):
-            worker = file.stem.removeprefix(_WORKER_FILES)
-            with locked(self.folder / f"{LOCK_FILE}-{worker}", self.folder, LOCK_SECONDS):
-                self.take_over(worker)
-
-    def take_over(self, worker: str) -> None:
-        """Take what a worker that has ended has written."""
-        file = self.folder / _worker_file(worker)
-        if file.is_file():
-            self.stages |= _read(file)
-            self.write()
-            file.unlink()
-
     def put(self, name: str, stage: StageRecord) -> None:
         """Set a stage, in the place it has."""
         summary, *warnings = (without_places(text, self.places) for text in (stage.summary, *stage.warnings))
-        self.stages[name] = replace(stage, summary=summary, warnings=tuple(warnings))
-        self._own.add(name)
-        self.write()
+        self.write({name: replace(stage, summary=summary, warnings=tuple(warnings))})
 
     def forget(self, names: Sequence[str], outputs: Sequence[str]) -> None:
         """Forget stages and remove what they made, files and folders relative to the folder."""
-        self.stages = {name: stage for name, stage in self.stages.items() if name not in names}
-        self.write()
+        self.write(without=names)
         for output in outputs:
             path = self.folder / output
             if path.is_dir():
@@ -144,42 +129,56 @@ class Record:
             if path.parent != self.folder and path.parent.is_dir() and not any(path.parent.iterdir()):
                 path.parent.rmdir()
 
-    def write(self) -> None:
-        """Write the file atomically."""
-        stages = {n: asdict(stage) for n, stage in self.stages.items() if not self._is_worker or n in self._own}
-        write_json(self._file, {"format": FORMAT, "version": __version__, "stages": stages})
+    def write(self, stages: Mapping[str, StageRecord] | None = None, without: Sequence[str] = ()) -> None:
+        """Write the file atomically, with these stages and without some, in the order of segments and sub-maps."""
+        with locked(self.folder / f".{RECORD_FILE}.lock", self._file, LOCK_SECONDS):
+            self.refresh()
+            changed = {name: stage for name, stage in self.stages.items() if name not in without} | dict(stages or {})
+            self.stages = dict(sorted(changed.items(), key=lambda item: _place(item[0])))
+            plain = {name: asdict(stage) for name, stage in self.stages.items()}
+            write_json(self._file, {"format": FORMAT, "version": __version__, "stages": plain})
+            self._read = self._status()
 
 
-def _worker_file(name: str) -> str:
-    return f"{_WORKER_FILES}{name}.json"
+def worker_lock(folder: Path, worker: str) -> Path:
+    """Lock that a worker holds."""
+    return folder / f"{LOCK_FILE}-{worker}"
+
+
+def wait_for_workers(folder: Path) -> None:
+    """Wait for the workers of an earlier call, which end with it.
+
+    Raises:
+        LockedError: One does not end.
+    """
+    for lock in sorted(folder.glob(worker_lock(folder, "*").name)):
+        with locked(lock, folder, LOCK_SECONDS):
+            pass
+
+
+def _place(name: str) -> list[int]:
+    """Numbers of segment and sub-map of a stage."""
+    return [int(number) for number in re.findall(r"\d+", name)]
 
 
 def _read(file: Path) -> dict[str, StageRecord]:
-    return read_record(file, lambda _, content: _RECORDED.validate_python(content["stages"]), "Choose another --output")
-
-
-def read_record(file: Path, validate: Callable[[str, Any], T], do: str = "") -> T:
-    """Read a record by its text and JSON value; refused are damaged ones, and those of other versions of the package.
-
-    ``do`` is what to do about a damaged one.
-    """
+    """The stages in a record; refused are damaged ones, and those of other versions of the package."""
     try:
-        text = json_text(file)
-        content = parse_json(text)
+        content = parse_json(json_text(file))
         if isinstance(content, dict) and content.get("format") != FORMAT:
             raise InputError(
                 f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
                 f"format {FORMAT}, of version {__version__}",
                 "Choose another --output, or go on with that version",
             )
-        with invalid_reported(f"cannot read {file}: ", "what `coliags reconstruct` wrote", do):
-            return validate(text, content)
+        with invalid_reported(f"cannot read {file}: ", MADE, "Choose another --output"):
+            return _RECORDED.validate_python(content["stages"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", do) from error
+        raise InputError(f"cannot read {file}: {error}", MADE, "Choose another --output") from error
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a file is there before the record is: the lock, or what a kill has left of writing the record."""
+    """Whether a file is there before the record is: a lock, or what a kill has left of writing the record."""
     return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")
 
 
@@ -205,45 +204,22 @@ class Stage:
     run: Callable[[], StageOutcome]
     outputs: Sequence[str] = ()  # files and folders that it writes, relative to the reconstruction's folder
     part: Part = None  # which of several parts, independent of each other, it is of; None: all need it
-    is_plan: bool = False  # whether the stages after it are known only once it is done
 
 
-def run_stages(
-    stages: Sequence[Stage],
-    record: Record,
-    overwrite: bool = False,
-    plan: Callable[[], Sequence[Stage]] | None = None,
-    parts: Container[Part] | None = None,
-) -> ReportedError | None:
-    """Run the stages that are not done, all or those of some parts; ``plan`` gives them anew after one that decides.
+def run_stages(stages: Sequence[Stage], record: Record, part: Part = None) -> None:
+    """Run the stages of a part that are not done, in order.
 
-    A stage that was begun with other options is an error, or with ``overwrite`` removed and repeated, along with those
-    that need it. The options of one that failed may change. A stage of a part that fails ends that part alone: the
-    error of part 0 is returned, those of others are in the record.
+    Raises:
+        InputError: One cannot be done; which, and what stands, is told.
     """
-    number, failed = 0, dict[int, ReportedError]()
-    check_options(stages, record, overwrite)
-    while number < len(stages):
-        stage = stages[number]
-        number += 1
-        if stage.part in failed or (parts is not None and stage.part not in parts):
+    for number, stage in enumerate(stages, start=1):
+        if stage.part != part:
             continue
-        before = [other.name for other in stages[: number - 1] if other.part in (None, stage.part)]
         try:
             _run_stage(stage, f"[{number}/{len(stages)}] {stage.name}", record)
-        except NotWritableError as error:
+        except InputError as error:
+            before = [other.name for other in stages[: number - 1] if other.part in (None, part)]
             raise _failed(error, stage, before) from error
-        except (InputError, NotFiniteError, NothingDrawnError) as error:
-            told = _failed(error, stage, before) if isinstance(error, InputError) else error
-            if stage.part is None:
-                raise told from error
-            failed[stage.part] = told
-            if any(other.part not in (None, stage.part) for other in stages):
-                log.warning("%s; the others go on", str(told).rstrip("."))
-        if stage.is_plan and plan is not None:
-            stages = plan()
-            check_options(stages, record, overwrite)
-    return failed.get(0)
 
 
 def _run_stage(stage: Stage, title: str, record: Record) -> None:
@@ -272,7 +248,10 @@ def _run_stage(stage: Stage, title: str, record: Record) -> None:
 
 
 def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
-    """Refuse, or remove, what was made with other options."""
+    """Refuse what was made with other options, or with ``overwrite`` remove it along with what needs it.
+
+    The options of a stage that failed may change.
+    """
     for number, stage in enumerate(stages):
         known = record.stages.get(stage.name)
         if known is None or known.options == _plain(stage.options):
@@ -294,11 +273,9 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return f"{name} {old.get(name)}, not {new.get(name)}"
 
 
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    leaves: list[tuple[str, Any]] = []
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in values.items():
-        leaves += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
-    return leaves
+        yield from _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
 
 
 def _plain(options: Mapping[str, Any]) -> dict[str, Any]:

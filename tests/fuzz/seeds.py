@@ -23,7 +23,7 @@ from tests.comparison.small import TINY
 from tests.datamanagers.kinds import KINDS, write_kind
 from tests.export.splats.clouds import random_cloud
 from tests.phantom.phantom_layouts import write_phantom
-from tests.pipeline.procedures import write_procedure
+from tests.pipeline.reconstructions import write_long, write_short
 
 FRAMES = 9
 METHOD = "coliags"
@@ -58,7 +58,8 @@ def make_seeds(folder: Path) -> None:
     (folder / "video").mkdir()
     frames = [cv2.imread(str(path))[..., ::-1] for path in sorted((phantom / "images").iterdir())]
     write_video(np.stack(frames), folder / "video/film.mp4", 10.0)
-    write_procedure(folder / "procedure")
+    write_long(folder / "long-video")
+    write_short(folder / "short-video")
     shutil.rmtree(work)
 
 

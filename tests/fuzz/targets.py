@@ -25,7 +25,7 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surface
 from coliags_plugin.geometry.poses.formats import format_of
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.procedure.page import write_procedure_page
+from coliags_plugin.pipeline.page import write_page
 from coliags_plugin.reconstruction.depth.priors import FilePrior
 from tests.datamanagers.kinds import KINDS
 from tests.fuzz.seeds import METHOD, METHODS, TRAJECTORIES
@@ -179,7 +179,7 @@ def _video(folder: Path) -> None:
 #: Files of a scene besides its images.
 _FILES = ("*.json", "*.txt", "*.xml", "*.npz", "*.ply", "sparse/0/*", "rotation/*.txt", "rotation/*.json", "*.yaml")
 _RUN = ("run/*.*", "run/checkpoints/*/*")
-_PROCEDURE = ("*.*", "*/*.json", "*/*/*.json", "*/*/images/*", "*/run/eval/*/*.json")
+_PIPELINE = ("*.*", "*/*.json", "*/*/*.json", "*/images/*", "*/*/images/*", "**/run/eval/*/*.json")
 
 TARGETS: dict[str, Target] = {
     **{
@@ -218,9 +218,9 @@ TARGETS: dict[str, Target] = {
     "ablation": Target("methods", ("ablation.yaml",), lambda folder: load_ablation(f"{folder}/ablation.yaml")),
     "prior": Target("depth-maps", ("npy/*", "png/*"), _prior),
     "video": Target("video", ("*",), _video),
-    "procedure-page": Target("procedure", _PROCEDURE, write_procedure_page, True),
-    "procedure-export": Target(
-        "procedure",
+    **{f"page-{name}": Target(name, _PIPELINE, write_page, True) for name in ("short-video", "long-video")},
+    "poses-export": Target(
+        "long-video",
         ("*.json", "*/*/*.json", "*/poses/sparse/0/*"),
         lambda folder: _command("poses", "export", folder, "--output", folder.with_name("exported"), "--overwrite"),
         True,

@@ -14,9 +14,8 @@ from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
-from coliags_plugin.pipeline import capture_stages, reconstruct, training_stages
+from coliags_plugin.pipeline import reconstruct, steps
 from coliags_plugin.pipeline.jobs import PartTask, work
-from coliags_plugin.pipeline.procedure import run
 from coliags_plugin.pipeline.stages import StageOutcome
 from tests.pipeline.films import film
 from tests.reconstruction.seen_points import frame_model
@@ -47,11 +46,10 @@ def done(monkeypatch):
 
         return work
 
-    write = capture_stages.make_frames
-    monkeypatch.setattr(capture_stages, "make_frames", lambda context: (names.append("make_frames"), write(context))[1])
-    for module, functions in ((capture_stages, CAPTURE), (training_stages, TRAINING)):
-        for function in functions:
-            monkeypatch.setattr(module, function, faked(function))
+    write = steps.make_frames
+    monkeypatch.setattr(steps, "make_frames", lambda context: (names.append("make_frames"), write(context))[1])
+    for function in (*CAPTURE, *TRAINING):
+        monkeypatch.setattr(steps, function, faked(function))
     return names
 
 
@@ -92,17 +90,24 @@ def atlas(tmp_path):
 
 
 @pytest.fixture(scope="session")
-def whole_procedure(tmp_path_factory):
-    """The folder of :mod:`tests.pipeline.procedures`, not to be changed."""
-    from tests.pipeline.procedures import write_procedure  # which uses this module
+def folders(tmp_path_factory):
+    """The folders of :mod:`tests.pipeline.reconstructions`, not to be changed."""
+    from tests.pipeline.reconstructions import write_long, write_short  # which uses this module
 
-    return write_procedure(tmp_path_factory.mktemp("procedure") / "out")
+    folder = tmp_path_factory.mktemp("folders")
+    return {"long": write_long(folder / "long"), "short": write_short(folder / "short")}
 
 
 @pytest.fixture
-def out(whole_procedure, tmp_path):
-    """A copy of it."""
-    return shutil.copytree(whole_procedure, tmp_path / "out")
+def out(folders, tmp_path):
+    """A copy of the long video's."""
+    return shutil.copytree(folders["long"], tmp_path / "out")
+
+
+@pytest.fixture
+def short(folders, tmp_path):
+    """A copy of the short video's."""
+    return shutil.copytree(folders["short"], tmp_path / "short")
 
 
 class Workers(TaskList):
@@ -124,8 +129,7 @@ class Workers(TaskList):
 def workers(monkeypatch):
     def use(*endings):
         executor = Workers(*endings)
-        for module in (reconstruct, run):
-            monkeypatch.setattr(module, "make_executor", lambda options: executor)
+        monkeypatch.setattr(reconstruct, "make_executor", lambda options: executor)
         return executor
 
     return use

@@ -20,6 +20,7 @@ from coliags_plugin.pipeline.frame_selection import looks_interlaced, motion_and
 from coliags_plugin.pipeline.frame_sources import chosen_frames, frame_source, image_files
 from coliags_plugin.pipeline.frames import write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.survey import survey_video
 from tests.pipeline.films import WIDTH, film, write_images
 
 RNG = np.random.default_rng(0)
@@ -109,7 +110,7 @@ def test_frames_are_written_so_and_the_record_says_it(tmp_path):
     video = tmp_path / "film.mp4"
     write_video(INTERLACED, video, 25.0)
     source = chosen_frames(video, FrameSettings())
-    summary = write_frames(source, tmp_path / "frames", FrameSettings(least_motion=0.0))
+    summary = write_frames(source, survey_video(source), tmp_path / "frames", FrameSettings(least_motion=0.0))
     assert summary.startswith("60 of 60 frames, 160 x 120 px, deinterlaced")
     assert json.loads((tmp_path / "frames" / "frames.json").read_text())["deinterlaced"]
     with image_files(video) as files:
@@ -121,16 +122,17 @@ def test_frames_are_written_so_and_the_record_says_it(tmp_path):
 @pytest.mark.thorough
 def test_a_procedure_decides_once(tmp_path, done, workers):
     """Of which the last segment would not look interlaced by itself."""
-    video = tmp_path / "long.mp4"
-    write_video([*INTERLACED, *FIELDS[:120]], video, 25.0)
+    file = tmp_path / "long.mp4"
+    write_video([*INTERLACED, *FIELDS[:120]], file, 25.0)
     executor = workers()
     options = {"frames.segment": 100, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
     known = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0, 60.0)}
-    made = cp.reconstruct(video, tmp_path / "out", settings={**options, **known})
-    assert made.procedure.deinterlace and made.procedure.seek and len(made.segments) >= 2
+    made = cp.reconstruct(file, tmp_path / "out", settings={**options, **known})
+    video = made.stages["survey"].figures
+    assert video["deinterlace"] and video["seek"] and len(video["segments"]) >= 2
     tasks = [json.loads(task.settings)["frames"]["deinterlace"] for task in executor.tasks]
     assert tasks and all(tasks)
-    last = tmp_path / "out" / list(made.segments)[-1] / "frames" / "images" / "frame_000179.png"
-    frames = [image for _, image in frame_source(video)]
+    last = tmp_path / "out" / video["segments"][-1]["name"] / "frames" / "images" / "frame_000179.png"
+    frames = [image for _, image in frame_source(file)]
     np.testing.assert_array_equal(read_rgb(last), one_field(frames[179]))
     assert "180 frames, 7.2 s, 160 x 120 px, deinterlaced" in (tmp_path / "out" / "index.html").read_text()

@@ -13,17 +13,22 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_mask
 from coliags_plugin.pipeline.frame_selection import motion, reduced
 from coliags_plugin.pipeline.frame_sources import frame_source
-from coliags_plugin.pipeline.frames import FrameSurvey, read_blurred, read_lens_mask, write_frames
+from coliags_plugin.pipeline.frames import read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.survey import FrameSurvey, survey_video
 from tests.pipeline.films import HEIGHT, WIDTH, blurred, film, write_images
 
 FILM = film(range(0, 120, 6))
 
 
+def write(source, out, settings, mask=None):
+    return write_frames(source, survey_video(source), out, settings, mask)
+
+
 def test_frames_are_written_without_loss_and_what_is_dropped_is_recorded(tmp_path):
     frames = [*FILM[:5], blurred(FILM[5]), *FILM[6:10], FILM[9], FILM[9], np.zeros_like(FILM[0]), *FILM[10:]]
     out = tmp_path / "frames"
-    summary = write_frames(frame_source(write_images(tmp_path / "film", frames)), out, FrameSettings())
+    summary = write(frame_source(write_images(tmp_path / "film", frames)), out, FrameSettings())
     dropped = {10: "the camera rests", 11: "the camera rests", 12: "black or without any texture"}
     record = json.loads((out / "frames.json").read_text())
     assert {each["frame"]: each["why"] for each in record["dropped"]} == dropped
@@ -40,7 +45,7 @@ def test_frames_are_written_without_loss_and_what_is_dropped_is_recorded(tmp_pat
 def test_a_slow_camera_does_not_rest(tmp_path):
     """Motion counts from the last frame kept, so that slow motion adds up."""
     frames = film([place // 3 for place in range(60)])
-    write_frames(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
+    write(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
     kept = json.loads((tmp_path / "out" / "frames.json").read_text())["kept"]
     assert [each["frame"] for each in kept] == list(range(0, 60, 3))
 
@@ -50,18 +55,18 @@ def test_the_mask_is_found_or_given(tmp_path):
     ring[:, :20] = False
     frames = [np.where(ring[..., None], frame, 0).astype(np.uint8) for frame in FILM]
     source = frame_source(write_images(tmp_path / "film", frames))
-    summary = write_frames(source, tmp_path / "found", FrameSettings(least_motion=0.0))
+    summary = write(source, tmp_path / "found", FrameSettings(least_motion=0.0))
     assert summary.endswith("% of the image masked")
     mask = read_lens_mask(tmp_path / "found")
     assert not mask[:, :20].any()
     assert mask[:, 24:].all()
     ring[:30] = False
     write_mask(tmp_path / "mask.png", ring)
-    write_frames(source, tmp_path / "given", FrameSettings(), tmp_path / "mask.png")
+    write(source, tmp_path / "given", FrameSettings(), tmp_path / "mask.png")
     np.testing.assert_array_equal(read_lens_mask(tmp_path / "given"), ring)
     write_mask(tmp_path / "small.png", ring[:50])
     with pytest.raises(InputError, match=r"small.png is 160 x 50, the frames 160 x 120"):
-        write_frames(source, tmp_path / "no", FrameSettings(), tmp_path / "small.png")
+        write(source, tmp_path / "no", FrameSettings(), tmp_path / "small.png")
     assert not (tmp_path / "no").exists()
 
 
@@ -75,7 +80,7 @@ def test_the_mask_is_found_or_given(tmp_path):
 )
 def test_too_few_frames_of_use_are_refused(tmp_path, frames, message):
     with pytest.raises(InputError, match=message):
-        write_frames(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
+        write(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
     assert not (tmp_path / "out").exists()
 
 

@@ -15,9 +15,9 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.execution.tasks import TaskOutcome
-from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.jobs import PartJob
+from coliags_plugin.pipeline.jobs import PartJob, Reconstruction
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome, StageRecord
 from tests.comparison.small import lock_holder, until
@@ -44,7 +44,7 @@ def posed(done, monkeypatch):
         write_atlas(context.posed)
         return StageOutcome("posed")
 
-    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    monkeypatch.setattr(steps, "make_poses", poses)
 
 
 @pytest.mark.thorough
@@ -57,7 +57,6 @@ def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, wo
     assert parts(executor) == [None, 0, 1] and done == alone
     assert told(tmp_path / "out") == told(tmp_path / "alone") and list(record.stages) == list(told(tmp_path / "alone"))
     assert (tmp_path / "out" / PAGE_FILE).is_file()
-    assert not list((tmp_path / "out").glob(".reconstruction-*")), "all is in one record at the end"
     executor = workers()
     cp.reconstruct(video, tmp_path / "out", jobs=2)
     assert parts(executor) == [], "what is done is not done again"
@@ -83,28 +82,26 @@ def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, a
 
 
 def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
-    stages = [SimpleNamespace(name=f"submap-3/{name}") for name in ("depth", "train", "mesh")]
+    stages = [SimpleNamespace(name=f"submap-3/{name}", part=3) for name in ("depth", "train", "mesh")]
     context = StageContext(tmp_path, tmp_path, ReconstructionSettings(), None, None, torch.device("cpu"))
-    options = SimpleNamespace(device="cpu", threads=1)
-    job = PartJob(SimpleNamespace(context=context, options=options, executor=options), 3, stages, 10)
-    assert job.doing == f"{tmp_path.name}, sub-map 3"
-    record = Record(tmp_path)
-    record.put("submap-3/depth", StageRecord({}, "done"))
-    record.put("submap-3/train", StageRecord({}))
-    record.write()
-    assert job.doing == f"{tmp_path.name}, sub-map 3 train"
+    job = PartJob(Reconstruction(Record(tmp_path), [], False, None), context, 3, stages, 10)
+    assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3", 0)
+    worker = Record.of(tmp_path)
+    worker.put("submap-3/depth", StageRecord({}, "done"))
+    worker.put("submap-3/train", StageRecord({}))
+    assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3 train", 2)
 
 
 @pytest.mark.thorough
 def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, workers, monkeypatch):
-    mesh, failing = training_stages.mesh, [1]
+    mesh, failing = steps.mesh, [1]
 
     def fails(context):
         if context.submap.number in failing:
             raise InputError("no surface")
         return mesh(context)
 
-    monkeypatch.setattr(training_stages, "mesh", fails)
+    monkeypatch.setattr(steps, "mesh", fails)
     workers()
     record = cp.reconstruct(atlas, tmp_path / "out", jobs=1)
     assert record.stages["submap-1/mesh"].state == "failed" and record.stages["report"].state == "done"
@@ -126,19 +123,6 @@ def test_it_stops_and_goes_on(done, atlas, tmp_path, workers):
     workers()
     cp.reconstruct(atlas, tmp_path / "out", jobs=1)
     assert done == [*SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
-
-
-@pytest.mark.thorough
-def test_what_a_worker_of_a_killed_call_has_written_is_taken_over(done, atlas, tmp_path, workers, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setattr(Record, "take_over", lambda *_: None)
-        executor = workers()
-        cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert len(list((tmp_path / "out").glob(".reconstruction-*.json"))) == 2
-    assert len(Record.of(tmp_path / "out").stages) == 16
-    executor = workers()
-    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert parts(executor) == [] and not list((tmp_path / "out").glob(".reconstruction-*.json"))
 
 
 @pytest.mark.thorough

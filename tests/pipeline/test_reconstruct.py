@@ -19,7 +19,7 @@ from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline import training_stages
+from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.reconstruct import forecast
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.results.reading import read_result
@@ -28,7 +28,7 @@ from tests.pipeline.conftest import CAPTURE, TRAINING
 from tests.pipeline.films import film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
-_COVERAGE = training_stages.coverage
+_COVERAGE = steps.coverage
 
 
 def test_stages_of_a_video(done, video, tmp_path, capsys):
@@ -36,7 +36,7 @@ def test_stages_of_a_video(done, video, tmp_path, capsys):
     assert commands.run(*argv) == 0
     assert done == ["make_frames", *CAPTURE, *TRAINING]
     printed = capsys.readouterr().out
-    assert printed.splitlines()[0].startswith("frames: 15 of 15 frames, 160 x 120 px")
+    assert printed.startswith("survey: 15 frames in 1 segment\nframes: 15 of 15 frames, 160 x 120 px")
     assert f"{tmp_path / 'out' / 'frames' / 'images'}: frames of use, PNG" in printed
     page = (tmp_path / "out" / "index.html").read_text()
     assert 'href="frames/images"' in page
@@ -69,7 +69,7 @@ def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
 def test_another_video_is_noticed(done, video, tmp_path):
     cp.reconstruct(video, tmp_path / "out")
     write_video(film(range(0, 60, 4)), video, 15.0)
-    with pytest.raises(InputError, match=r"stage frames was made with source.bytes \d+, not \d+"):
+    with pytest.raises(InputError, match=r"stage survey was made with source.bytes \d+, not \d+"):
         cp.reconstruct(video, tmp_path / "out")
 
 
@@ -86,7 +86,7 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
     done, tmp_path, monkeypatch, caplog
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
-    monkeypatch.setattr(training_stages, "coverage", _COVERAGE)
+    monkeypatch.setattr(steps, "coverage", _COVERAGE)
     monkeypatch.setattr("coliags_plugin.geometry.meshes.files.read_mesh", lambda path: None)
 
     def failing(error):
@@ -158,7 +158,7 @@ def test_a_tube_is_reconstructed_from_its_frames(tmp_path, monkeypatch):
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "10 of 10 used (100 %)" in page and f"{figures['psnr']:.2f}" in page
     pictures = set(re.findall(r'src="(data:image[^"]+)"', page))
-    assert len(pictures) == 1 + 4 + 1 + 4 * 3  # ribbon; one view and hatch; four frames, their depth and light
+    assert len(pictures) == 10 + 4 + 1 + 4 * 3  # time line; one view and hatch; four frames, their depth and light
     assert page.count("<iframe") == 1 and 'src="index_files' not in page
 
 

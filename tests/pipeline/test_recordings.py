@@ -18,7 +18,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.morphology import eroded
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
-from coliags_plugin.pipeline import capture_stages
+from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.frame_sources import opened_recording
 from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, Start, starting_cameras
@@ -93,13 +93,15 @@ def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_b
     executor = workers()
     options = {"frames.segment": 50, "frames.least_motion": 0.0, "sfm.camera.model": "c3vd"}
     made = cp.reconstruct(folder / "rgb", tmp_path / "out", settings=options)
-    assert len(made.segments) == 2 and made.procedure.frames == 70 and made.procedure.size == (270, 216)
+    video = made.stages["survey"].figures
+    assert len(video["segments"]) == 2 and video["frames"] == 70 and video["size"] == [270, 216]
     assert {json.loads(task.settings)["sfm"]["camera"]["model"] for task in executor.tasks} == {"c3vd"}
-    for name, segment in zip(made.segments, made.procedure.segments, strict=True):
+    for segment in video["segments"]:
+        name = segment["name"]
         mask = read_mask(tmp_path / "out" / name / "frames" / "mask.png")
         assert not mask[~shown].any() and mask[eroded(shown, 5)].all()
         images = sorted(path.stem for path in (tmp_path / "out" / name / "frames" / "images").iterdir())
-        assert images == [f"{number:04d}" for number in range(segment.first, segment.last + 1)]
+        assert images == [f"{number:04d}" for number in range(segment["first"], segment["last"] + 1)]
     poses = np.tile(np.eye(4), (70, 1, 1))
     poses[:, 0, 3] = np.arange(70)
     lines = [",".join(map(str, pose.T.ravel())) for pose in poses]
@@ -144,8 +146,8 @@ def test_it_is_no_scene(recording):
 
 def test_it_is_reconstructed_with_its_camera(done, recording, tmp_path, monkeypatch):
     seen = []
-    fake = capture_stages.make_poses
-    monkeypatch.setattr(capture_stages, "make_poses", lambda context: (seen.append(context.settings), fake(context))[1])
+    fake = steps.make_poses
+    monkeypatch.setattr(steps, "make_poses", lambda context: (seen.append(context.settings), fake(context))[1])
     cp.reconstruct(recording, tmp_path / "out")
     assert done == ["make_frames", *CAPTURE, *TRAINING]
     assert seen[0].sfm == opened_recording(recording, SfmSettings())[1]

@@ -7,8 +7,16 @@ import json
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.pipeline.procedure.record import PROCEDURE_FILE, Procedure
-from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, Stage, StageOutcome, run_stages
+from coliags_plugin.pipeline.stages import (
+    LOCK_FILE,
+    RECORD_FILE,
+    Record,
+    Stage,
+    StageOutcome,
+    StageRecord,
+    check_options,
+    run_stages,
+)
 from tests.pipeline.conftest import Killed
 
 
@@ -35,9 +43,9 @@ class Workshop:
 
     def run(self, overwrite=False, **options):
         self.done = []
-        failure = run_stages(self.stages(**options), Record.of(self.folder), overwrite)
-        if failure is not None:
-            raise failure
+        record, stages = Record.of(self.folder), self.stages(**options)
+        check_options(stages, record, overwrite)
+        run_stages(stages, record)
         return self.done
 
 
@@ -46,7 +54,7 @@ def test_done_stages_are_left_out(tmp_path):
     assert shop.run() == ["first", "second", "third"]
     assert shop.run() == []
     record, content = Record.of(tmp_path), json.loads((tmp_path / RECORD_FILE).read_text())
-    assert (content["format"], list(content["stages"])) == (1, ["first", "second", "third"])
+    assert (content["format"], list(content["stages"])) == (2, ["first", "second", "third"])
     assert [stage.state for stage in record.stages.values()] == ["done"] * 3
     assert record.stages["second"].summary == "second is there"
     assert record.stages["third"].files == {"third.txt": "a file"}
@@ -89,16 +97,33 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match="already exists and is no reconstruction"):
         Record.of(tmp_path)
-    (tmp_path / RECORD_FILE).write_text('{"format": 1, "stages": 3}')
+    (tmp_path / RECORD_FILE).write_text('{"format": 2, "stages": 3}')
     with pytest.raises(InputError, match=r"cannot read .*reconstruction.json"):
         Record.of(tmp_path)
 
 
 def test_records_of_other_versions_are_refused(tmp_path):
-    for name, read in ((RECORD_FILE, Record.of), (PROCEDURE_FILE, Procedure.read)):
-        (tmp_path / name).write_text('{"format": 0, "version": "0.0.1", "stages": {}}')
-        with pytest.raises(InputError, match=rf"{name} is of version 0\.0\.1 .*Choose another --output"):
-            read(tmp_path)
+    (tmp_path / RECORD_FILE).write_text('{"format": 1, "version": "0.0.1", "stages": {}}')
+    with pytest.raises(InputError, match=rf"{RECORD_FILE} is of version 0\.0\.1 .*Choose another --output"):
+        Record.of(tmp_path)
+
+
+def test_several_processes_change_one_record_which_is_in_order(tmp_path):
+    record = Record(tmp_path, {"survey": StageRecord({}, "done")})
+    record.write()
+    names = ["segment-001/frames", "segment-000/submap-1/train", "segment-000/train"]
+    workers = {name: Record.of(tmp_path) for name in names}
+    for name, worker in workers.items():
+        worker.put(name, StageRecord({}, "done", files={name: "a file"}))
+    assert record.refresh() and list(record.stages) == ["survey", *names[:0:-1], names[0]]
+    workers[names[0]].forget(names[1:2], [])
+    assert list(Record.of(tmp_path).stages) == ["survey", names[2], names[0]]
+    assert [path.name for path in tmp_path.iterdir()] == [RECORD_FILE]
+    own = record.within("segment-000")
+    assert {name: list(stage.files) for name, stage in own.items()} == {
+        "train": ["train"],
+        "submap-1/train": ["submap-1/train"],
+    }
 
 
 def test_what_a_kill_leaves_before_the_record_is_no_hindrance(tmp_path):

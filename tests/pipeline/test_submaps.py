@@ -18,7 +18,7 @@ from coliags_plugin.datamanagers.atlas import ATLAS_FILE, read_atlas
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
-from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.context import StageContext, Submap, find_submaps
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
@@ -67,14 +67,14 @@ def test_each_sub_map_has_its_own_frames_and_unit(atlas, tmp_path, caplog):
 
 def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_path, monkeypatch):
     with monkeypatch.context() as patched, pytest.raises(Killed):
-        mesh = training_stages.mesh
+        mesh = steps.mesh
 
         def killed(context):
             if context.submap.number == 1:
                 raise Killed
             return mesh(context)
 
-        patched.setattr(training_stages, "mesh", killed)
+        patched.setattr(steps, "mesh", killed)
         cp.reconstruct(atlas, tmp_path / "out")
     assert done == [*SUBMAP, "submap-1/check_data", "submap-1/estimate_depth", "submap-1/train", "submap-1/evaluate"]
     done.clear()
@@ -94,14 +94,14 @@ def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_
 
 
 def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatch):
-    make_poses = capture_stages.make_poses
+    make_poses = steps.make_poses
 
     def poses(context):
         shutil.rmtree(context.posed, ignore_errors=True)
         write_atlas(context.posed, COUNTS if context.settings.diameter is None else COUNTS[:1])
         return make_poses(context)
 
-    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    monkeypatch.setattr(steps, "make_poses", poses)
     cp.reconstruct(video, tmp_path / "out")
     assert done == ["make_frames", "make_poses", *SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
     (tmp_path / "out" / "submap-1").mkdir()
@@ -118,14 +118,14 @@ def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatc
 @pytest.mark.parametrize("error", [InputError("no surface that frames agree on"), NotFiniteError("loss is nan")])
 def test_a_sub_map_that_fails_does_not_end_the_others(done, atlas, tmp_path, monkeypatch, caplog, error, capsys):
     failing = [1]
-    estimate = capture_stages.estimate_depth
+    estimate = steps.estimate_depth
 
     def fails(context):
         if context.submap.number in failing:
             raise error
         return estimate(context)
 
-    monkeypatch.setattr(capture_stages, "estimate_depth", fails)
+    monkeypatch.setattr(steps, "estimate_depth", fails)
     argv = ("reconstruct", atlas, "--output", tmp_path / "out", "--set", "least_submap=5")
     assert commands.run(*argv) == 0
     assert done == [*SUBMAP, "submap-1/check_data", *(f"submap-2/{name}" for name in SUBMAP)]
@@ -149,7 +149,7 @@ def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypa
     def fails(context):
         raise InputError(f"{context.out / 'depth'} is empty")
 
-    monkeypatch.setattr(training_stages, "mesh", fails)
+    monkeypatch.setattr(steps, "mesh", fails)
     with pytest.raises(InputError):
         cp.reconstruct(atlas, tmp_path / "out")
     for file in ("reconstruction.json", "index.html"):
@@ -159,7 +159,7 @@ def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypa
 
 def test_warnings_and_figures_are_kept(done, atlas, tmp_path, monkeypatch, caplog):
     outcome = StageOutcome("1 suspect finding", {}, ["suspect: the camera jumps. Check it"], {"frames": 14})
-    monkeypatch.setattr(capture_stages, "check_data", lambda context: outcome)
+    monkeypatch.setattr(steps, "check_data", lambda context: outcome)
     cp.reconstruct(atlas, tmp_path / "out")
     assert "submap-1/check: suspect: the camera jumps. Check it" in caplog.text
     content = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]
@@ -194,12 +194,12 @@ def test_each_model_is_scaled_by_the_diameter_or_else_to_its_median_depth(tmp_pa
     monkeypatch.setattr("coliags_plugin.reconstruction.structure.sfm.reconstruct", lambda *arguments: found)
     settings = ReconstructionSettings(diameter=40.0, least_submap=4)
     context = StageContext(out, tmp_path / "film", settings, None, None, torch.device("cpu"))
-    assert "unit mm, by a diameter of 40 mm" in capture_stages.make_poses(context).summary
+    assert "unit mm, by a diameter of 40 mm" in steps.make_poses(context).summary
     atlas = read_atlas(context.posed)
     assert [stretch.unit for stretch in atlas.submaps] == ["mm", "unknown", "unknown"]
-    steps = [
+    ways = [
         float(np.diff(colmap.read(context.posed / "sparse" / str(number)).camera_to_world[:, 2, 3]).mean())
         for number in range(3)
     ]
-    np.testing.assert_allclose(steps, [4.0, UNKNOWN_MEDIAN_DEPTH / models[1].median_depth, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(ways, [4.0, UNKNOWN_MEDIAN_DEPTH / models[1].median_depth, 1.0], rtol=1e-6)
     assert [one.open_posed().is_metric for one in context.submaps()] == [True, False]

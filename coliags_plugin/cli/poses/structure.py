@@ -56,7 +56,7 @@ class PosesSfmCommand:
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.pipeline.frame_sources import image_files, opened_recording
-        from coliags_plugin.pipeline.frames import FrameSurvey
+        from coliags_plugin.pipeline.survey import FrameSurvey
         from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.image_files import Masks, masks_for, read_image
         from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled

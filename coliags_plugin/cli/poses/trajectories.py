@@ -200,10 +200,10 @@ def _table(result: Alignment, unit: str) -> str:
 
 @dataclass(frozen=True)
 class PosesExportCommand:
-    """Export the sub-maps of a long video: COLMAP and nerfstudio layouts, trajectories, and how they are joined."""
+    """Export the sub-maps of a video: COLMAP and nerfstudio layouts, trajectories, and how they are joined."""
 
-    procedure: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder that `coliags reconstruct` made of a long video."""
+    reconstruction: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder that `coliags reconstruct` made of a video."""
     output: options.Output
     """Folder to create."""
     link: bool = False
@@ -214,9 +214,9 @@ class PosesExportCommand:
 
     def run(self) -> None:
         """Export, and print the sub-maps."""
-        from coliags_plugin.pipeline.procedure.export import MANIFEST, export_atlas
+        from coliags_plugin.pipeline.export import MANIFEST, export_atlas
 
-        manifest = export_atlas(self.procedure, self.output, self.overwrite, self.link)
+        manifest = export_atlas(self.reconstruction, self.output, self.overwrite, self.link)
         lines = [
             f"{one['name']}: {len(one['frames'])} frames, unit {one['unit']}"
             + ("" if one["nerfstudio"] else ", no dense depth")

@@ -1,4 +1,4 @@
-"""Export of a procedure's sub-maps: COLMAP and nerfstudio layouts, trajectories, and how they lie to each other."""
+"""Export of a reconstruction's sub-maps: COLMAP and nerfstudio layouts, trajectories, and how they are joined."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from coliags_plugin.core.files import atomic_folder, link_or_copy, make_folder, 
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.pipeline.procedure.contents import ProcedureContents, ProcedureSubmap, common_frames, read_procedure
+from coliags_plugin.pipeline.contents import SubmapContents, common_frames, read_contents
+from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES
 
 #: Name of the record of an export, and version of its schema.
@@ -22,7 +23,7 @@ MANIFEST, _FORMAT = "manifest.json", 1
 
 
 def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = False) -> dict[str, Any]:
-    """Write the sub-maps of a procedure, each in a folder of its own; returns what ``manifest.json`` says.
+    """Write the sub-maps of a video, each in a folder of its own; returns what ``manifest.json`` says.
 
     Of each sub-map (docs/procedure.md 3): ``colmap/`` with the posed images and the model, ``nerfstudio/`` with dense
     depth where it was estimated, and ``trajectory.txt`` in TUM's format, camera to world, at seconds of the video, or
@@ -31,21 +32,23 @@ def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = 
     are on one disk.
 
     Raises:
-        InputError: ``out`` is no procedure, has no poses, or is damaged; or ``folder`` is there without ``overwrite``.
+        InputError: ``out`` is of no video, has no poses, or is damaged; or ``folder`` is there without ``overwrite``.
     """
-    procedure = read_procedure(out)
-    if not procedure.submaps:
-        why = "; ".join(procedure.problems)
+    contents = read_contents(out)
+    submaps, video = [submap for submap in contents.submaps if submap.names], contents.video
+    if not submaps:
+        why = "; ".join(contents.problems)
         raise InputError(f"{out} has no sub-map with poses{f': {why}' if why else ''}", "at least one")
     refuse_overlap(folder, out)
-    placed = common_frames(procedure)
-    names = {submap.key: submap.name for submap in procedure.submaps}
+    placed = common_frames(contents)
+    names = {submap.key: submap.name for submap in submaps}
     entries = []
     with atomic_folder(folder, overwrite) as scratch:
-        for submap in procedure.submaps:
+        for submap in submaps:
             first, to_first = placed[submap.key]
-            own = submap.name.replace("/", "-")
-            has_depth = _write_submap(procedure, submap, scratch / own, link_or_copy if link else shutil.copyfile)
+            own = f"{submap.segment or 'submap'}-{submap.number}"
+            copy = link_or_copy if link else shutil.copyfile
+            has_depth = _write_submap(out / submap.segment, submap, video.rate, scratch / own, copy)
             entries.append(
                 {
                     "name": submap.name,
@@ -57,27 +60,25 @@ def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = 
                     "to_joined": to_first.tolist(),
                 }
             )
-        record = procedure.record
         manifest = {
             "format": _FORMAT,
-            "source": record.source,
-            "frames": record.frames,
-            "rate": record.rate,
-            "size": list(record.size),
-            "timestamps": "frame number" if record.rate is None else "s",
+            "source": [video.source],
+            "frames": video.frames,
+            "rate": video.rate,
+            "size": list(video.size or ()),
+            "timestamps": "frame number" if video.rate is None else "s",
             "submaps": entries,
-            "joins": [join.model_dump(mode="json") for join in record.joins],
-            "not_read": list(procedure.problems),
+            "joins": [join.model_dump(mode="json") for join in contents.joins],
+            "not_read": list(contents.problems),
         }
         write_json(scratch / MANIFEST, manifest)
     return manifest
 
 
 def _write_submap(
-    procedure: ProcedureContents, submap: ProcedureSubmap, folder: Path, copy: Callable[[Path, Path], object]
+    segment: Path, submap: SubmapContents, rate: float | None, folder: Path, copy: Callable[[Path, Path], object]
 ) -> bool:
     """Write the files of one sub-map, images by ``copy``; returns whether there is dense depth."""
-    segment = procedure.folder / submap.segment
     scene, model = segment / "poses", segment / "poses" / submap.model
     poses = colmap.read(model)
     numbers = {name: number for number, name in submap.names.items()}
@@ -90,17 +91,17 @@ def _write_submap(
         )
     frames = np.array([numbers[name] for name in posed])
     order = np.argsort(frames)
-    times = frames[order] / (procedure.record.rate or 1.0)
     make_folder(folder)
-    tum.write(folder / "trajectory.txt", Trajectory(poses.camera_to_world[order], timestamps=times))
+    trajectory = Trajectory(poses.camera_to_world[order], timestamps=frames[order] / (rate or 1.0))
+    tum.write(folder / "trajectory.txt", trajectory)
     files = [(scene / "images" / name, f"colmap/images/{name}") for name in posed]
     masks = [(scene / "masks" / f"{name}.png", f"colmap/masks/{name}.png") for name in posed]
     files += [(mask, place) for mask, place in masks if mask.is_file()]
     files += [(file, f"colmap/sparse/0/{file.name}") for file in sorted(model.iterdir())]
     _copy(files, folder, copy)
     write_unit(folder / "colmap", submap.unit)
-    depth = segment / submap.results.submap.folder / "depth" if submap.results else None
-    if depth is None or not (depth / "transforms.json").is_file():
+    depth = segment / Submap(submap.number).folder / "depth"
+    if not submap.stages or not (depth / "transforms.json").is_file():
         return False
     inside = sorted(path for path in depth.rglob("*") if path.is_file())
     _copy([(file, f"nerfstudio/{file.relative_to(depth).as_posix()}") for file in inside], folder, copy)

@@ -1,4 +1,4 @@
-"""The export of a procedure's sub-maps: what is written can be read back, and is what lies in the segments."""
+"""The export of a sub-maps: what is written can be read back, and is what lies in the segments."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap, tum
-from coliags_plugin.pipeline.procedure.export import export_atlas
-from tests.pipeline.procedures import RATE, SUBMAPS, procedure_content, similarity
+from coliags_plugin.pipeline.export import export_atlas
+from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity
 
 
 def test_every_sub_map_is_exported_with_its_trajectory(out, tmp_path):
@@ -43,11 +43,20 @@ def test_joined_sub_maps_have_the_transform_to_the_first_one(out, tmp_path):
     assert by_name["segment-001/0"]["joined_to"] == "segment-000/2"
     np.testing.assert_allclose(by_name["segment-001/0"]["to_joined"], similarity(1))
     np.testing.assert_array_equal(by_name["segment-000/2"]["to_joined"], np.eye(4))
-    assert [one["reason"] for one in manifest["joins"]] == ["", "12 frames between them"]
+    assert [one["reason"] for one in manifest["joins"]] == [one["reason"] for one in JOINS]
+
+
+def test_a_short_video_is_exported_likewise(short, tmp_path):
+    manifest = export_atlas(short, tmp_path / "export")
+    assert [(one["name"], one["folder"], one["nerfstudio"]) for one in manifest["submaps"]] == [
+        (f"sub-map {number}", f"submap-{number}", number != 2) for number in range(3)
+    ]
+    assert manifest["joins"] == [] and manifest["size"] == [40, 32]
+    assert colmap.read(tmp_path / "export" / "submap-1" / "colmap" / "sparse" / "0").names
 
 
 def test_timestamps_are_frame_numbers_where_the_rate_is_unknown(out, tmp_path):
-    write_json(out / "procedure.json", procedure_content(rate=None))
+    change_video(out, rate=None)
     assert export_atlas(out, tmp_path / "export")["timestamps"] == "frame number"
     assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
 
@@ -97,4 +106,4 @@ def test_the_command_names_the_sub_maps(out, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["poses", "export", str(tmp_path), "--output", str(tmp_path / "other")])
     assert stopped.value.code == 2
-    assert "procedure.json" in capsys.readouterr().err
+    assert "already exists and is no reconstruction" in capsys.readouterr().err

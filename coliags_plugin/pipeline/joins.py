@@ -2,23 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
+from typing_extensions import Self
 
 from coliags_plugin.datamanagers.colmap import find_models
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
-from coliags_plugin.pipeline.procedure.record import SegmentJoin
+from coliags_plugin.pipeline.survey import Segment
 
 #: Fewest frames that both models have to have posed.
 _FEWEST = 6
 #: Largest residuals of a join: rotation in degrees, and position as a share of the median depth; and the largest ratio
 #: of the depths of a point-wise scale to its median, as a share.
 _ROTATION, _POSITION, _SCALE = 3.0, 0.1, 0.2
+
+
+#: Error of a rotation matrix in double precision that is written as JSON.
+_SKEW = 1e-4
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+#: A model of a segment: the segment's name, and the model's folder relative to the segment's scene.
+ModelKey = tuple[str, str]
+
+
+class SegmentJoin(BaseModel):
+    """What came out where the models of two segments were compared."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    segments: tuple[str, str]
+    models: tuple[str, str]  # folders, relative to the segments' scenes; empty where a side has none
+    frames: int  # posed in both
+    joined: bool
+    reason: str = ""  # why not
+    #: similarity from the world of the second to that of the first; None where they are not joined. [4][4]
+    transform: Annotated[list[Row], Field(min_length=4, max_length=4)] | None = None
+    rotation_deg: float | None = None  # residual of the shared frames, degrees
+    position: float | None = None  # residual of their positions, relative to the median depth
+
+    @model_validator(mode="after")
+    def _transform_of_joined(self) -> Self:
+        if self.joined and (self.transform is None or not _is_similarity(np.array(self.transform))):
+            raise ValueError("'transform' is no similarity, though 'joined' is true")
+        return self
+
+    @property
+    def keys(self) -> tuple[ModelKey, ModelKey]:
+        """The two models."""
+        first, second = zip(self.segments, self.models, strict=True)
+        return first, second
+
+
+def _is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a matrix turns, scales and moves, and mirrors nothing."""
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not (1e-9 < scale < 1e9 and np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0))):
+        return False
+    turn = linear / scale
+    return bool(np.abs(turn @ turn.T - np.eye(3)).max() < _SKEW)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +96,19 @@ def read_posed(scene: Path) -> list[PosedFrames]:
                 frames.rotations[name], frames.centers[name] = turn.T, -turn.T @ shift
                 frames.depths[name] = float(np.median(seen @ turn[2] + shift[2]))
         found.append(frames)
+    return found
+
+
+def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
+    """Joins of every two neighbouring segments in the folder of a reconstruction."""
+    found, posed = (
+        list[SegmentJoin](),
+        [read_posed(scene) if (scene := out / segment.name / "poses").is_dir() else [] for segment in segments],
+    )
+    for (first, before), (second, after) in pairwise(zip(segments, posed, strict=True)):
+        names, gap = (first.name, second.name), second.first - first.last - 1
+        why = f"{gap} frames between them show nothing that can be followed"
+        found += joins(names, before, after) if gap < 0 else [apart(names, why)]
     return found
 
 

@@ -6,6 +6,7 @@ import errno
 import json
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,14 +20,13 @@ from coliags_plugin.core.files import not_writable
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline import capture_stages
+from coliags_plugin.pipeline import steps
+from coliags_plugin.pipeline.contents import read_contents
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
-from coliags_plugin.pipeline.procedure import run
-from coliags_plugin.pipeline.procedure.joins import PosedFrames, joins
-from coliags_plugin.pipeline.procedure.record import Procedure
-from coliags_plugin.pipeline.procedure.segments import OVERLAP, Survey, cut, survey_video
+from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
+from coliags_plugin.pipeline.survey import OVERLAP, Survey, are_found, cut, survey_video
 from tests import commands
 from tests.faults import largest_file
 from tests.pipeline.conftest import TRAINING, write_atlas
@@ -149,8 +149,12 @@ def long_video(done, tmp_path, monkeypatch):
         write_atlas(context.posed)
         return StageOutcome("31 of 50 images posed")
 
-    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    monkeypatch.setattr(steps, "make_poses", poses)
     return tmp_path / "long.mp4"
+
+
+def segments_of(record):
+    return [segment["name"] for segment in record.stages["survey"].figures["segments"]]
 
 
 KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0, 60.0)}
@@ -160,28 +164,33 @@ OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharp
 @pytest.mark.thorough
 def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers):
     executor = workers()
-    made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    names = list(made.segments)
+    record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    made = read_contents(tmp_path / "out", record)
+    names = [segment.span.name for segment in made.segments]
     plans = [task for task in executor.tasks if task.part is None]
     assert len(plans) == len(names) >= 3 and executor.tasks[0].part is None
     cameras = [json.loads(task.settings)["sfm"]["camera"] for task in plans]
     assert cameras[0]["params"] is None and all(camera["params"] is not None for camera in cameras[1:])
-    (skipped,) = made.procedure.skipped
+    (skipped,) = made.video.skipped
     assert 70 <= skipped.first <= 72 and 105 <= skipped.last <= 110
-    for name, segment in zip(names, made.procedure.segments, strict=True):
+    for name, segment in zip(names, made.video.segments, strict=True):
         kept = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
         assert [frame["frame"] for frame in kept] == list(range(segment.first, segment.last + 1))
-        assert made.segments[name].stages["submap-1/report"].state == "done"
-    assert {each.segments for each in made.procedure.joins} == set(pairwise(names))
-    assert any("show nothing that can be followed" in each.reason for each in made.procedure.joins)
-    assert Procedure.read(tmp_path / "out") == made.procedure
+        assert record.stages[f"{name}/submap-1/report"].state == "done"
+        assert "<h2>Stages" in (tmp_path / "out" / name / "index.html").read_text(encoding="utf-8")
+    assert {each.segments for each in made.joins} == set(pairwise(names))
+    assert any("show nothing that can be followed" in each.reason for each in made.joins)
+    assert list(Record.of(tmp_path / "out").stages) == list(record.stages)
+    assert [path.relative_to(tmp_path) for path in tmp_path.rglob("reconstruction.json")] == [
+        Path("out/reconstruction.json")
+    ]
     assert "segment-000" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.thorough
 def test_what_is_done_is_not_done_again_and_other_cuts_begin_anew(long_video, tmp_path, workers, done):
     workers()
-    names = list(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS).segments)
+    names = segments_of(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS))
     before, executor = list(done), workers()
     cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     assert executor.tasks == [] and done == before
@@ -189,7 +198,7 @@ def test_what_is_done_is_not_done_again_and_other_cuts_begin_anew(long_video, tm
         cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
     workers()
     again = cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 110}, overwrite=True)
-    assert {path.name for path in (tmp_path / "out").glob("segment-*")} == set(again.segments) < set(names)
+    assert sorted(path.name for path in (tmp_path / "out").glob("segment-*")) == segments_of(again) < names
 
 
 @pytest.mark.thorough
@@ -199,20 +208,20 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     workers(None, KeyboardInterrupt())
     with pytest.raises(InterruptedRunError):
         cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    make_poses, failing = capture_stages.make_poses, ["segment-001"]
+    make_poses, failing = steps.make_poses, ["segment-001"]
 
     def poses(context):
         if context.out.name in failing:
             raise InputError("2 of 50 frames have poses")
         return make_poses(context)
 
-    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    monkeypatch.setattr(steps, "make_poses", poses)
     workers(TaskOutcome("died", "the node died"))
     given = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
     assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *given) == 0
-    records = {path.parent.name: Record.of(path.parent) for path in (tmp_path / "out").glob("*/reconstruction.json")}
-    done_poses = {name: record.stages["poses"].state for name, record in records.items()}
-    assert sorted(done_poses.values())[0] == "done" and len(records) >= 3
+    stages = Record.of(tmp_path / "out").stages
+    states = [stages[f"{name}/poses"].state for name in segments_of(Record.of(tmp_path / "out"))]
+    assert sorted(states)[0] == "done" and len(states) >= 3
     failing[:] = [f"segment-{number:03d}" for number in range(9)]
     workers()
     with pytest.raises(
@@ -222,12 +231,12 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     assert len(list((tmp_path / "none").glob("segment-*/frames/frames.json"))) == 3, "the next one is tried"
     page = (tmp_path / "none" / "index.html").read_text(encoding="utf-8")
     assert "No frame of this video has a pose: poses failed: 2 of 50 frames have poses" in page
-    assert Procedure.read(tmp_path / "none") and Survey.read(tmp_path / "none")
+    assert Record.of(tmp_path / "none").is_done("survey") and Survey.read(tmp_path / "none")
 
 
 @pytest.mark.thorough
 def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path, workers, monkeypatch):
-    make_poses, tried = capture_stages.make_poses, []
+    make_poses, tried = steps.make_poses, []
 
     def poses(context):
         tried.append(context.out.name)
@@ -235,11 +244,11 @@ def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path
             raise InputError("2 of 50 frames have poses")
         return make_poses(context)
 
-    monkeypatch.setattr(capture_stages, "make_poses", poses)
+    monkeypatch.setattr(steps, "make_poses", poses)
     executor = workers()
     made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    states = {name: record.stages["poses"].state for name, record in made.segments.items()}
-    assert states == {name: "failed" if name == tried[0] else "done" for name in made.segments}
+    states = {name: made.stages[f"{name}/poses"].state for name in segments_of(made)}
+    assert states == {name: "failed" if name == tried[0] else "done" for name in states}
     plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.part is None]
     assert [params is None for params in plans] == [True, True, False]
 
@@ -254,7 +263,7 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
         page = (out / "index.html").read_text(encoding="utf-8")
         assert "No frame of this video has a pose: nothing of the frame before is seen" in page
         assert "No stretch of this video is long enough" in page and 'class="pictures"' not in page
-        assert Procedure.read(out).segments == [] and len(Survey.read(out)) == 60
+        assert segments_of(Record.of(out)) == [] and len(Survey.read(out)) == 60
         (out / "index.html").unlink()
     assert executor.tasks == []
     assert "shows why" in commands.refused(capsys, *argv, "--set", "least_submap=20"), "nothing is made with others"
@@ -276,8 +285,10 @@ def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
     black = [number for number, image in enumerate(frames.values()) if not image.any()]
     workers()
     made = cp.reconstruct(tmp_path / "damaged.mp4", tmp_path / "out", settings={**OPTIONS, **KNOWN})
-    assert made.procedure.seek and made.procedure.frames == 150 and black
-    for name, segment in zip(made.segments, made.procedure.segments, strict=True):
+    video = read_contents(tmp_path / "out", made).video
+    assert video.seek and video.frames == 150 and black
+    for segment in video.segments:
+        name = segment.name
         written = {path.stem: read_rgb(path) for path in (tmp_path / "out" / name / "frames" / "images").iterdir()}
         assert set(written) == {f"frame_{n:06d}" for n in range(segment.first, segment.last + 1) if n not in black}
         assert all(np.array_equal(image, frames[frame]) for frame, image in written.items())
@@ -290,7 +301,7 @@ def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_
     executor = workers()
     with largest_file(20_000):
         message = commands.refused(capsys, *argv)
-    assert "stage frames: cannot write to" in message and "Free some, or choose another output" in message
+    assert "/frames: cannot write to" in message and "Free some, or choose another output" in message
     assert len(executor.tasks) == 1, "the other segments are not tried"
     assert not list((tmp_path / "out").glob("segment-*/frames")) and not list((tmp_path / "out").rglob("*.png"))
     assert commands.run(*argv) == 0
@@ -308,8 +319,7 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("file", ["procedure.json", "survey.npz"])
-def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, workers, monkeypatch, file):
+def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, workers, monkeypatch):
     workers()
     full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
 
@@ -317,15 +327,15 @@ def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, wor
         raise full
 
     with monkeypatch.context() as patched, pytest.raises(InputError, match="No space left"):
-        patched.setattr(Procedure if file == "procedure.json" else Survey, "write", fails)
+        patched.setattr(Survey, "write", fails)
         cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    assert not (tmp_path / "out" / file).exists()
-    assert len(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS).segments) == 3
+    assert not (tmp_path / "out" / "survey.npz").exists()
+    assert len(segments_of(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS))) == 3
 
 
 def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):
     survey = survey_video(frame_source(long_video))
-    assert run._are_found(frame_source(long_video), survey, [0, 55, 120])
+    assert are_found(frame_source(long_video), survey, [0, 55, 120])
     other = replace(survey, checksums=survey.checksums + 1)
-    assert not run._are_found(frame_source(long_video), other, [55]) and "decoded in order" in caplog.text
+    assert not are_found(frame_source(long_video), other, [55]) and "decoded in order" in caplog.text
     assert len(list(frame_source(long_video, Span(140, None, seek=False)))) == 10

@@ -1,22 +1,32 @@
-"""Stages from a scene with depth to a report: training, evaluation, mesh, coverage, report."""
+"""The stages of a segment, what each does, and their order: those that all its sub-maps need, and those of each."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.method_config import method_name
+from coliags_plugin.config.method_config import load_method, method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.datamanagers.units import Unit
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.frames import IMAGES, read_lens_mask, write_frames
+from coliags_plugin.pipeline.settings import FEWEST
+from coliags_plugin.pipeline.stages import Part, Stage, StageOutcome
+from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.reporting.numbers import area_text
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from coliags_plugin.engine.trained import TrainedRun
 
+#: Share of the frames below which it is said that the poses are of a part of the video only.
+_MOST = 0.7
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
 #: What the results are that the page shows: of scenes, and of frames beside depth and flattened light.
@@ -30,6 +40,143 @@ _PICTURED = 4
 _TRAINING_VIEWS = 16
 #: Frames of a sub-map that get the steps of the settings; least share of them, and most (docs/reconstruct.md 5).
 _ALL_STEPS, _LEAST_SHARE, _MOST_SHARE = 100, 0.25, 2.0
+
+
+#: What is done, its name, options, and files and folders that it writes.
+_Row = tuple[Callable[[StageContext], StageOutcome], str, Mapping[str, Any], tuple[str, ...]]
+
+
+def stages_of(context: StageContext) -> list[Stage]:
+    """The stages for a source, or a segment of it, in order: of the sub-maps as far as they are known."""
+    settings, stages = context.settings, list[Stage]()
+    source: dict[str, Any] = {"source": identity_of(context.source)}
+    if context.data_format is None:
+        mask, source = None if context.mask is None else identity_of(context.mask), {}
+        rows: list[_Row] = [
+            (make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}, ("frames",)),
+            (make_poses, "poses", {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}, ("poses",)),
+        ]
+        stages += _stages(context, None, rows)
+    for inside in context.submaps():
+        number = inside.submap.number
+        own = {"model": identity_of(context.posed / str(inside.submap.model))} if number else source
+        stages += _stages(inside, number, _submap_rows(inside, own))
+    return stages
+
+
+def _stages(context: StageContext, part: Part, rows: Iterable[_Row]) -> list[Stage]:
+    """Stages that are named, and have their files, by the way to the folder of their sub-map."""
+    prefix = context.prefix
+
+    def run(work: Callable[[StageContext], StageOutcome]) -> StageOutcome:
+        made = work(context)
+        return replace(made, files={prefix + path: what for path, what in made.files.items()})
+
+    return [
+        Stage(prefix + name, options, partial(run, work), [prefix + path for path in outputs], part)
+        for work, name, options, outputs in rows
+    ]
+
+
+def _submap_rows(context: StageContext, source: Mapping[str, Any]) -> Iterator[_Row]:
+    """The stages of one sub-map; the first depends on ``source``, as no stage before it does."""
+    settings, size = context.settings, {"size": context.settings.size}
+    yield check_data, "check", {**size, **source}, ("check.html", "check.json")
+    if context.estimates_depth:
+        yield estimate_depth, "depth", {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work")
+    method = method_for(context)
+    load_method(method)  # an unknown method is found out before the work starts
+    yield train, "train", {"method": method, "steps": steps_for(context), "seed": settings.seed}, ("run",)
+    yield evaluate, "evaluate", {}, ("run/eval",)
+    yield mesh, "mesh", {"mesh": settings.mesh.model_dump()}, ("run/mesh",)
+    yield coverage, "coverage", {"coverage": settings.coverage.model_dump()}, ("run/coverage",)
+    yield show, "scene", {}, ("run/scene.html", "run/pictures")
+    yield report, "report", {}, ("report.html",)
+
+
+def identity_of(path: Path) -> Mapping[str, Any]:
+    """Name and size of a file or folder: enough to notice that it is another one."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}
+
+
+def make_frames(context: StageContext) -> StageOutcome:
+    """Write the frames of use, and their mask, by the survey of the video."""
+    settings = context.settings.frames
+    span = Span(settings.first, settings.last, settings.seek, bool(settings.deinterlace))
+    source, survey = frame_source(context.source, span), Survey.read(context.root).part(span.first, span.last)
+    summary = write_frames(source, survey, context.frames, settings, context.mask, context.progress)
+    made = {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}
+    return StageOutcome(summary, made)
+
+
+def make_poses(context: StageContext) -> StageOutcome:
+    """Estimate poses and points by structure from motion, and write them as a scene."""
+    from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
+    from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
+    from coliags_plugin.reconstruction.structure.image_files import list_images
+    from coliags_plugin.reconstruction.structure.sfm import millimetres, reconstruct, scaled
+
+    settings = context.settings
+    mask = read_lens_mask(context.frames)
+    atlas = reconstruct(list_images(context.frames / IMAGES), settings.sfm, mask, context.progress)
+    largest, count = atlas.largest, len(atlas.images)
+    if len(largest.registered) < FEWEST:
+        raise InputError(
+            f"{len(largest.registered)} of {count} frames have poses",
+            f"at least {FEWEST}",
+            "Choose a part of the video in which the camera moves along tissue that it sees well, keep more frames "
+            "(--every), or give the camera (--camera)",
+        )
+    warnings = []
+    if (posed := count - len(atlas.lost)) < _MOST * count:
+        warnings.append(f"{posed} of {count} frames have a pose: poses/{RIBBON_FILE} shows why the others have none")
+    used = [model for model in atlas.models if model is largest or len(model.registered) >= settings.least_submap]
+    factors = [millimetres(model, settings.diameter) for model in used]
+    models = [
+        scaled(model, factor or UNKNOWN_MEDIAN_DEPTH / model.median_depth)
+        for model, factor in zip(used, factors, strict=True)
+    ]
+    atlas = replace(atlas, models=(*models, *atlas.models[len(used) :]))
+    units: list[Unit] = ["unknown" if factor is None else "mm" for factor in factors]
+    write_sfm_scene(context.posed, atlas, mask, overwrite=True, units=units, link=True)
+    depth = atlas.largest.median_depth
+    unit = (
+        f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
+        if units[0] == "unknown"
+        else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
+    )
+    made = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
+    return StageOutcome(f"{atlas.summary()}; {unit}", made, warnings)
+
+
+def check_data(context: StageContext) -> StageOutcome:
+    """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
+    from coliags_plugin.checks.data.check import check_scene
+    from coliags_plugin.checks.data.page import check_page, verdict
+    from coliags_plugin.reporting.html_page import write_html
+
+    scene = context.open_posed()
+    check = check_scene(
+        scene, context.progress, (lambda: context.open_posed(stored_size=True)) if scene.is_resized else None
+    )
+    write_html(check_page(check), context.folder / "check.html")
+    write_json(context.folder / "check.json", check.as_json())
+    made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
+    warnings = [f"suspect: {finding.what} ({finding.evidence}). {finding.do}" for finding in check.findings]
+    return StageOutcome(verdict(check), made, warnings, {"frames": len(scene.video)})
+
+
+def estimate_depth(context: StageContext) -> StageOutcome:
+    """Estimate dense depth with its confidence; goes on where a kill has left it."""
+    from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
+
+    request = DepthRequest(context.settings.depth)
+    estimated = estimate_scene(
+        context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
+    )
+    made = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
+    return StageOutcome(estimated.summary, made, estimated.warnings)
 
 
 def method_for(context: StageContext) -> str:

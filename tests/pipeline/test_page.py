@@ -1,4 +1,4 @@
-"""The page of a procedure: what it says of every frame, of sub-maps and joins, and of parts that are damaged."""
+"""The page of a short video, and of a long one: every frame, sub-maps and joins, scenes, and parts that are damaged."""
 
 from __future__ import annotations
 
@@ -11,30 +11,52 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.pipeline.procedure import page as procedure_page
-from coliags_plugin.pipeline.procedure.contents import common_frames, read_procedure
-from coliags_plugin.pipeline.procedure.page import write_procedure_page
-from coliags_plugin.pipeline.procedure.timeline import frame_states, timeline
-from tests.pipeline.procedures import FAILURE, FRAMES, SUBMAPS, join, procedure_content, similarity
+from coliags_plugin.datamanagers.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.pipeline import page
+from coliags_plugin.pipeline.contents import common_frames, read_contents
+from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table, write_page
+from coliags_plugin.pipeline.stages import Record
+from coliags_plugin.pipeline.timeline import frame_states, timeline
+from coliags_plugin.reporting.text_formats import terminal_text
+from tests.pipeline.reconstructions import (
+    FAILURE,
+    FRAMES,
+    JOINS,
+    SUBMAPS,
+    change_video,
+    done,
+    failed,
+    join,
+    similarity,
+    span,
+    three_submaps,
+    video,
+    write_frames,
+)
 
 
-def page_of(out):
-    write_procedure_page(out)
-    return (out / "index.html").read_text(encoding="utf-8")
+@pytest.fixture(params=["long", "short"])
+def either(request):
+    return request.getfixturevalue({"long": "out", "short": "short"}[request.param])
+
+
+def page_of(out, **options):
+    write_page(out, **options)
+    return (out / options.get("segment", "") / "index.html").read_text(encoding="utf-8")
 
 
 def states_of(out):
-    states, codes = frame_states(read_procedure(out))
+    states, codes = frame_states(read_contents(out))
     return [states[code] for code in codes]
 
 
 def test_sub_maps_have_the_numbers_of_the_video_in_its_order(out):
-    procedure = read_procedure(out)
-    assert {one.name: [*one.names] for one in procedure.submaps} == {name: [*own] for name, own in SUBMAPS.items()}
-    assert procedure.submaps[4].names[40] == "014.png"
-    assert [one.results is None for one in procedure.submaps] == [False] * 6
-    assert list(procedure.problems) == []
-    assert (len(procedure.posed), len(procedure.kept)) == (57, 58)
+    contents = read_contents(out)
+    assert {one.name: [*one.names] for one in contents.submaps} == {name: [*own] for name, own in SUBMAPS.items()}
+    assert contents.submaps[4].names[40] == "014.png"
+    assert all(one.stages for one in contents.submaps)
+    assert list(contents.problems) == []
+    assert (len(contents.posed), len(contents.kept)) == (57, 58)
 
 
 def test_every_frame_has_one_state_and_the_earlier_segment_comes_first(out):
@@ -65,7 +87,7 @@ def test_frames_that_were_not_used_share_the_state_of_the_used_one_before(out):
     states = states_of(out)
     assert [one.what for one in states[26:53]] == ["segment-000/2"] * 5 + ["segment-001/0"] * 22
     assert {one.why for one in states[53:58]} == {"wet"}
-    assert read_procedure(out).submaps[-1].names.keys() == {*range(26, 53, 3)}
+    assert read_contents(out).submaps[-1].names.keys() == {*range(26, 53, 3)}
 
 
 def test_the_page_tells_what_came_out(out):
@@ -74,9 +96,9 @@ def test_the_page_tells_what_came_out(out):
         "100 frames, 10.0 s, 40 x 32 px",
         "57 of 58 used (98 %)",
         "2 of 3 (1 failed or not finished)",
-        "4 reconstructed of 6",
+        "4 reconstructed of 6 (2 failed)",
         "1 of 2 places between segments",
-        "23.00 dB (22.00 to 24.00 in 4 sub-maps)",
+        "23.00 dB in the mean over 4 sub-maps, 22.00 to 24.00",
         "84.0 cm² (of 2 sub-maps with lengths in mm)",
         "62 % in the mean over 2 sub-maps",
         "mm of 2 of 6 sub-maps",
@@ -97,30 +119,91 @@ def test_the_page_tells_what_came_out(out):
 def test_two_segments_may_be_joined_at_several_models(out):
     pair = ["segment-000", "segment-001"]
     apart = join(pair, ["sparse/1", "sparse/0"], reason="scales differ by 30 %")
-    joins = procedure_content()["joins"]
-    write_json(out / "procedure.json", procedure_content(joins=[apart, *joins]))
+    change_video(out, joins=[apart, *JOINS])
     text = page_of(out)
     assert "1 of 2 places between segments" in text
     assert "<span>joined: 5 shared frames" in text and "scales differ by 30 %" in text
-    write_json(
-        out / "procedure.json", procedure_content(joins=[join(pair, ["sparse/0", "sparse/1"], similarity(2)), apart])
-    )
+    change_video(out, joins=[join(pair, ["sparse/0", "sparse/1"], similarity(2)), apart])
     assert "<span>no frame has a pose in both</span>" in page_of(out)
-    write_json(out / "procedure.json", procedure_content(joins=[apart]))
+    change_video(out, joins=[apart])
     assert "<span>scales differ by 30 %</span>" in page_of(out)
 
 
-def test_the_page_is_one_file_without_anything_from_elsewhere(out):
-    text = page_of(out)
-    links = re.findall(r'(?:src|href|data-file)="([^"]*)"', text)
-    assert {link for link in links if not re.match(r"data:|segment-00[01]/", link)} == set()
-    assert all((out / link).is_file() for link in links if link.startswith("segment"))
-    assert text.count("<iframe") == 4 and text.count("data-page=") == 4
-    assert not (out / "index_files").exists()
+def test_the_page_is_one_file_without_anything_from_elsewhere(either):
+    text = page_of(either)
+    links = [link for link in re.findall(r'(?:src|href|data-file)="([^"]*)"', text) if not link.startswith("data:")]
+    assert links and all(not link.startswith(("/", "http")) for link in links)
+    assert all((either / link).exists() for link in links if re.search(r"index|scene|images|poses", link))
+    scenes = 4 if either.name == "out" else 2
+    assert text.count("<iframe") == scenes == text.count("data-page=")
+    assert not (either / "index_files").exists() and str(either) not in text
+
+
+def test_the_page_of_a_segment_is_that_of_a_short_video_of_its_frames(out, short):
+    whole, text = page_of(short), page_of(out, segment="segment-001")
+    for one, other in (
+        ("32 frames, 3.2 s", "32 frames, 3.2 s"),
+        ("frames 0 to 13", "frames 26 to 39"),
+        (">0:00 to", ">0:02 to"),
+    ):
+        assert one in whole and other in text
+    heads = re.findall(r"<h2>([^<]*)", whole)
+    assert heads == re.findall(r"<h2>([^<]*)", text)
+    assert heads[:4] == ["Time line", "Scenes", "Map of the sub-maps", "Depth and light"]
+    for kind in ("recorded", "depth", "flattened light"):
+        assert text.count(f'<div class="name">{kind}</div>') == 1
+    assert text.index("sub-map 0, 0:02 to 0:03</option>") < text.index("sub-map 1, ")
+    assert 'href="frames/images"' in text and 'href="submap-1/check.html"' in text and "the camera jumps" in text
+    assert "31 of 32 used (97 %)" in text and "2 reconstructed of 3 (1 failed)" in text and "blurred" in text
+
+
+def test_the_page_of_a_scene_with_poses_does_without_frames(atlas, tmp_path):
+    out = tmp_path / "out"
+    record = Record(out, {name: stage for name, stage in three_submaps().items() if name not in ("frames", "poses")})
+    record.write()
+    joins = [{"after": 13, "joined": False, "reason": "7 points are seen from both sides"}]
+    write_json(atlas / ATLAS_FILE, read_atlas(atlas).model_dump() | {"joins": joins})
+    text = page_of(out, scene=atlas)
+    assert "Reconstruction of atlas" in text and "31 of 32 used (97 %)" in text and "blurred" in text
+    assert "7 points are seen from both sides" in text and text.count('class="pictures"') == 1
+    shutil.rmtree(atlas)
+    record.stages = {"check": done({"check.html": "check"}, frames=14), "train": done()}
+    record.write()
+    text = page_of(out, scene=atlas)
+    assert "Frames with a pose" not in text and "Time line" not in text and "sub-map 1" not in text
+    assert "<iframe" not in text and "1 reconstructed of 1" in text
+
+
+def test_figures_of_sub_maps_and_their_means(short):
+    submaps = read_contents(short).submaps
+    table = submap_table(submaps)
+    rows = [{column.key: cell.text for column, cell in zip(table.columns, row, strict=True)} for row in table.cells]
+    assert [row["submap"] for row in rows] == ["sub-map 0", "sub-map 1", "sub-map 2", "mean"]
+    assert [row["psnr"] for row in rows] == ["24.00", "22.00", "", "23.00"]
+    assert [row["gap"] for row in rows] == ["3.50", "1.50", "", "2.50"]
+    assert [row["psnr_pose_refined"] for row in rows] == ["", "23.00", "", "23.00"]
+    assert [row["area"] for row in rows] == ["42.0 cm²", "900 square units", "", ""]
+    assert [row["seen"] for row in rows] == ["62 %", "800 square units", "", ""]
+    assert [row["steps"] for row in rows] == ["2000", "500", "", ""]
+    assert rows[0]["span"] == "0 to 13"
+    assert held_out_text(submaps) == "23.00 dB in the mean over 2 sub-maps, 22.00 to 24.00"
+    assert (held_out_text(submaps[:1]), held_out_text(submaps[2:])) == ("24.00 dB", "")
+    assert "depth failed: no surface that 5 frames agree on" in terminal_text([table])
+    alone = submap_table(submaps[2:])
+    assert not {"seen", "psnr_pose_refined"} & {column.key for column in alone.columns} and len(alone.rows) == 1
+
+
+def test_what_failed_and_what_is_suspect_is_said_with_what_to_do(short):
+    failure, suspect = remarks(read_contents(short).segments[0])
+    assert failure == "submap-2/depth failed: no surface that 5 frames agree on. Check the poses."
+    assert suspect.startswith("the poses of sub-map 0 (well): there the surface may be bent or torn. Compare")
+    record = Record.of(short)
+    record.put("check", failed("no two frames overlap."))
+    assert remarks(read_contents(short).segments[0]) == ["check failed: no two frames overlap.", failure]
 
 
 def test_the_time_line_has_one_axis(out):
-    values = timeline(read_procedure(out), *frame_states(read_procedure(out))).values
+    values = timeline(read_contents(out), *frame_states(read_contents(out))).values
     assert sum(bar["width"] for bar in values["ribbon"]) == pytest.approx(100.0)
     assert [bar["left"] for row in values["rows"] for bar in row] == [0.0, 70.0, 26.0]
     assert len(values["thumbs"]) == 24 and sum(thumb["image"] is not None for thumb in values["thumbs"]) == 14
@@ -133,15 +216,14 @@ def test_the_time_line_has_one_axis(out):
 
 
 def test_an_unknown_rate_leaves_frame_numbers(out):
-    write_json(out / "procedure.json", procedure_content(rate=None))
+    change_video(out, rate=None)
     text = page_of(out)
     assert "min:s" not in text and ">frame number<" in text
     assert "100 frames, 40 x 32 px" in text
 
 
 def test_frames_are_counted_from_where_the_survey_began(out):
-    content = procedure_content(first=20, frames=80, segments=procedure_content()["segments"][1:], joins=[])
-    write_json(out / "procedure.json", content)
+    change_video(out, first=20, frames=80, segments=video()["segments"][1:], joins=[])
     (out / "survey.npz").unlink()
     states = states_of(out)
     assert len(states) == 80
@@ -160,11 +242,10 @@ def test_a_long_video_has_a_time_line_of_bounded_size(out):
         "lost": [{"frame": frame, "reason": "blurred"} for frame in range(1, frames, 2)],
     }
     write_json(out / "segment-000" / "poses" / "atlas.json", atlas)
-    write_json(out / "segment-000" / "frames" / "frames.json", {"kept": kept, "dropped": [], "deinterlaced": False})
-    segments = [{"name": "segment-000", "first": 0, "last": frames - 1}]
-    write_json(out / "procedure.json", procedure_content(frames=frames, segments=segments, skipped=[], joins=[]))
-    procedure = read_procedure(out)
-    assert len(timeline(procedure, *frame_states(procedure)).values["ribbon"]) <= 2000
+    write_frames(out / "segment-000", kept)
+    change_video(out, frames=frames, segments=[span("segment-000", 0, frames - 1)], skipped=[], joins=[])
+    contents = read_contents(out)
+    assert len(timeline(contents, *frame_states(contents)).values["ribbon"]) <= 2000
     (out / "survey.npz").unlink()
     text = page_of(out)
     assert len(text) < 1_000_000
@@ -173,17 +254,17 @@ def test_a_long_video_has_a_time_line_of_bounded_size(out):
 
 def test_what_has_no_room_is_loaded_from_the_folder(out, monkeypatch):
     whole = len(page_of(out).encode())
-    monkeypatch.setattr(procedure_page, "_SCENES", 5000)
+    monkeypatch.setattr(page, "_SCENES", 5000)
     assert page_of(out).count("data-page=") == 2
-    monkeypatch.setattr(procedure_page, "_SCENES", 100)
-    monkeypatch.setattr(procedure_page, "_LIMIT", whole - 10_000)
+    monkeypatch.setattr(page, "_SCENES", 100)
+    monkeypatch.setattr(page, "_LIMIT", whole - 10_000)
     text = page_of(out)
     assert len(text.encode()) <= whole - 10_000
     assert "data-page=" not in text
     assert re.findall(r'data-file="([^"]*)"', text)[:2] == [f"segment-00{k}/run/scene.html" for k in (0, 1)]
-    monkeypatch.setattr(procedure_page, "_LIMIT", 70_000)
+    monkeypatch.setattr(page, "_LIMIT", 70_000)
     assert 'src="index_files/' in page_of(out)
-    assert procedure_page._SCENES < procedure_page._LIMIT
+    assert page._SCENES < page._LIMIT
 
 
 def remove(path):
@@ -200,8 +281,6 @@ def garble(path):
 @pytest.mark.parametrize(
     ("part", "spoil", "told"),
     [
-        ("segment-000/reconstruction.json", remove, "segment-000: segment-000 already exists and is no reconstruction"),
-        ("segment-000/reconstruction.json", garble, "segment-000: cannot read reconstruction.json"),
         ("segment-000/poses/atlas.json", garble, "segment-000: poses/atlas.json"),
         ("segment-000/poses/atlas.json", remove, ""),
         ("segment-000/frames/frames.json", garble, "segment-000: frames/frames.json"),
@@ -210,19 +289,24 @@ def garble(path):
         ("segment-000/run/eval/paper/result.json", garble, ""),
         ("segment-000/run/eval/paper/renders", remove, ""),
         ("segment-000/run/scene.html", remove, ""),
-        ("segment-000", remove, "segment-000 (it was not begun)"),
+        ("segment-000", remove, ""),
         ("survey.npz", garble, "cannot read survey.npz"),
         ("survey.npz", remove, ""),
         ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros(99)), "a number for each of 100 frames"),
         ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros((100, 2))), "a number for each of 100 frames"),
     ],
 )
-def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, part, spoil, told):
+def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, short, part, spoil, told):
     spoil(out / part)
     text = page_of(out)
     assert told in text
     assert "segment-001/0" in text and "46.00 dB" in text
     assert ('class="curve"' in text) == (part != "survey.npz")
+    own = short / part.removeprefix("segment-000").lstrip("/")
+    if own != short and own.exists():
+        spoil(own)
+        text = page_of(short)
+        assert told.removeprefix("segment-000: ") in text and "24.00" in text
 
 
 def test_an_atlas_that_names_frames_elsewhere_is_not_used(out):
@@ -230,49 +314,53 @@ def test_an_atlas_that_names_frames_elsewhere_is_not_used(out):
     content = json.loads(file.read_text())
     for name in ("../000.png", "frame_000100.png"):
         write_json(file, {**content, "frames": [name, *content["frames"][1:]]})
-        assert f"{name}" in read_procedure(out).problems[0]
+        assert f"{name}" in read_contents(out).problems[0]
 
 
-def test_a_procedure_without_any_pose_has_a_page_that_says_so(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    segments = [{"name": "segment-000", "first": 0, "last": 99}]
-    write_json(out / "procedure.json", procedure_content(segments=segments, skipped=[], joins=[]))
-    text = page_of(out)
+def test_a_video_without_any_pose_has_a_page_that_says_so(out, tmp_path):
+    record = Record(tmp_path, {"survey": done(**video(segments=[span("segment-000", 0, 99)], skipped=[]))})
+    record.write()
+    text = page_of(tmp_path)
     assert "No frame of this video has a pose: it was not begun" in text
     assert "No sub-map was reconstructed." in text
     assert text.count('class="lost"') == 1
-    write_json(out / "procedure.json", procedure_content(segments=[], skipped=[], joins=[]))
-    assert "No frame of this video has a pose" in page_of(out)
+    record.stages["survey"] = done(**video(segments=[], skipped=[]))
+    record.write()
+    assert "No frame of this video has a pose" in page_of(tmp_path)
+    record.stages["survey"] = done(**video(segments=[span("", 0, 99)], skipped=[]))
+    record.stages["poses"] = failed("2 of 32 frames have poses")
+    record.write()
+    text = page_of(tmp_path)
+    assert "poses failed: 2 of 32 frames have poses" in text and "No sub-map was reconstructed." in text
 
 
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"frames": 0}, "frames"),
-        ({"frames": 10**12}, "frames"),
-        ({"rate": 0.0}, "rate"),
-        ({"segments": [{"name": "../other", "first": 0, "last": 3}]}, "segments.0.name"),
-        ({"segments": [{"name": "a", "first": 3, "last": 2}]}, "frames 3 to 2"),
-        ({"segments": [{"name": "a", "first": 0, "last": 100}]}, "frames 0 to 100, not of 0 to 99"),
-        ({"segments": [{"name": "a", "first": 0, "last": 1}] * 2}, "the same name"),
+        ({"frames": 0}, "survey: frames"),
+        ({"frames": 10**12}, "survey: frames"),
+        ({"rate": 0.0}, "survey: rate"),
+        ({"segments": [span("../other", 0, 3)]}, "survey: segments.0.name"),
+        ({"segments": [span("segment-0", 3, 2)]}, "frames 3 to 2"),
+        ({"segments": [span("segment-0", 0, 100)]}, "frames 0 to 100, not of 0 to 99"),
+        ({"segments": [span("segment-0", 0, 1)] * 2}, "the same name"),
         ({"joins": [join(["a", "b"], ["x", "y"], np.diag([1.0, 1.0, -1.0, 1.0]))]}, "no similarity"),
         ({"joins": [join(["a", "b"], ["x", "y"], np.diag([1.0, 2.0, 1.0, 1.0]))]}, "no similarity"),
         ({"joins": [join(["a", "b"], ["x", "y"], np.zeros((4, 4)))]}, "no similarity"),
-        ({"joins": [join(["a", "b"], ["x", "y"], np.eye(3))]}, "joins.0.transform"),
+        ({"joins": [join(["a", "b"], ["x", "y"], np.eye(3))]}, "joins: joins.0.transform"),
     ],
 )
-def test_a_damaged_record_is_refused(tmp_path, changes, told):
-    write_json(tmp_path / "procedure.json", procedure_content(**changes))
-    with pytest.raises(InputError, match=r"procedure\.json") as caught:
-        write_procedure_page(tmp_path)
+def test_a_damaged_record_is_refused(out, changes, told):
+    change_video(out, **changes)
+    with pytest.raises(InputError, match=r"cannot read .*reconstruction\.json") as caught:
+        write_page(out)
     assert told in str(caught.value)
-    assert not (tmp_path / "index.html").exists()
+    assert not (out / "index.html").exists()
 
 
 def test_another_folder_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no .*procedure\.json"):
-        write_procedure_page(tmp_path)
+    with pytest.raises(InputError, match=r"no stage in .*reconstruction\.json"):
+        write_page(tmp_path)
 
 
 def test_sub_maps_are_brought_into_the_frame_of_the_first_they_are_joined_to(out):
@@ -290,8 +378,8 @@ def test_sub_maps_are_brought_into_the_frame_of_the_first_they_are_joined_to(out
         between("segment-000/2", "segment-001/2"),
         between("segment-000/1", "segment-001/1", known=False),
     ]
-    write_json(out / "procedure.json", procedure_content(joins=joins))
-    placed = common_frames(read_procedure(out))
+    change_video(out, joins=joins)
+    placed = common_frames(read_contents(out))
     named = {f"{segment}/{model[-1]}": value for (segment, model), value in placed.items()}
     together = ("segment-000/0", "segment-000/2", "segment-001/0", "segment-001/2")
     for name in SUBMAPS:
@@ -303,15 +391,15 @@ def test_sub_maps_are_brought_into_the_frame_of_the_first_they_are_joined_to(out
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("width", [1400, 390])
-def test_the_page_in_a_browser(browser, out, monkeypatch, width):
-    monkeypatch.setattr(procedure_page, "_SCENES", 2500)
-    monkeypatch.setattr(procedure_page, "_LISTED", 30)
+def test_the_page_in_a_browser(browser, out, short, monkeypatch, width):
+    monkeypatch.setattr(page, "_SCENES", 2500)
+    monkeypatch.setattr(page, "_LISTED", 30)
     file = out / "segment-001" / "poses" / "atlas.json"
     content = json.loads(file.read_text())
     content["lost"] = [{"frame": frame, "reason": f"reason {frame}"} for frame in range(12, 31)]
     content["submaps"] = content["submaps"][:1]
     write_json(file, content)
-    write_procedure_page(out)
+    write_page(out)
     browser.open(out / "index.html", width, phone=width < 500)
     assert browser.run("document.documentElement.scrollWidth <= innerWidth")
     browser.run("document.querySelector('.ribbon i').dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))")
@@ -334,4 +422,9 @@ def test_the_page_in_a_browser(browser, out, monkeypatch, width):
         "(document.querySelector('.scenes select'))"
     )
     assert browser.run(loaded) == "segment-001/run/scene.html"
+    assert browser.errors() == []
+    write_page(short)
+    browser.open(short / "index.html", width, phone=width < 500)
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    assert browser.run(loaded).startswith("short")
     assert browser.errors() == []

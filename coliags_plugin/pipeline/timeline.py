@@ -1,4 +1,4 @@
-"""The time line of a procedure: which frame has a pose in which sub-map, why others have none, what the survey saw."""
+"""The time line of a video: which frame has a pose in which sub-map, why others have none, what the survey saw."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.charts import COLORS
 from coliags_plugin.outputs.image_files import encode_jpeg
+from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
-from coliags_plugin.pipeline.procedure.contents import ProcedureContents, ProcedureSubmap
 from coliags_plugin.pipeline.stages import PAGE_FILE
 from coliags_plugin.reporting.model import EncodedImage, Template
 from coliags_plugin.reporting.numbers import counted
@@ -60,47 +60,47 @@ class Stretch:
     state: State
 
 
-def styles(procedure: ProcedureContents) -> dict[str, int]:
+def styles(contents: Contents) -> dict[str, int]:
     """Colour index of each sub-map, by name: neighbours differ."""
-    return {submap.name: index % COLORS for index, submap in enumerate(procedure.submaps)}
+    return {submap.name: index % COLORS for index, submap in enumerate(contents.submaps)}
 
 
-def clock(procedure: ProcedureContents, frame: float) -> str:
+def clock(contents: Contents, frame: float) -> str:
     """Time of a frame in minutes and seconds, ``3:05``, with hours from the first one on; empty for an unknown rate."""
-    if procedure.record.rate is None:
+    if contents.video.rate is None:
         return ""
-    minutes, seconds = divmod(int(frame / procedure.record.rate + 1e-6), 60)
+    minutes, seconds = divmod(int(frame / contents.video.rate + 1e-6), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
-def span_text(procedure: ProcedureContents, first: int, last: int) -> str:
+def span_text(contents: Contents, first: int, last: int) -> str:
     """Frames and times of a stretch: ``frames 30 to 60, 0:01 to 0:02``."""
     frames = f"frame {first}" if first == last else f"frames {first} to {last}"
-    times = [clock(procedure, first), clock(procedure, last)]
+    times = [clock(contents, first), clock(contents, last)]
     return frames if not times[0] else f"{frames}, {' to '.join(dict.fromkeys(times))}"
 
 
-def frame_states(procedure: ProcedureContents) -> tuple[list[State], Int[np.ndarray, "N"]]:
+def frame_states(contents: Contents) -> tuple[list[State], Int[np.ndarray, "N"]]:
     """States, and which of them each frame of the video has. [N]
 
     Frames that were not used, since of every n only one is, have the state of the used one before them. A frame that
     two sub-maps have posed belongs to the earlier one.
     """
-    record, kinds = procedure.record, dict[State, int]()
-    codes = np.full(record.frames, -1)
-    posed = np.zeros(record.frames, bool)
-    colors = styles(procedure)
+    video, kinds = contents.video, dict[State, int]()
+    codes = np.full(video.frames, -1)
+    posed = np.zeros(video.frames, bool)
+    colors = styles(contents)
 
     def code(state: State) -> int:
         return kinds.setdefault(state, len(kinds))
 
     def number(first: int, last: int) -> slice:
-        return slice(first - record.first, last + 1 - record.first)
+        return slice(first - video.first, last + 1 - video.first)
 
-    for skipped in record.skipped:
+    for skipped in video.skipped:
         codes[number(skipped.first, skipped.last)] = code(State("left out", skipped.why))
-    for segment in procedure.segments:
+    for segment in contents.segments:
         span = segment.span
         why = segment.failure or "not among those that were posed"
         own = dict.fromkeys(segment.kept, code(State("no pose", why)))
@@ -123,23 +123,23 @@ def frame_states(procedure: ProcedureContents) -> tuple[list[State], Int[np.ndar
     return list(kinds), codes
 
 
-def stretches(procedure: ProcedureContents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Iterator[Stretch]:
+def stretches(contents: Contents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Iterator[Stretch]:
     """Runs of one state, along the video."""
     edges = np.flatnonzero(np.diff(codes)) + 1
-    first = procedure.record.first
+    first = contents.video.first
     for start, stop in zip([0, *edges.tolist()], [*edges.tolist(), len(codes)], strict=True):
         yield Stretch(first + start, first + stop - 1, states[int(codes[start])])
 
 
-def picture_near(procedure: ProcedureContents, first: int, last: int) -> EncodedImage | None:
+def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | None:
     """The frame of use nearest to the middle of a stretch, as a small JPEG; None without one that can be read."""
     middle = (first + last) / 2
-    for segment in procedure.segments:
+    for segment in contents.segments:
         if segment.span.last < first or segment.span.first > last:
             continue
         near = min(segment.kept, key=lambda frame: abs(frame - middle), default=None)
         if near is not None and first <= near <= last:
-            return small_picture([segment.image(procedure.folder, near)], _WIDTH)
+            return small_picture([segment.images / segment.kept[near]], _WIDTH)
     return None
 
 
@@ -155,12 +155,12 @@ def small_picture(files: Sequence[Path], width: int) -> EncodedImage | None:
     return EncodedImage(encode_jpeg(image, 80), "image/jpeg", image.shape[1], image.shape[0])
 
 
-def timeline(procedure: ProcedureContents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Template:
+def timeline(contents: Contents, states: Sequence[State], codes: Int[np.ndarray, "N"]) -> Template:
     """The time line: pictures, ribbon of sub-maps, segments and curves over one axis of time and frames."""
-    record = procedure.record
+    video = contents.video
 
     def percent(frame: float) -> float:
-        return round(100.0 * (frame - record.first) / record.frames, 3)
+        return round(100.0 * (frame - video.first) / video.frames, 3)
 
     def bar(first: int, last: int) -> dict[str, Any]:
         return {"left": percent(first), "width": round(percent(last + 1) - percent(first), 3)}
@@ -169,27 +169,27 @@ def timeline(procedure: ProcedureContents, states: Sequence[State], codes: Int[n
         bar(one.first, one.last)
         | {
             "style": one.state.style,
-            "title": f"{one.state.what}: {span_text(procedure, one.first, one.last)}"
+            "title": f"{one.state.what}: {span_text(contents, one.first, one.last)}"
             + (f"; {one.state.why}" if one.state.why else ""),
         }
-        for one in stretches(procedure, states, _thinned(codes))
+        for one in stretches(contents, states, _thinned(codes))
     ]
     parts = [
-        bar(segment.span.first, segment.span.last)
+        bar(span.first, span.last)
         | {
-            "name": segment.span.name.removeprefix("segment-"),
-            "href": quote(f"{segment.span.name}/{PAGE_FILE}")
-            if (procedure.folder / segment.span.name / PAGE_FILE).is_file()
-            else "",
+            "name": span.name.removeprefix("segment-"),
+            "href": quote(page) if (contents.folder / (page := f"{span.name}/{PAGE_FILE}")).is_file() else "",
             "failed": bool(segment.failure),
-            "title": f"{segment.span.name}: {span_text(procedure, segment.span.first, segment.span.last)}"
-            + (f"; {segment.failure}" if segment.failure else ""),
+            "title": "; ".join(
+                filter(None, (f"{span.name}: {span_text(contents, span.first, span.last)}", segment.failure))
+            ),
         }
-        for segment in procedure.segments
+        for segment in contents.segments
+        if (span := segment.span).name
     ]
-    edges = [record.first + round(index * record.frames / _PICTURES) for index in range(_PICTURES + 1)]
+    edges = [video.first + round(index * video.frames / _PICTURES) for index in range(_PICTURES + 1)]
     pictures = [
-        {"image": picture_near(procedure, first, stop - 1), "title": span_text(procedure, first, stop - 1)}
+        {"image": picture_near(contents, first, stop - 1), "title": span_text(contents, first, stop - 1)}
         for first, stop in pairwise(edges)
         if stop > first
     ]
@@ -199,9 +199,9 @@ def timeline(procedure: ProcedureContents, states: Sequence[State], codes: Int[n
             "thumbs": pictures,
             "ribbon": ribbon,
             "rows": [row for row in (parts[::2], parts[1::2]) if row],
-            "curves": list(_curves(procedure)),
-            "ticks": [{"left": percent(frame), "texts": texts} for frame, texts in _ticks(procedure)],
-            "axis": "frame number" if record.rate is None else "time, min:s; frame number",
+            "curves": list(_curves(contents)),
+            "ticks": [{"left": percent(frame), "texts": texts} for frame, texts in _ticks(contents)],
+            "axis": "frame number" if video.rate is None else "time, min:s; frame number",
         },
     )
 
@@ -216,23 +216,23 @@ def _thinned(codes: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
     return shown
 
 
-def _ticks(procedure: ProcedureContents) -> Iterator[tuple[float, list[str]]]:
-    record = procedure.record
-    if record.rate is None:
-        for tick in linear_ticks(record.first, record.stop):
+def _ticks(contents: Contents) -> Iterator[tuple[float, list[str]]]:
+    video = contents.video
+    if video.rate is None:
+        for tick in linear_ticks(video.first, video.stop):
             yield tick, [tick_label(tick)]
         return
-    seconds = record.frames / record.rate
+    seconds = video.frames / video.rate
     step = next((step for step in _STEPS if seconds / step <= _TICKS), math.ceil(seconds / _TICKS))
-    for number in range(math.ceil(record.first / record.rate / step), int(record.stop / record.rate / step) + 1):
-        frame = number * step * record.rate
-        yield frame, [clock(procedure, frame), str(round(frame))]
+    for number in range(math.ceil(video.first / video.rate / step), int(video.stop / video.rate / step) + 1):
+        frame = number * step * video.rate
+        yield frame, [clock(contents, frame), str(round(frame))]
 
 
-def _curves(procedure: ProcedureContents) -> Iterator[dict[str, Any]]:
+def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
     """Means of the survey's numbers over columns, as SVG paths in a box of 1000 x 100."""
     for name, (title, unit, factor) in _CURVES.items():
-        values = factor * procedure.survey.get(name, np.zeros(0)).astype(np.float64)
+        values = factor * contents.survey.get(name, np.zeros(0)).astype(np.float64)
         values[~np.isfinite(values)] = np.nan
         if not np.isfinite(values).any():
             continue
@@ -252,9 +252,9 @@ def _curves(procedure: ProcedureContents) -> Iterator[dict[str, Any]]:
         yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
 
 
-def submap_between(procedure: ProcedureContents, one: ProcedureSubmap, other: ProcedureSubmap) -> tuple[bool, str]:
+def submap_between(contents: Contents, one: SubmapContents, other: SubmapContents) -> tuple[bool, str]:
     """Whether a sub-map and the one that follows it are joined, and how well, or why they are not."""
-    for join in procedure.record.joins:
+    for join in contents.joins:
         if {one.key, other.key} == set(join.keys):
             if not join.joined:
                 return False, join.reason
@@ -262,12 +262,12 @@ def submap_between(procedure: ProcedureContents, one: ProcedureSubmap, other: Pr
             residuals += [] if join.rotation_deg is None else [f"cameras turned by {join.rotation_deg:.2g} degrees"]
             residuals += [] if join.position is None else [f"{100.0 * join.position:.2g} % of the depth apart"]
             return True, ", ".join(residuals)
-    return False, _reason_apart(procedure, one, other)
+    return False, _reason_apart(contents, one, other)
 
 
-def _reason_apart(procedure: ProcedureContents, one: ProcedureSubmap, other: ProcedureSubmap) -> str:
+def _reason_apart(contents: Contents, one: SubmapContents, other: SubmapContents) -> str:
     """Why two sub-maps that no join of segments names are apart, as far as it was recorded."""
-    segments = {segment.span.name: segment for segment in procedure.segments}
+    segments = {segment.span.name: segment for segment in contents.segments}
     if one.segment == other.segment and (atlas := segments[one.segment].atlas) is not None:
         names = {name: number for number, name in one.names.items()} | {
             name: number for number, name in other.names.items()
@@ -277,18 +277,18 @@ def _reason_apart(procedure: ProcedureContents, one: ProcedureSubmap, other: Pro
             return reason
     if one.segment != other.segment:
         pair = {one.segment, other.segment}
-        between = [join for join in procedure.record.joins if set(join.segments) == pair]
+        between = [join for join in contents.joins if set(join.segments) == pair]
         if between and not any(join.joined for join in between):
             return between[0].reason  # of the models that share most frames
-    return _lost_between(procedure, one.last, other.first)
+    return _lost_between(contents, one.last, other.first)
 
 
-def _lost_between(procedure: ProcedureContents, last: int, first: int) -> str:
+def _lost_between(contents: Contents, last: int, first: int) -> str:
     """The commonest reason why frames between two have no pose."""
     reasons = Counter(
-        why for segment in procedure.segments for frame, why in segment.why.items() if last < frame < first
+        why for segment in contents.segments for frame, why in segment.why.items() if last < frame < first
     )
-    for skipped in procedure.record.skipped:
+    for skipped in contents.video.skipped:
         if last < skipped.first < first:
             reasons[skipped.why] += skipped.last - skipped.first + 1
     gap = max(0, first - last - 1)

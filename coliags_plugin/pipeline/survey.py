@@ -1,0 +1,287 @@
+"""Surveys a long video in one pass, cuts it into segments, and leaves out what cannot be posed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+from zlib import crc32
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt32
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing_extensions import Self
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_arrays
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.pipeline.frame_selection import lens_mask, motion_and_survival, overlays, reduced
+from coliags_plugin.pipeline.frame_sources import FrameSource, frame_source, watched
+from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.reconstruction.structure.texture import sharpness
+from coliags_plugin.reconstruction.structure.video import cut_where_lost
+
+log = logging.getLogger(__name__)
+
+#: Name of the file in the reconstruction's folder.
+SURVEY_FILE = "survey.npz"
+_ARRAYS = ("sharpness", "followed", "motion", "checksums")
+#: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
+_FEWEST_STILL = 10
+#: Most frames of a video: a day at 60 a second.
+_MOST_FRAMES = 6_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What is known of each frame of a video.
+
+    Attributes:
+        sharpness: Root mean square of the Laplacian over the mean brightness; 0 without any texture. [N]
+        followed: Share of corners that were followed from the frame before. [N]
+        motion: Their median displacement, as a share of the larger side; infinity where too few were followed. [N]
+        checksums: Of the pixels, to know a frame again. [N]
+        size: Height and width of the frames, pixels.
+        mask: False outside of the lens's image and on overlays; None where all counts. [H, W]
+        first: Number of the first frame.
+    """
+
+    sharpness: Float[np.ndarray, "N"]
+    followed: Float32[np.ndarray, "N"]
+    motion: Float32[np.ndarray, "N"]
+    checksums: UInt32[np.ndarray, "N"]
+    size: tuple[int, int]
+    mask: Bool[np.ndarray, "H W"] | None
+    first: int = 0
+
+    def __len__(self) -> int:
+        return len(self.sharpness)
+
+    def part(self, first: int, last: int | None) -> Survey:
+        """Some of the frames, by their numbers, both inclusive; without ``last`` up to the end."""
+        place = slice(first - self.first, None if last is None else last + 1 - self.first)
+        return replace(self, first=first, **{name: getattr(self, name)[place] for name in _ARRAYS})
+
+    def write(self, folder: Path) -> None:
+        """Write ``survey.npz``."""
+        mask = np.zeros((0, 0), bool) if self.mask is None else self.mask
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        numbers = {"size": np.array(self.size), "first": np.array(self.first), "mask": mask}
+        write_arrays(folder / SURVEY_FILE, {**arrays, **numbers})
+
+    @classmethod
+    def read(cls, folder: Path) -> Survey:
+        """Read ``survey.npz``."""
+        with np.load(folder / SURVEY_FILE) as arrays:
+            own = {name: arrays[name] for name in _ARRAYS}
+            height, width = arrays["size"].tolist()
+            mask = arrays["mask"] if arrays["mask"].size else None
+            return cls(**own, size=(height, width), mask=mask, first=int(arrays["first"]))
+
+
+class FrameSurvey:
+    """Sharpness of all frames of a video, and the mask that they have in common."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.sharpnesses: list[float] = []
+        self._extremes: list[UInt8[np.ndarray, "H W 3"]] = []
+        self._sum: Float32[np.ndarray, "H W 3"] | None = None
+        self._sizes: set[tuple[int, ...]] = set()
+
+    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Look at the next frame."""
+        self._sizes.add(image.shape)
+        if len(self._sizes) > 1:
+            return
+        self.sharpnesses.append(sharpness(reduced(image)))
+        if self._sum is None:
+            self._extremes, self._sum = [image.copy(), image.copy()], image.astype(np.float32)
+            return
+        for extreme, of_both in zip(self._extremes, (np.minimum, np.maximum), strict=True):
+            of_both(extreme, image, out=extreme)
+        self._sum += image
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the frames."""
+        return self._extremes[0].shape[0], self._extremes[0].shape[1]
+
+    def mask(self) -> Bool[np.ndarray, "H W"] | None:
+        """False outside of the lens's image and on overlays; None without any, as of frames of several sizes."""
+        if self._sum is None:
+            raise InputError(f"no frames in {self.path}", "a video")
+        darkest, brightest = self._extremes
+        inside, count = lens_mask(brightest.max(axis=2)), len(self.sharpnesses)
+        mask = np.ones(self.size, bool) if inside is None else inside
+        if count >= _FEWEST_STILL:
+            mask &= ~overlays(darkest, brightest, self._sum / count)
+        return None if mask.all() or len(self._sizes) > 1 else mask
+
+
+def checksum(gray: UInt8[np.ndarray, "h w"]) -> int:
+    """Checksum of a reduced frame."""
+    return crc32(gray.tobytes())
+
+
+def survey_video(source: FrameSource, progress: Progress | None = None) -> Survey:
+    """Look at every frame of a video once, two of them at a time.
+
+    Raises:
+        InputError: It has no frame that can be decoded, or frames of several sizes.
+    """
+    whole = FrameSurvey(source.path)
+    followed, motions, checksums, last = list[float](), list[float](), list[int](), None
+    for _, image in watched(source, "look at frames", progress):
+        whole.add(image)
+        gray = reduced(image)
+        moved, share = (np.inf, 0.0) if last is None else motion_and_survival(last, gray)
+        motions.append(moved)
+        followed.append(share)
+        checksums.append(checksum(gray))
+        last = gray
+    mask, single = whole.mask(), np.float32
+    return Survey(
+        np.array(whole.sharpnesses), np.array(followed, single), np.array(motions, single),
+        np.array(checksums, np.uint32), whole.size, mask, source.span.first,
+    )  # fmt: skip
+
+
+#: Share of corners below which a frame shows nothing of the one before: wall contact, blur, wash, or a cut.
+_NOTHING = 0.06
+#: Share of the video's median sharpness below which corners are noise of the sensor and of compression, which may be
+#: followed: wall contact has 0.10 to 0.13, the least sharp of a patient's frames of use 0.28.
+_FLAT = 0.2
+#: Frames without a break of which a stretch of such frames is left out; shorter ones stay within their segment.
+_LONGEST_LOSS = 30
+#: Frames that two segments share where a video is cut although points are followed, so that they can be joined.
+OVERLAP = 24
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames of a video by their numbers, both inclusive."""
+
+    first: int
+    last: int
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True)
+class Segment(Stretch):
+    """Frames that are reconstructed by themselves."""
+
+    name: Annotated[str, Field(pattern=r"^(segment-[0-9]{1,6})?$")]  # of the folder; empty: of the whole video
+
+
+@dataclass(frozen=True)
+class Skipped(Stretch):
+    """Frames that are left out."""
+
+    why: str = ""
+
+
+class Video(BaseModel):
+    """A video and its segments, as the record has them; numbers of frames are those of the video."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    source: str  # name of the video's file, or of the folder
+    rate: Annotated[float, Field(gt=0.0, lt=1e4)] | None = None  # frames a second; None: unknown
+    frames: Annotated[int, Field(gt=0, lt=_MOST_FRAMES)]  # that were looked at
+    size: tuple[int, int] | None = None  # width and height, pixels
+    first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)] = 0  # that was looked at
+    seek: bool = True  # whether frames are found by their number
+    deinterlace: bool = False  # whether they were read so
+    segments: tuple[Segment, ...]
+    skipped: tuple[Skipped, ...] = ()
+
+    @model_validator(mode="after")
+    def _within_the_video(self) -> Self:
+        stretches: list[Stretch] = [*self.segments, *self.skipped]
+        for one in stretches:
+            if not self.first <= one.first <= one.last < self.stop:
+                raise ValueError(f"frames {one.first} to {one.last}, not of {self.first} to {self.stop - 1}")
+        if len({segment.name for segment in self.segments}) < len(self.segments):
+            raise ValueError("two segments have the same name")
+        return self
+
+    @property
+    def stop(self) -> int:
+        """Number of the last frame that was looked at, plus one."""
+        return self.first + self.frames
+
+
+def survey_and_cut(
+    source: FrameSource, settings: FrameSettings, least: int | None, progress: Progress | None
+) -> tuple[Survey, Video]:
+    """Look at all frames of a video and cut it into segments of ``least`` frames or more; None: leave it whole."""
+    survey, span = survey_video(source, progress), source.span
+    segments, skipped = [Segment(span.first, span.first + len(survey) - 1, "")], list[Skipped]()
+    if least is not None:
+        segments, skipped = cut(survey, settings, least)
+        log.info("%d frames in %d segments, %d stretches left out", len(survey), len(segments), len(skipped))
+    height, width = survey.size
+    video = Video(
+        source=source.path.name,
+        rate=source.rate,
+        frames=len(survey),
+        size=(width, height),
+        first=span.first,
+        seek=span.seek and (least is None or are_found(source, survey, [each.first for each in segments])),
+        deinterlace=span.deinterlace,
+        segments=tuple(segments),
+        skipped=tuple(skipped),
+    )
+    return survey, video
+
+
+def are_found(source: FrameSource, survey: Survey, numbers: Sequence[int]) -> bool:
+    """Whether frames that are sought by their number are those that came in order."""
+    for number in numbers:
+        one = frame_source(source.path, replace(source.span, first=number, last=number))
+        image = next((image for _, image in one), None)
+        if image is None or checksum(reduced(image)) != survey.checksums[number - source.span.first]:
+            log.warning("%s: frames are not found by their number, and decoded in order for every segment", source.path)
+            return False
+    return True
+
+
+def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segment], list[Skipped]]:
+    """Segments in order, and what is left out: where nothing is followed for long, and what is shorter than ``least``.
+
+    Segments that follow each other without a gap share at most ``OVERLAP`` frames, times ``settings.every``.
+    """
+    flat = survey.sharpness <= _FLAT * np.median(survey.sharpness)
+    lost = flat | (survey.followed < _NOTHING)
+    lost[0] = flat[0]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(np.int8), [0]])))
+    gaps = [(first, stop) for first, stop in edges.reshape(-1, 2).tolist() if stop - first > _LONGEST_LOSS]
+    bounds = [0, *(place for gap in gaps for place in gap), len(survey)]
+    skipped = [(first, stop - 1, "nothing of the frame before is seen, or no texture") for first, stop in gaps]
+    kept: list[tuple[int, int]] = []
+    for start, stop in zip(bounds[::2], bounds[1::2], strict=True):
+        if 0 < stop - start < least * settings.every:
+            skipped.append((start, stop - 1, f"fewer than {least} frames of use between such stretches"))
+        elif stop > start:
+            kept += _split(survey, start, stop, settings)
+    began = survey.first
+    return (
+        [Segment(began + one, began + last, f"segment-{number:03d}") for number, (one, last) in enumerate(kept)],
+        [Skipped(began + one, began + last, why) for one, last, why in sorted(skipped)],
+    )
+
+
+def _split(survey: Survey, start: int, stop: int, settings: FrameSettings) -> list[tuple[int, int]]:
+    # Stretches are not shorter than a quarter of the longest, so that no frame is in more than two segments.
+    shared = min(OVERLAP, settings.segment // 8) * settings.every
+    longest = settings.segment * settings.every - shared
+    windows = cut_where_lost(survey.followed[start:stop].tolist(), longest)
+    half = shared // 2
+    return [(max(start, start + window.start - half), min(stop, start + window.stop + half) - 1) for window in windows]
