@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -239,28 +239,30 @@ def _read_segment(
             if span.first <= one.frame <= span.last
         }
     why = {one.frame: one.why for one in (frames.dropped if frames else ())}
-    submaps = {number: SubmapContents(span.name, f"sparse/{number}", own) for number, own in _of_submaps(stages)}
+    made: dict[int, dict[str, StageRecord]] = {}
+    for name, stage in stages.items():
+        place, _, step = name.rpartition("/")
+        if step not in _OF_ALL:
+            made.setdefault(int(place.removeprefix("submap-") or 0), {})[step] = stage
+    submaps = {number: SubmapContents(span.name, f"sparse/{number}", known) for number, known in made.items()}
     if atlas is not None:
         try:
             numbers = _numbers(atlas, {Path(name).stem: number for number, name in kept.items()}, video)
-            submaps |= _with_frames(atlas, numbers, span.name, submaps)
             why |= {numbers[lost.frame]: lost.reason for lost in atlas.lost}
+            names: dict[str, dict[int, str]] = {}
+            for stretch in atlas.submaps:
+                own = {numbers[index]: atlas.frames[index] for index in stretch.frames}
+                names[stretch.model] = names.get(stretch.model, {}) | own
+            units = {stretch.model: stretch.unit for stretch in atlas.submaps}
+            for model, own in names.items():
+                known = made.get(number := int(Path(model).name), {})
+                submaps[number] = SubmapContents(span.name, model, known, dict(sorted(own.items())), units[model])
         except (LookupError, ValueError) as error:
             told = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
             problems.append(f"poses/atlas.json does not fit the frames: {told}")
             atlas = None
     ordered = [submaps[number] for number in sorted(submaps)]
     return SegmentContents(span, stages, ordered, atlas, images, kept, why, "; ".join(problems))
-
-
-def _of_submaps(stages: Mapping[str, StageRecord]) -> Iterable[tuple[int, dict[str, StageRecord]]]:
-    """Numbers of the sub-maps of a segment, and the stages of each."""
-    found: dict[int, dict[str, StageRecord]] = {}
-    for name, stage in stages.items():
-        folder, _, own = name.rpartition("/")
-        if own not in _OF_ALL:
-            found.setdefault(int(folder.removeprefix("submap-") or 0), {})[own] = stage
-    return found.items()
 
 
 def _numbers(atlas: AtlasRecord, known: Mapping[str, int], video: Video) -> list[int]:
@@ -276,21 +278,6 @@ def _numbers(atlas: AtlasRecord, known: Mapping[str, int], video: Video) -> list
             raise ValueError(f"{file} is none of the frames {video.first} to {video.stop - 1}")
         numbers.append(number)
     return numbers
-
-
-def _with_frames(
-    atlas: AtlasRecord, numbers: Sequence[int], segment: str, known: Mapping[int, SubmapContents]
-) -> dict[int, SubmapContents]:
-    """The models of an atlas, by their numbers."""
-    units, models = {stretch.model: stretch.unit for stretch in atlas.submaps}, dict[str, dict[int, str]]()
-    for stretch in atlas.submaps:
-        models.setdefault(stretch.model, {}).update({numbers[index]: atlas.frames[index] for index in stretch.frames})
-    found = (
-        SubmapContents(segment, model, {}, dict(sorted(names.items())), units[model])
-        for model, names in models.items()
-        if names
-    )
-    return {one.number: replace(one, stages=known[one.number].stages) if one.number in known else one for one in found}
 
 
 def common_frames(contents: Contents) -> dict[ModelKey, tuple[ModelKey, Float[np.ndarray, "4 4"]]]:

@@ -56,166 +56,126 @@ class Span:
 
 
 @dataclass(frozen=True)
-class ImageFolder:
-    """Images of a folder, in the natural order of their names.
+class FrameSource:
+    """Frames of a folder of images, of a video file or of several, in order; every iteration reads them anew.
 
-    As of the others: iterations read names, which sort in frame order, and RGB images, all of one size, anew.
+    Images are in the natural order of their names, frames of videos numbered through by what their headers say.
     """
 
     path: Path
     span: Span = Span()  # which of them
-    rate: float | None = None  # frames a second: unknown
+    videos: tuple[Path, ...] = ()  # files, decoded by OpenCV; none: a folder of images
 
     @property
     def expected(self) -> int:
         """Number of frames by what files say, at least 1; for progress alone."""
-        return self.span.count(len(list_images(self.path)))
+        return self.span.count(sum(count for _, count in self._headers) or len(list_images(self.path)))
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second by the first file's header; None where it does not say, and of images."""
+        rate = self._headers[0][0] if self.videos else 0.0
+        return rate if 0.0 < rate < _FASTEST else None
+
+    @cached_property
+    def _headers(self) -> list[tuple[float, int]]:
+        """Frames a second, and frames, of each video."""
+        import cv2
+
+        found = []
+        for file in self.videos:
+            video = _opened(file)
+            count = max(1, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
+            found.append((video.get(cv2.CAP_PROP_FPS), count))
+            video.release()
+        return found
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Stems of the file names, and images."""
-        images = list_images(self.path)
+        """Names, which sort in frame order, and RGB images, all of one size.
+
+        Names are the stems of images, or ``frame_000000``, ... by the number in the video.
+        """
         shape: tuple[int, ...] | None = None
-        named = list(zip(file_names([path.stem for path in images], ""), images, strict=True))
-        for name, path in named[self.span.first :][: self.span.count(len(named))]:
-            image = read_image(path)
+        for file, name, image in self._of_videos() if self.videos else self._of_images():
             shape = shape or image.shape
             if image.shape != shape:
                 raise InputError(
-                    f"{path} is {image.shape[1]} x {image.shape[0]}, {images[0].name} {shape[1]} x {shape[0]}",
+                    f"{file} is {image.shape[1]} x {image.shape[0]} at {name}, what is before {shape[1]} x {shape[0]}",
                     "frames of one size",
-                    "Leave out images of other sizes",
+                    _AS_IMAGES if self.videos else "Leave out images of other sizes",
                 )
             yield name, self.span.shown(image)
 
+    def _of_images(self) -> Iterator[tuple[Path, str, UInt8[np.ndarray, "H W 3"]]]:
+        images = list_images(self.path)
+        named = list(zip(file_names([path.stem for path in images], ""), images, strict=True))
+        for name, path in named[self.span.first :][: self.span.count(len(named))]:
+            yield path, name, read_image(path)
 
-@dataclass(frozen=True)
-class VideoFile:
-    """Frames of a video file, decoded by OpenCV."""
-
-    path: Path
-    span: Span = Span()
-
-    @property
-    def expected(self) -> int:
-        """Number of frames by the file's header."""
-        return self.span.count(self._frame_count)
-
-    @property
-    def rate(self) -> float | None:
-        """Frames a second by the file's header; None where it does not say."""
-        rate, _ = self._header
-        return rate if 0.0 < rate < _FASTEST else None
-
-    @property
-    def _frame_count(self) -> int:
-        return max(1, int(self._header[1]))
-
-    @cached_property
-    def _header(self) -> tuple[float, float]:
-        """Frames a second, and frames."""
-        import cv2
-
-        video = _opened(self.path)
-        try:
-            return video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
-        finally:
-            video.release()
-
-    def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names ``frame_000000``, ... by their number in the video, and images.
-
-        Where the file is damaged and goes on behind that, the frames between are black.
-        """
-        span, shape, count = self.span, None, 0
-        last, stop = self._frame_count - 1, sys.maxsize if self.span.last is None else self.span.last + 1
-        video = _opened(self.path)
-        number = _go_to(video, span)
-        try:
-            while number < stop:
-                there, image = video.read()
-                if not there:
-                    # Of a file whose first frame cannot be decoded, FFmpeg may take packets of gigabytes for others.
-                    found = _beyond_damage(video, number, last) if number > 0 else None
-                    if found is None:
-                        break
-                    behind, image = found
-                    log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, number, behind - 1)
-                    for lost in range(max(number, span.first), min(behind, stop)):
-                        yield f"frame_{lost:06d}", np.zeros(image.shape, np.uint8)
-                        count += 1
-                    number = behind
-                shape = shape or image.shape
-                if image.shape != shape:
-                    raise InputError(
-                        f"{self.path}: the size changes at frame {number}", "frames of one size", _AS_IMAGES
-                    )
-                if span.first <= number < stop:
-                    yield f"frame_{number:06d}", span.shown(np.ascontiguousarray(image[..., ::-1]))
-                    count += 1
-                number += 1
-        finally:
-            video.release()
-        if count == 0 and span.first > 0:
-            raise InputError(f"{self.path} has no frame {span.first}", f"one of about {self._frame_count} frames")
-        if count == 0:
-            raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec OpenCV has", _AS_IMAGES)
-        if count < _COMPLETE * self.expected:
-            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, self.expected)
-
-
-@dataclass(frozen=True)
-class VideoFiles:
-    """Frames of several video files of one procedure, numbered through by what their headers say."""
-
-    path: Path
-    files: tuple[Path, ...]
-    span: Span = Span()
-
-    @property
-    def expected(self) -> int:
-        """Number of frames by the files' headers."""
-        return self.span.count(sum(VideoFile(file).expected for file in self.files))
-
-    @property
-    def rate(self) -> float | None:
-        """Frames a second of the first file."""
-        return VideoFile(self.files[0]).rate
-
-    def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names ``frame_000000``, ... and images. Where a file ends too early, black ones."""
-        start, image = 0, None
-        for file in self.files:
-            count, first = VideoFile(file).expected, max(0, self.span.first - start)
-            last = count - 1 if self.span.last is None else min(count - 1, self.span.last - start)
-            number, shape = first, None if image is None else image.shape
-            if first <= last:
-                for _, image in VideoFile(file, replace(self.span, first=first, last=last)):
-                    if shape is not None and image.shape != shape:
-                        raise InputError(f"{file} is {image.shape[1]} x {image.shape[0]}, the file before {shape[1]} x "
-                            f"{shape[0]}", "videos of one size", _AS_IMAGES)  # fmt: skip
-                    yield f"frame_{start + number:06d}", image
+    def _of_videos(self) -> Iterator[tuple[Path, str, UInt8[np.ndarray, "H W 3"]]]:
+        """Files, names and frames. Where a file ends too early, and another one follows, black ones."""
+        start, end = 0, sys.maxsize if self.span.last is None else self.span.last + 1
+        for file, (_, count) in zip(self.videos, self._headers, strict=True):
+            number, stop = max(0, self.span.first - start), end - start
+            is_last = file == self.videos[-1]
+            if not is_last:
+                stop = min(stop, count)
+            if number < stop:
+                for image in _decoded(file, number, stop, self.span.seek, count):
+                    yield file, f"frame_{start + number:06d}", image
                     number += 1
-                for missing in range(number, last + 1 if image is not None else 0):
-                    yield f"frame_{start + missing:06d}", np.zeros_like(image)
+                for missing in range(number, 0 if is_last else stop):
+                    yield file, f"frame_{start + missing:06d}", np.zeros_like(image)
             start += count
 
 
-#: Frames in order, read anew by every iteration.
-FrameSource = ImageFolder | VideoFile | VideoFiles
+def _decoded(file: Path, first: int, stop: int, seek: bool, total: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """Frames of a video of ``total`` frames by its header, from one on as far as there are.
+
+    Where the file is damaged and goes on behind that, the frames between are black.
+    """
+    video, done = _opened(file), 0
+    try:
+        number = _go_to(video, first, seek)
+        while number < stop:
+            there, image = video.read()
+            if not there:
+                # Of a file whose first frame cannot be decoded, FFmpeg may take packets of gigabytes for others.
+                found = _beyond_damage(video, number, total - 1) if number > 0 else None
+                if found is None:
+                    break
+                behind, image = found
+                log.warning("%s: frames %d to %d cannot be decoded: black here", file, number, behind - 1)
+                for _ in range(max(number, first), min(behind, stop)):
+                    yield np.zeros(image.shape, np.uint8)
+                    done += 1
+                number = behind
+            if first <= number < stop:
+                yield np.ascontiguousarray(image[..., ::-1])
+                done += 1
+            number += 1
+    finally:
+        video.release()
+    if done == 0 and first > 0:
+        raise InputError(f"{file} has no frame {first}", f"one of about {total} frames")
+    if done == 0:
+        raise InputError(f"no frame of {file} can be decoded", "a video whose codec OpenCV has", _AS_IMAGES)
+    if done < _COMPLETE * (expected := min(stop, total) - first):
+        log.warning("%s: %d frames, though its header says %d: is it complete?", file, done, expected)
 
 
-def _go_to(video: cv2.VideoCapture, span: Span) -> int:
-    """Have the first frame of a span come next; returns its number, or where the video ended before it."""
+def _go_to(video: cv2.VideoCapture, first: int, seek: bool) -> int:
+    """Have a frame come next; returns its number, or where the video ended before it."""
     import cv2
 
-    if span.seek and span.first > 0 and video.set(cv2.CAP_PROP_POS_FRAMES, span.first):
-        if round(video.get(cv2.CAP_PROP_POS_FRAMES)) == span.first:
-            return span.first
+    if seek and first > 0 and video.set(cv2.CAP_PROP_POS_FRAMES, first):
+        if round(video.get(cv2.CAP_PROP_POS_FRAMES)) == first:
+            return first
         video.set(cv2.CAP_PROP_POS_FRAMES, 0)
-    for number in range(span.first):
+    for number in range(first):
         if not video.grab():
             return number
-    return span.first
+    return first
 
 
 def _beyond_damage(video: cv2.VideoCapture, number: int, last: int) -> tuple[int, np.ndarray] | None:
@@ -251,15 +211,15 @@ def frame_source(path: Path, span: Span = Span()) -> FrameSource:
     """The frames of a file or folder, all or some."""
     if path.is_dir():
         if videos := videos_in(path):
-            return VideoFiles(path, tuple(videos), span)
+            return FrameSource(path, span, tuple(videos))
         list_images(path)
-        return ImageFolder(path, span)
+        return FrameSource(path, span)
     if not path.exists():
         raise InputError(f"no {path}", "a video file, or a folder of images", "Check the path")
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image", "a video file, or a folder of images", "Give its folder")
     _opened(path).release()
-    return VideoFile(path, span)
+    return FrameSource(path, span, (path,))
 
 
 def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
@@ -271,7 +231,7 @@ def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
             "rows between are interpolated (frames.deinterlace)",
             path,
         )
-        return frame_source(path, replace(source.span, deinterlace=True))
+        return replace(source, span=replace(source.span, deinterlace=True))
     return source
 
 
@@ -365,7 +325,7 @@ def image_files(
     Raises:
         InputError: As :func:`frame_source`, or a frame cannot be read.
     """
-    if isinstance(frame_source(source), ImageFolder):
+    if not frame_source(source).videos:
         yield list_images(source)
         return
     frames = chosen_frames(source, FrameSettings())

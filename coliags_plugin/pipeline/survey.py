@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frame_selection import lens_mask, motion_and_survival, overlays, reduced
-from coliags_plugin.pipeline.frame_sources import FrameSource, frame_source, watched
+from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.texture import sharpness
 from coliags_plugin.reconstruction.structure.video import cut_where_lost
@@ -245,7 +245,7 @@ def survey_and_cut(
 def are_found(source: FrameSource, survey: Survey, numbers: Sequence[int]) -> bool:
     """Whether frames that are sought by their number are those that came in order."""
     for number in numbers:
-        one = frame_source(source.path, replace(source.span, first=number, last=number))
+        one = replace(source, span=replace(source.span, first=number, last=number))
         image = next((image for _, image in one), None)
         if image is None or checksum(reduced(image)) != survey.checksums[number - source.span.first]:
             log.warning("%s: frames are not found by their number, and decoded in order for every segment", source.path)

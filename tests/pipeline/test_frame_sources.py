@@ -12,10 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.frame_sources import (
-    ImageFolder,
     Span,
-    VideoFile,
-    VideoFiles,
     every_of,
     frame_at,
     frame_source,
@@ -27,7 +24,6 @@ def test_a_video_is_read_in_order(tmp_path):
     frames = film(range(0, 60, 10))
     write_video(frames, tmp_path / "film.mp4", 15.0)
     source = frame_source(tmp_path / "film.mp4")
-    assert isinstance(source, VideoFile)
     assert source.expected == len(frames)
     for _ in range(2):
         read = list(source)
@@ -41,7 +37,6 @@ def test_a_video_is_read_in_order(tmp_path):
 def test_a_folder_is_read_in_natural_order(tmp_path):
     frames = film(range(0, 24, 2))
     source = frame_source(write_images(tmp_path, frames))
-    assert isinstance(source, ImageFolder)
     assert source.expected == 12
     read = list(source)
     assert [name for name, _ in read] == [str(index) for index in range(12)]
@@ -80,7 +75,7 @@ def test_a_truncated_video_is_read_as_far_as_it_goes_or_refused(tmp_path, caplog
 def test_images_of_two_sizes_are_refused(tmp_path):
     frames = film([0, 5])
     write_images(tmp_path, [frames[0], frames[1][:100]])
-    with pytest.raises(InputError, match=r"1.png is 160 x 100, 0.png 160 x 120. Expected frames of one size"):
+    with pytest.raises(InputError, match=r"1.png is 160 x 100 at 1, what is before 160 x 120. .*one size"):
         list(frame_source(tmp_path))
 
 
@@ -171,7 +166,7 @@ def test_the_videos_of_a_folder_are_one(tmp_path):
         write_video(film(places), tmp_path / "parts" / name, 15.0)
     parts = [image for n in (1, 2, 10) for _, image in frame_source(tmp_path / "parts" / f"part {n}.mp4")]
     source = frame_source(tmp_path / "parts")
-    assert isinstance(source, VideoFiles) and source.expected == 80 and source.rate == pytest.approx(15.0)
+    assert source.expected == 80 and source.rate == pytest.approx(15.0)
     whole = list(source)
     assert [name for name, _ in whole] == [f"frame_{number:06d}" for number in range(80)]
     assert all(np.array_equal(image, part) for (_, image), part in zip(whole, parts, strict=True))
@@ -181,5 +176,5 @@ def test_the_videos_of_a_folder_are_one(tmp_path):
         assert [name for name, _ in some] == [name for name, _ in expected]
         assert all(np.array_equal(one, other) for (_, one), (_, other) in zip(some, expected, strict=True))
     write_video([image[:100] for image in film([0, 5])], tmp_path / "parts" / "part 11.mp4", 15.0)
-    with pytest.raises(InputError, match=r"part 11.mp4 is 160 x 100, the file before 160 x 120"):
+    with pytest.raises(InputError, match=r"part 11.mp4 is 160 x 100 at frame_000080, what is before 160 x 120"):
         list(frame_source(tmp_path / "parts"))
