@@ -79,12 +79,12 @@ def test_what_was_there_stays_until_all_fits(tmp_path, write):
 def test_the_training_log_on_a_full_disk_is_a_message(tmp_path):
     run = RunFolder(tmp_path)
     run.log_file.symlink_to("/dev/full")
-    with pytest.raises(InputError, match="No space left"), run.log_writer() as append:
-        append({"step": 1})
+    with pytest.raises(InputError, match="No space left"):
+        run.log({"step": 1})
 
 
 def test_a_training_log_that_is_no_file_is_a_message(tmp_path):
     run = RunFolder(tmp_path)
     run.log_file.symlink_to("metrics.jsonl")
-    with pytest.raises(InputError, match="cannot write"), run.log_writer():
-        pass
+    with pytest.raises(InputError, match="cannot write"):
+        run.log({"step": 1})

@@ -15,7 +15,6 @@ from coliags_plugin.config.options import (
     MeshOptions,
     PageOptions,
     RenderOptions,
-    bytes_of,
     takes,
 )
 from coliags_plugin.core.files import refuse_existing
@@ -266,8 +265,7 @@ class Run:
         """
         from coliags_plugin.export.viewer.page import save_page
 
-        size = bytes_of(str(options.size), "--size")
-        return save_page(self.load(), options.output or self.path / "scene.html", size, options.light, options.seconds)
+        return save_page(self.load(), options)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

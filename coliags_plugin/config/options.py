@@ -264,6 +264,11 @@ class PageOptions(Options):
     light: Light = "recorded"
     seconds: float = 180.0
 
+    @property
+    def largest(self) -> int:
+        """The size, bytes."""
+        return bytes_of(str(self.size), "--size")
+
 
 @dataclass(frozen=True)
 class CoverageOptions(Options):

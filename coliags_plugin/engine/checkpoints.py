@@ -54,22 +54,10 @@ class Checkpoint:
         return {key[len(prefix) :]: value for key, value in self.tensors.items() if key.startswith(prefix)}
 
 
-def save_checkpoint(
-    folder: Path,
-    step: int,
-    method: str,
-    model: Model,
-    optimizers: Optimizers,
-    strategy: Strategy,
-    generators: Mapping[str, torch.Generator],
-    sampler: Sampler,
-    cost: TrainingCost | None = None,
-) -> Path:
-    """Write ``step-<step>`` into ``folder``, for bitwise identical continuation of training; its folder.
-
-    Raises:
-        NotFiniteError: A number in it is NaN or infinite; nothing was written.
-    """
+def training_tensors(
+    model: Model, optimizers: Optimizers, strategy: Strategy, generators: Mapping[str, torch.Generator]
+) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, for bitwise identical continuation of training."""
     tensors: dict[str, Tensor] = {f"field/{name}": value for name, value in model.field.state_dict().items()}
     for module, part in model.view_modules.items():
         tensors |= {f"modules/{module}/{name}": value for name, value in part.state_dict().items()}
@@ -78,17 +66,23 @@ def save_checkpoint(
             for key, value in adam.state.get(parameter, {}).items():
                 tensors[f"optimizer/{group}/{index}/{key}"] = value
     tensors |= {f"strategy/{name}": value for name, value in strategy.state_dict().items()}
-    tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
-    _check_finite(tensors, step)
-    target = checkpoint_folder(folder, step)
-    state: JsonObject = {"format": FORMAT, "step": step, "method": method, "frame_queue": sampler.queue}
-    if cost is not None:
-        state["cost"] = cost.model_dump()
-    with atomic_folder(target, overwrite=True) as scratch:
-        save_tensors(tensors, scratch / "state.safetensors")
+    return tensors | {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
+
+
+def save_checkpoint(folder: Path, made: Checkpoint) -> None:
+    """Write ``step-<step>`` into a folder.
+
+    Raises:
+        NotFiniteError: A number in it is NaN or infinite; nothing was written.
+    """
+    _check_finite(made.tensors, made.step)
+    state: JsonObject = {"format": FORMAT, "step": made.step, "method": made.method, "frame_queue": made.frame_queue}
+    if made.cost is not None:
+        state["cost"] = made.cost.model_dump()
+    with atomic_folder(checkpoint_folder(folder, made.step), overwrite=True) as scratch:
+        save_tensors(made.tensors, scratch / "state.safetensors")
         write_json(scratch / "state.json", state)
         write_checksums(scratch)
-    return target
 
 
 def save_tensors(tensors: Mapping[str, Tensor], file: Path) -> None:

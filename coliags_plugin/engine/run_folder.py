@@ -8,8 +8,8 @@ import logging
 import math
 import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -247,23 +247,10 @@ class RunFolder:
             write_json(self.provenance_file, {**provenance, "code_changes": changes})
             logger.warning("the code has changed since %s was begun; its result will have a key of its own", self.path)
 
-    @contextmanager
-    def log_writer(self) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-        """What appends rows to the training log."""
-        with reporting_unwritable(self.path):
-            file = self.log_file.open("a", encoding="utf-8")
-
-        def append(row: Mapping[str, Any]) -> None:
-            text = json.dumps(row, allow_nan=False) + "\n"
-            with reporting_unwritable(self.path):
-                file.write(text)
-                file.flush()
-
-        try:
-            yield append
-        finally:
-            with suppress(OSError):  # of what could not be flushed, which was reported
-                file.close()
+    def log(self, row: Mapping[str, Any]) -> None:
+        """Append a row to the training log."""
+        with reporting_unwritable(self.path), self.log_file.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row, allow_nan=False) + "\n")
 
     @property
     def logged_step(self) -> int:

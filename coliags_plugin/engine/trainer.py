@@ -151,7 +151,6 @@ class Trainer:
             self.costs.running(),
             deferred_stop() as interrupted,
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
-            self.run.log_writer() as log,
             closing(Followers(followers)) as following,
         ):
             while self.step < self.steps:
@@ -161,7 +160,7 @@ class Trainer:
                     raise self._out_of_memory(error) from error
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
                     row = {**row, "seconds": round(self.seconds, 3)}
-                    log(row)
+                    self.run.log(row)
                     following.logged(row)
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
                 following.stepped(self.step)
@@ -240,17 +239,10 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint of the current step."""
-        checkpoints.save_checkpoint(
-            self.run.checkpoints,
-            self.step,
-            self.method.name,
-            self.model,
-            self.optimizers,
-            self.strategy,
-            self.generators,
-            self.sampler,
-            self.costs.cost(),
-        )
+        tensors = checkpoints.training_tensors(self.model, self.optimizers, self.strategy, self.generators)
+        queue, cost = self.sampler.queue, self.costs.cost()
+        made = checkpoints.Checkpoint(self.step, self.method.name, queue, tensors, cost)
+        checkpoints.save_checkpoint(self.run.checkpoints, made)
 
     def provenance(self) -> JsonObject:
         """What the run is and is made with."""

@@ -31,9 +31,9 @@ _MOST = 0.7
 _SAVE_SECONDS, _KEPT = 60.0, 2
 #: What the results are that the page shows: of scenes, and of frames beside depth and flattened light.
 SCENE, PICTURES = "the scene to fly through: Gaussians, surface, coverage", "frames, depth, flattened light"
-#: Largest page of a scene, bytes: of the largest sub-map and of others. Its Gaussians are fitted for as many steps as
+#: Largest page of a scene: of the largest sub-map and of others. Its Gaussians are fitted for as many steps as
 #: were trained, but so many at most; not for a time, so that it is the same whatever machine made it.
-_PAGES, _MOST_FIT_STEPS = {True: 10_000_000, False: 4_000_000}, 2000
+_PAGES, _MOST_FIT_STEPS = {True: "10MB", False: "4MB"}, 2000
 #: Frames that are shown with their depth.
 _PICTURED = 4
 #: Training views that are evaluated, for comparison with those held out.
@@ -288,13 +288,14 @@ def coverage(context: StageContext) -> StageOutcome:
 
 def show(context: StageContext) -> StageOutcome:
     """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
+    from coliags_plugin.config.options import PageOptions
     from coliags_plugin.engine.trained import load_trained
     from coliags_plugin.export.viewer.page import save_page
 
     trained = load_trained(context.run, context.device, context.scene)
     depth_scale = _write_pictures(trained, context.run / "pictures")
     size, steps = _PAGES[context.submap.number == 0], min(trained.step, _MOST_FIT_STEPS)
-    page = save_page(trained, context.run / "scene.html", size, "recorded", math.inf, steps)
+    page = save_page(trained, PageOptions(size=size, seconds=math.inf), steps)
     files = {"run/scene.html": SCENE, "run/pictures": PICTURES}
     return StageOutcome(page.text, files, figures={"depth_scale": depth_scale})
 

@@ -21,6 +21,7 @@ from markupsafe import Markup
 from torch import Tensor
 from typing_extensions import Self
 
+from coliags_plugin.config.options import PageOptions
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
@@ -28,7 +29,7 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.baking import SECONDS, bake
+from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
@@ -50,8 +51,6 @@ _RATE = 10.0
 _REACH = 1024.0
 #: Share of the Gaussians, at either end, whose distance to the lamp, or exponent, is brought to those of the others.
 _RARE = 0.001
-#: Largest page, bytes.
-LARGEST_PAGE = 5_000_000
 #: Bytes of a page that a Gaussian takes, about: 22, compressed and in base 64.
 _BYTES = 24
 #: Room for the line about the Gaussians.
@@ -199,23 +198,16 @@ class ScenePage:
     facts: Mapping[str, Any]  # the figures
 
 
-def save_page(
-    trained: TrainedRun, output: Path, largest: int, light: str, seconds: float, most_steps: int | None = None
-) -> ScenePage:
-    """Write :func:`scene_page` to a file; an existing one is replaced."""
+def save_page(trained: TrainedRun, options: PageOptions, most_steps: int | None = None) -> ScenePage:
+    """Write :func:`scene_page` to a file, ``scene.html`` in the run folder by default; an existing one is replaced."""
+    output = options.output or trained.run.path / "scene.html"
     refuse_folder(output)
-    page = scene_page(trained, largest, light, seconds, most_steps)
+    page = scene_page(trained, options, most_steps)
     atomic_write(output, page.html)
     return page
 
 
-def scene_page(
-    trained: TrainedRun,
-    largest: int = LARGEST_PAGE,
-    light: str = "recorded",
-    seconds: float = SECONDS,
-    most_steps: int | None = None,
-) -> ScenePage:
+def scene_page(trained: TrainedRun, options: PageOptions | None = None, most_steps: int | None = None) -> ScenePage:
     """A run as an HTML page of at most so many bytes: its Gaussians, and the meshes in its folder.
 
     Gaussians are baked in a light, given by its name, as files are, with colours that do not depend on the direction,
@@ -225,11 +217,13 @@ def scene_page(
     (:func:`~coliags_plugin.export.baking.distillation.best_frame`). Of a method without Gaussians, the page shows the
     meshes.
     """
+    options = options or PageOptions()
+    largest = options.largest
     meshes = [_mesh_layer(name, read_mesh(file)) for name, file in mesh_files(trained.run.path).items()]
     frames = trained.scene.video
     path = CameraPath(frames, [adjusted_camera(trained, frame) for frame in frames], trained.training_frames)
     if isinstance(trained.model.field, GaussianField):
-        return _page_of_gaussians(trained, trained.model.field, path, meshes, largest, light, seconds, most_steps)
+        return _page_of_gaussians(trained, trained.model.field, path, meshes, options, most_steps)
     if not meshes:
         raise InputError(
             f"method '{trained.method}' has no Gaussians to draw in a browser, and its run no mesh",
@@ -257,17 +251,16 @@ def _page_of_gaussians(
     field: GaussianField,
     path: CameraPath,
     meshes: list[Layer],
-    largest: int,
-    light: str,
-    seconds: float,
+    options: PageOptions,
     most_steps: int | None,
 ) -> ScenePage:
+    light, largest = options.light, options.largest
     held = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     empty = len(_html(trained, path, meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
     kind = AttenuatedGaussians if held is None and field.knows_lamp else ExplicitGaussians
-    splats, baking = bake(trained, held, seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
+    splats, baking = bake(trained, held, options.seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
     first = best_frame(field_of_cloud(splats), trained, held)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
     while empty + (size := len(json.dumps(layer.packed))) > largest:

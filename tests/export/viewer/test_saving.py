@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.config.options import bytes_of
+from coliags_plugin.config.options import PageOptions, bytes_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.page import most_visible, scene_page
@@ -47,10 +47,10 @@ def test_a_small_page_has_the_most_visible_gaussians(anchors):
     whole = scene_page(trained)
     assert whole.facts["gaussians"] == whole.facts["baking"]["visible"]
     with pytest.raises(InputError) as error:
-        scene_page(trained, 1000)
+        scene_page(trained, PageOptions(size="1000"))
     empty = int(re.search(r"more than (\d+) bytes", str(error.value))[1])
     largest = empty + 10 * whole.facts["gaussians"]  # room for about half of them
-    small = scene_page(trained, largest)
+    small = scene_page(trained, PageOptions(size=str(largest)))
     assert len(small.html.encode()) <= largest
     assert 0.4 < small.facts["gaussians"] / whole.facts["gaussians"] < 0.6
     assert small.facts["cost"]["test"]["export"]["psnr"] > 10
