@@ -1,7 +1,8 @@
-"""PR-Endo from end to end: what training recovers of a lamp, and other lamps after training."""
+"""What training recovers of a lamp, learned numbers in results, other lamps after training, and flattened light."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
 
@@ -158,3 +159,38 @@ def test_a_method_without_a_lamp_is_refused_and_the_fields_with_one_are_listed(t
 
 def test_a_lamp_is_at_the_camera_unless_told_otherwise():
     assert Lamp().at_camera and not Lamp(offset=(1.0, 0.0, 0.0)).at_camera
+
+
+# Light that a method has learned
+
+
+@pytest.fixture(scope="module")
+def plus(wall, tmp_path_factory):
+    """A run of a few steps on the wall."""
+    return coliags_plugin.train("coliags-plus", wall, tmp_path_factory.mktemp("light") / "run", steps=4, device="cpu")
+
+
+def test_learned_numbers_are_in_the_metrics(plus):
+    result = plus.evaluate()
+    learned = result.provenance["learned"]
+    assert set(learned) == {"field", "exposure", "response"} and len(learned["field"]["distance_exponent"]) == 3
+    summary = json.loads((plus.path / "eval" / "paper" / "metrics.json").read_text())
+    assert summary["learned"] == learned
+
+
+def test_gains_at_a_bound_are_said(plus, caplog):
+    loaded = coliags_plugin.load_run(plus.path, device="cpu")
+    with torch.no_grad():
+        loaded.load().model.view_modules["exposure"].log_gain[3] = 90.0
+    loaded.evaluate()
+    name = loaded.load().scene.train[3].name
+    assert f"module 'exposure' is at a bound in 1 frames: {name}" in caplog.text
+
+
+def test_the_command_writes_flattened_views(plus, capsys):
+    run("render", str(plus.path), "--no-video", "--flatten")
+    assert not (plus.path / "relit" / "rgb_error").exists()
+    assert "distance" in (plus.path / "relit" / "lamp.yaml").read_text()
+    with pytest.raises(InputError, match="relit run"):
+        plus.flatten().evaluate()
+    assert "one of them" in refused(capsys, "render", str(plus.path), "--flatten", "--light", "power=2")

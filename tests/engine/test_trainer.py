@@ -14,7 +14,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
-from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.core.errors import DeviceMemoryError, InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,
@@ -24,6 +24,7 @@ from coliags_plugin.engine.checkpoints import (
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
+from tests.pretended_cuda import CUDA, PretendedCuda
 from tests.scenes import SMALL, wall_scene
 
 CPU = torch.device("cpu")
@@ -451,3 +452,31 @@ def test_provenance_says_where_the_run_came_from(tmp_path):
     assert "auto" in found["renderer_reason"]
     assert found["scene"]["provenance"]["fingerprint"] == "wall-9-True"
     assert software().items() <= found.items()
+
+
+# Memory of a device
+
+
+def test_frames_stay_on_the_cpu_where_they_would_fill_the_device(monkeypatch, tmp_path):
+    with PretendedCuda():
+        assert make_trainer(tmp_path, "3dgs", overrides=["renderer=torch"], device=CUDA).frames[0].image.is_cuda
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10_000, 2**34))
+        assert not make_trainer(tmp_path, "3dgs", overrides=["renderer=torch"], device=CUDA).frames[0].image.is_cuda
+
+
+def too_much(*args, **kwargs):
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
+
+
+TOLD = r"step 1, 2,464 elements: .* ran out \(CUDA out of memory.*2.00 GiB\).*whole.*points_count.*width.*--device cpu"
+
+
+def test_memory_that_runs_out_is_told(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path / "run", "3dgs")
+    trainer.start()
+    monkeypatch.setattr(trainer.model, "render_stages", too_much)
+    with pytest.raises(DeviceMemoryError, match=TOLD):
+        trainer.train()
+    monkeypatch.setattr(torch.nn.Module, "to", too_much)
+    with pytest.raises(DeviceMemoryError, match=TOLD):
+        make_trainer(tmp_path / "other", "3dgs")

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import coliags_plugin as cp
-from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light
@@ -26,27 +25,6 @@ from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, Explic
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from tests.commands import refused, run
 from tests.export.splats.clouds import PARTS, random_cloud
-from tests.scenes import SMALL, write_wall
-
-ANCHORS, OTHERS = parse_assignments(SMALL), parse_assignments([SMALL[0], SMALL[2]])
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
-
-
-@pytest.fixture(scope="module")
-def runs(scene, tmp_path_factory):
-    """Runs by method, trained for a few steps when first asked for."""
-    folder, made = tmp_path_factory.mktemp("runs"), {}
-
-    def trained(method, steps=3, settings=OTHERS):
-        if method not in made:
-            made[method] = cp.train(method, scene, folder / method, steps=steps, settings=settings)
-        return made[method]
-
-    return trained
 
 
 @pytest.fixture
@@ -55,10 +33,10 @@ def few_steps(monkeypatch):
     monkeypatch.setattr(distillation, "_MUCH", 0.0)
 
 
-def test_an_imported_export_renders_what_the_run_renders(runs, scene, tmp_path):
-    trained = runs("3dgs")
+def test_an_imported_export_renders_what_the_run_renders(run_of, wall, tmp_path):
+    trained = run_of("3dgs")
     (exported,) = trained.export(tmp_path / "wall.ply")
-    again = cp.import_splats(exported.file, scene, tmp_path / "imported")
+    again = cp.import_splats(exported.file, wall, tmp_path / "imported")
     assert again.method == "3dgs" and again.step == 0
     name = trained.frame_names()[0]
     ours, theirs = trained.render(name), again.render(name)
@@ -74,8 +52,8 @@ def test_an_imported_export_renders_what_the_run_renders(runs, scene, tmp_path):
     assert again.load().provenance["imported"]["gaussians"] == record["gaussians"]
 
 
-def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
-    trained = runs("coliags", settings=ANCHORS)
+def test_anchors_are_baked(anchors, wall, tmp_path, few_steps, capsys):
+    trained = anchors
     file = tmp_path / "wall.spz"
     assert run("export", trained.path, "--format", "spz", "--output", file, "--light", "flattened") == 0
     printed = capsys.readouterr().out
@@ -88,22 +66,22 @@ def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
     assert cost["cost"]["psnr"] == pytest.approx(cost["run"]["psnr"] - cost["export"]["psnr"])
     assert cost["psnr_between"] > 20
     assert record["sh_degree"] == 3 and record["gaussians"] == len(read_splats(file))
-    assert run("import", file, "--data", scene, "--output", tmp_path / "imported") == 0
+    assert run("import", file, "--data", wall, "--output", tmp_path / "imported") == 0
     imported = cp.load_run(tmp_path / "imported")
     assert imported.render(imported.frame_names()[0]).rgb.std() > 5
 
 
-def test_several_formats_are_of_one_baking(runs, tmp_path, few_steps):
-    exported = runs("coliags", settings=ANCHORS).export(tmp_path / "wall.any", "ply", "spz", measure=False)
+def test_several_formats_are_of_one_baking(anchors, tmp_path, few_steps):
+    exported = anchors.export(tmp_path / "wall.any", "ply", "spz", measure=False)
     assert [one.file.name for one in exported] == ["wall.ply", "wall.spz"]
     first, second = (read_splats(one.file) for one in exported)
     assert len(first) == len(second) and "dB" not in exported[0].text
     np.testing.assert_allclose(first.means, second.means, atol=2e-4)
 
 
-def test_distillation_comes_nearer_to_the_frames(runs, monkeypatch):
+def test_distillation_comes_nearer_to_the_frames(anchors, monkeypatch):
     """The run was hardly trained, and is no better than its averages; frames in its own light are the frames."""
-    trained = runs("coliags", settings=ANCHORS).load()
+    trained = anchors.load()
     frame = trained.scene.train[0]
     light = LightOfCamera(frame.camera)
     baked = field_of_cloud(bake(trained, light)[0])
@@ -125,8 +103,8 @@ def test_distillation_comes_nearer_to_the_frames(runs, monkeypatch):
     assert distillation.needs_distillation(baked, trained, light)
 
 
-def test_a_fit_of_so_many_steps_is_the_same_again(runs):
-    trained = runs("coliags", settings=ANCHORS).load()
+def test_a_fit_of_so_many_steps_is_the_same_again(anchors):
+    trained = anchors.load()
     first, second = (field_of_cloud(bake(trained, None)[0]) for _ in range(2))
     assert [distillation.distil(one, trained, None, math.inf, 5) for one in (first, second)] == [5, 5]
     for name, values in first.state_dict().items():
@@ -134,9 +112,9 @@ def test_a_fit_of_so_many_steps_is_the_same_again(runs):
 
 
 @pytest.mark.thorough
-def test_distilled_colours_fall_with_the_distance_to_the_lamp(runs, monkeypatch):
+def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatch):
     """As those of frames do, here of the run's own, which a colour that is the same from everywhere cannot."""
-    trained = runs("pr-endo").load()
+    trained = run_of("pr-endo").load()
     frames = trained.scene.train
     for index, frame in enumerate(frames):
         rgb = render_view(trained, frame, ("rgb", "alpha")).rgb
@@ -153,9 +131,9 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(runs, monkeypatch)
     assert made[0].attenuation is None and np.median(made[1].attenuation[:, 1]) > 0.0
 
 
-def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(runs):
+def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(run_of):
     """Cameras come nearer to the wall; what stands before the first one only is behind the others."""
-    trained = runs("3dgs").load()
+    trained = run_of("3dgs").load()
     cloud = cloud_of_field(trained.model.field)
     assert distillation.best_frame(field_of_cloud(cloud), trained, None) == 0
     before = trained.scene.train[0].camera.center.numpy().astype(np.float32) + np.float32([0.0, 0.0, 0.3])
@@ -166,8 +144,8 @@ def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(runs):
     assert distillation.best_frame(field_of_cloud(both), trained, None) == 1
 
 
-def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):
-    trained = runs("2dgs")
+def test_surfels_are_exported_thin_and_come_back_as_surfels(run_of, wall, tmp_path):
+    trained = run_of("2dgs")
     record = trained.export(tmp_path / "wall.ply", seconds=0.0)[0].record
     assert record["cost"]["test"]["psnr_between"] > 25
     thinnest = read_splats(tmp_path / "wall.ply").scales.min(axis=1)
@@ -182,19 +160,19 @@ def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_pat
     kept = [index for index, name in enumerate(names) if name != b"scale_2"]
     header = header.replace(b"property float scale_2\n", b"")
     (tmp_path / "discs.ply").write_bytes(header + b"end_header\n" + rows[:, kept].tobytes())
-    again = cp.import_splats(tmp_path / "discs.ply", scene, tmp_path / "discs")
+    again = cp.import_splats(tmp_path / "discs.ply", wall, tmp_path / "discs")
     assert again.method == "2dgs"
     np.testing.assert_allclose(again.load().model.field.scales.detach().numpy(), scales, atol=1e-5)
 
 
-def test_surfels_alone_of_explicit_gaussians_are_fitted(runs, few_steps):
-    assert bake(runs("2dgs").load(), None)[1]["steps"] == 3
-    assert bake(runs("3dgs").load(), None)[1] == {}
+def test_surfels_alone_of_explicit_gaussians_are_fitted(run_of, few_steps):
+    assert bake(run_of("2dgs").load(), None)[1]["steps"] == 3
+    assert bake(run_of("3dgs").load(), None)[1] == {}
 
 
 @pytest.mark.parametrize("method", ["coliags", "pr-endo"])
-def test_the_lamp_of_the_camera_itself_changes_nothing(runs, method):
-    trained = runs(method, settings=ANCHORS if method == "coliags" else OTHERS).load()
+def test_the_lamp_of_the_camera_itself_changes_nothing(run_of, method):
+    trained = run_of(method).load()
     camera = trained.scene.train[2].camera
     camera = replace(camera, camera_to_world=camera.camera_to_world.float())
     field = trained.model.field
@@ -212,9 +190,8 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(runs, method):
         pytest.param("scaffold-gs", marks=pytest.mark.thorough),
     ],
 )
-def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
-    explicit = method in ("pr-endo", "3dgs")
-    trained = runs(method, settings=OTHERS if explicit else ANCHORS).load()
+def test_fields_that_know_a_lamp_look_different_under_another(run_of, method):
+    trained = run_of(method).load()
     field, camera = trained.model.field, trained.scene.train[2].camera
     assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
     with torch.no_grad():
@@ -222,11 +199,11 @@ def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
     assert torch.equal(near, far) != field.knows_lamp
 
 
-def test_flattened_light_is_even_over_a_wall(runs):
+def test_flattened_light_is_even_over_a_wall(run_of):
     """Gaussians of one albedo and one normal look the same everywhere, however far they are."""
-    field = runs("pr-endo").load().model.field
+    field = run_of("pr-endo").load().model.field
     light = FlattenedLight(20.0, 1.0)
-    cameras = [frame.camera for frame in runs("pr-endo").load().scene.train]
+    cameras = [frame.camera for frame in run_of("pr-endo").load().scene.train]
     with torch.no_grad():
         near, far = (
             field.gaussians_in_light(replace(camera, camera_to_world=camera.camera_to_world.float()), light)
@@ -238,51 +215,51 @@ def test_flattened_light_is_even_over_a_wall(runs):
     assert float(difference.max()) < 0.05  # the mirrored part alone depends on the view
 
 
-def test_flattened_light_is_the_median_of_what_cameras_see(runs):
-    trained = runs("3dgs").load()
+def test_flattened_light_is_the_median_of_what_cameras_see(run_of):
+    trained = run_of("3dgs").load()
     light = flattened_light(trained.model, [frame.camera for frame in trained.scene.train])
     assert 15.0 < light.distance < 22.0 and 0.8 < light.cosine < 1.0
 
 
-def test_exports_that_cannot_be(runs, tmp_path, capsys, few_steps):
-    trained = runs("3dgs")
+def test_exports_that_cannot_be(run_of, anchors, tmp_path, capsys, few_steps):
+    trained = run_of("3dgs")
     (tmp_path / "there.ply").write_text("mine")
     assert "already exists" in refused(capsys, "export", trained.path, "--output", tmp_path / "there.ply")
     assert (tmp_path / "there.ply").read_text() == "mine"
     with pytest.raises(InputError, match="no format 'sog'"):
         trained.export(tmp_path / "a.sog", "sog")
     with pytest.raises(InputError, match="no light 'men'"):
-        runs("coliags", settings=ANCHORS).export(tmp_path / "a.ply", light="men")
+        anchors.export(tmp_path / "a.ply", light="men")
     with pytest.raises(InputError, match="relit"):
-        runs("pr-endo").relight(power=2.0).export(tmp_path / "a.ply")
-    radiance = runs("reim-nerf-small", 1, {})
+        run_of("pr-endo").relight(power=2.0).export(tmp_path / "a.ply")
+    radiance = run_of("reim-nerf-small", "field.width=8")
     assert "has no Gaussians" in refused(capsys, "export", radiance.path, "--output", tmp_path / "a.ply")
     assert "not a run folder" in refused(capsys, "export", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["there.ply"]
 
 
-def test_imports_that_cannot_be(runs, scene, tmp_path, capsys):
+def test_imports_that_cannot_be(wall, tmp_path, capsys):
     good, output = tmp_path / "good.ply", tmp_path / "run"
     write_splats(good, random_cloud(5), "ply")
     (tmp_path / "bad.ply").write_bytes(
         b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
         b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
     )
-    assert "compressed PLY" in refused(capsys, "import", tmp_path / "bad.ply", "--data", scene, "--output", output)
-    assert "no reader" in refused(capsys, "import", tmp_path / "a.glb", "--data", scene, "--output", output)
-    assert "cannot read" in refused(capsys, "import", tmp_path / "a.ply", "--data", scene, "--output", output)
+    assert "compressed PLY" in refused(capsys, "import", tmp_path / "bad.ply", "--data", wall, "--output", output)
+    assert "no reader" in refused(capsys, "import", tmp_path / "a.glb", "--data", wall, "--output", output)
+    assert "cannot read" in refused(capsys, "import", tmp_path / "a.ply", "--data", wall, "--output", output)
     refused(capsys, "import", good, "--data", tmp_path / "nowhere", "--output", output)
     assert not output.exists()
     output.mkdir()
     (output / "mine.txt").write_text("mine")
-    assert "already exists" in refused(capsys, "import", good, "--data", scene, "--output", output)
-    assert "not a run folder" in refused(capsys, "import", good, "--data", scene, "--output", output, "--overwrite")
+    assert "already exists" in refused(capsys, "import", good, "--data", wall, "--output", output)
+    assert "not a run folder" in refused(capsys, "import", good, "--data", wall, "--output", output, "--overwrite")
     assert (output / "mine.txt").read_text() == "mine"
 
 
-def test_a_file_of_another_world_is_imported_with_a_warning(scene, tmp_path, caplog):
+def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog):
     cloud = random_cloud(20)
     write_splat_ply(tmp_path / "far.ply", replace(cloud, means=cloud.means - np.float32(5000)))
     with caplog.at_level(logging.WARNING):
-        cp.import_splats(tmp_path / "far.ply", scene, tmp_path / "run")
+        cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
     assert "world frame and unit" in caplog.text

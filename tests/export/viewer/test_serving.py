@@ -313,9 +313,9 @@ def test_ctrl_c_ends_the_command_cleanly(anchors, request):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("method", "settings"), [("2dgs", {}), ("reim-nerf-small", {"field.width": 8})])
-def test_surfels_and_radiance_fields_are_drawn_too(run_of, method, settings):
-    run = run_of(method, *(f"{key}={value}" for key, value in settings.items()))
+@pytest.mark.parametrize("method", [("2dgs",), ("reim-nerf-small", "field.width=8")])
+def test_surfels_and_radiance_fields_are_drawn_too(run_of, method):
+    run = run_of(*method)
     with run.view(port=0) as viewer, connected(viewer) as (client, camera):
         client.set("Most pixels across", 64)
         client.look(replace(camera))

@@ -6,6 +6,7 @@ import pytest
 
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.method_config import load_method
 from tests.scenes import SMALL
 
 
@@ -16,8 +17,9 @@ def run_of(wall, tmp_path_factory):
 
     def trained(method, *settings):
         if method not in made:
-            folder = tmp_path_factory.mktemp("runs") / method
-            made[method] = cp.train(method, wall, folder, steps=2, settings=parse_assignments(settings))
+            small = SMALL if load_method(method).config.field.name == "anchors" else (SMALL[0], SMALL[2])
+            given, folder = parse_assignments([*small, *settings]), tmp_path_factory.mktemp("runs") / method
+            made[method] = cp.train(method, wall, folder, steps=2, settings=given)
         return made[method]
 
     return trained
@@ -25,4 +27,4 @@ def run_of(wall, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def anchors(run_of):
-    return run_of("coliags", *SMALL)
+    return run_of("coliags")
