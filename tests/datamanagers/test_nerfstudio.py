@@ -41,16 +41,15 @@ def opened(folder: Path, **options) -> Recording:
     return manager("nerfstudio", **options).open(folder)
 
 
-def write(folder: Path, lens: Lens | None = None, names: list[str] = NAMES, frame_keys=None, **content) -> Path:
+def write(folder: Path, lens: Lens | None = None, names: list[str] = NAMES, **content) -> Path:
     """The tilted wall, in millimetres, with points3D.ply beside it; ``content`` goes into the file, None out of it."""
     frames, directions = [], rays(lens or PINHOLE)
-    for index, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
+    for name, pose in zip(names, poses(len(names)), strict=True):
         depth, color = look(pose, directions)
         path = folder / (name if Path(name).suffix else f"{name}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), color[..., ::-1])
-        frame = {"file_path": name, "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
-        frames.append({**frame, **(frame_keys(index, depth) if frame_keys else {})})
+        frames.append({"file_path": name, "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()})
     points = pose[:3, 3] + depth.reshape(-1, 1) * directions.reshape(-1, 3) @ pose[:3, :3].T
     write_ply(folder / "points3D.ply", point_properties(points, np.full(points.shape, 128, np.uint8)))
     content = {"camera_model": "OPENCV", **CAMERA, "frames": frames, **content}
@@ -139,43 +138,14 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, mi
     assert any("undone" in remark for remark in after.provenance["pose_convention"]["remarks"])
 
 
-def depth_files(folder: Path, unit: float, suffix: str):
-    def keys(index, depth):
-        path = folder / f"depth/{index}{suffix}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if suffix == ".npy":
-            np.save(path, (depth / unit).astype(np.float32))
-        else:
-            cv2.imwrite(str(path), np.rint(depth / unit).astype(np.uint16))
-        return {"depth_file_path": f"depth/{index}{suffix}"}
-
-    return keys
-
-
-@pytest.mark.parametrize("suffix", [".png", ".npy"])
-@pytest.mark.parametrize(
-    ("unit", "content", "options"),
-    [
-        (1.0, {}, {}),
-        (0.01, {"depth_unit_scale_factor": 0.01}, {}),
-        (0.01, {"depth_unit_scale_factor": 0.5}, {"depth_unit_scale_factor": 0.01}),
-    ],
-    ids=["a millimetre unless said", "the file says", "an option says"],
-)
-def test_depth_files(tmp_path, unit, content, options, suffix):
-    folder = write(tmp_path, names=NAMES[:3], frame_keys=depth_files(tmp_path, unit, suffix), **content)
-    scene = load(folder, **options)
-    for frame in scene.train:
-        expected, _ = seen_from(frame, poses(3)[frame.index])
-        np.testing.assert_allclose(frame.depth.numpy(), expected, atol=0.51 * unit if suffix == ".png" else 1e-4)
-    assert scene.provenance["depth_unit"] == unit
-    assert off_wall(scene.points.positions.numpy()).max() < unit
-
-
-def test_depth_files_are_in_millimetres_without_a_factor(tmp_path):
-    folder = write(tmp_path, names=NAMES[:3], frame_keys=depth_files(tmp_path, 1.0, ".png"))
-    medians = [float(load(folder, unit=unit).train[0].depth.nanmedian()) for unit in ("mm", "m")]
-    assert medians[0] == pytest.approx(medians[1])
+def test_the_unit_of_depth_is_the_options_or_the_files_or_a_millimetre(copied):
+    folder = copied("nerfstudio")
+    depth = load(folder).train[1].depth
+    assert load(folder).provenance["depth_unit"] == 0.01
+    torch.testing.assert_close(load(folder, depth_unit_scale_factor=0.05).train[1].depth, 5.0 * depth, equal_nan=True)
+    change_json(FILE, depth_unit_scale_factor=None)(folder)
+    for unit in ("mm", "m"):  # of the poses
+        torch.testing.assert_close(load(folder, unit=unit).train[1].depth, 100.0 * depth, equal_nan=True)
 
 
 def test_masks_of_some_frames(mine):
@@ -215,22 +185,6 @@ def test_a_scene_whose_images_lie_elsewhere_has_to_be_trusted(mine, tmp_path, st
     with pytest.raises(InputError, match="outside_files=true"):
         load(mine)
     assert len(load(mine, outside_files=True).train) == 7
-
-
-@pytest.mark.parametrize(
-    ("write_bad", "message"),
-    [
-        (lambda path: np.save(path, np.zeros((HEIGHT, WIDTH, 3))), r"an array \[48, 64, 3\] of float64"),
-        (lambda path: np.save(path, np.zeros((HEIGHT, WIDTH), complex)), "complex128"),
-        (lambda path: np.save(path, np.array([None, {}])), "cannot read"),
-        (lambda path: path.write_bytes(path.read_bytes()[:300]), "cannot read"),
-    ],
-)
-def test_depth_arrays_of_another_kind(tmp_path, write_bad, message):
-    write(tmp_path, names=NAMES[:3], frame_keys=depth_files(tmp_path, 1.0, ".npy"))
-    write_bad(tmp_path / "depth/1.npy")
-    with pytest.raises(InputError, match=message):
-        load(tmp_path)
 
 
 def test_what_is_missing_for_training(mine):

@@ -13,7 +13,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import named_file, short_names
-from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.reading.images import depth_format, read_mask, resize_nearest, resize_rgb
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 
 # Images
@@ -66,6 +66,37 @@ def test_sizes_fit_the_papers_and_nothing_is_enlarged():
     assert fitted(800, 800, PAPER_SIZE) == (270, 270)
     assert fitted(3000, 10, PAPER_SIZE) == (338, 1)
     assert fitted(3000, 10, None) == (3000, 10)
+
+
+# Depth
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy"])
+def test_depth_files_hold_numbers_proportional_to_depth(tmp_path, suffix):
+    steps, path = np.array([[0.0, 1.0, 300.0], [25.0, 7.0, 65535.0]]), tmp_path / f"0{suffix}"
+    unknown = steps == 0.0
+    if suffix == ".npy":
+        steps = np.vstack([steps, [[-1.0, np.nan, np.inf]]]).astype(np.float32)
+        unknown = np.vstack([unknown, [[True] * 3]])
+        np.save(path, steps)
+    else:
+        cv2.imwrite(str(path), steps.astype(np.uint16))
+    form = depth_format(path, 0.02)
+    np.testing.assert_allclose(form.z_depth(form.read(path)), np.where(unknown, np.nan, 0.02 * steps), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((4, 5, 3)), r"an array \[4, 5, 3\] of float64"),
+        (np.zeros((4, 5), complex), "complex128"),
+        (np.array([None, {}]), "cannot read"),
+    ],
+)
+def test_depth_arrays_of_another_kind(tmp_path, array, message):
+    np.save(tmp_path / "0.npy", array)
+    with pytest.raises(InputError, match=message):
+        depth_format(tmp_path / "0.npy", 1.0).read(tmp_path / "0.npy")
 
 
 # Names of files

@@ -25,7 +25,6 @@ from coliags_plugin.checks.method.context import (
     CPU,
     CheckContext,
     MethodCheck,
-    as_in_new_process,
     components,
     difference,
     refuse,
@@ -120,8 +119,7 @@ def refuses_options(context: CheckContext) -> str:
 def builds(context: CheckContext) -> str:
     """The components fit one another and the scene."""
     context.scene = load_scene(context.loaded.config, context.data)
-    with as_in_new_process():
-        trainer = context.build("built")
+    trainer = context.build("built")
     if trainer.run.path.exists():
         raise CheckFailedError("the run folder was written before training began")
     numbers = sum(parameter.numel() for parameter in trainer.model.parameters())
@@ -160,10 +158,9 @@ def has_all_groups(context: CheckContext) -> str:
 @_check("trains", "builds")
 def trains(context: CheckContext) -> str:
     """A whole run ends, all its losses and parameters being finite."""
-    with as_in_new_process():
-        context.trainer = trainer = context.build("run")
-        trainer.start()
-        trainer.train()
+    context.trainer = trainer = context.build("run")
+    trainer.start()
+    trainer.train()
     context.rows = trainer.run.log_rows()
     spoilt = [name for name, value in trainer.model.named_parameters() if not torch.isfinite(value).all()]
     refuse((f"after {context.steps} steps these are not finite", spoilt))
@@ -194,8 +191,7 @@ def every_term_counts(context: CheckContext) -> str:
 @_check("learns", "trains")
 def error_falls(context: CheckContext) -> str:
     """Training brings the rendered training images closer to the recorded ones."""
-    with as_in_new_process():
-        before = _error(context.build("before"))
+    before = _error(context.build("before"))
     after = _error(context.trainer)
     change = f"mean colour error {before:.4f} before and {after:.4f} after {context.steps} steps"
     if not (math.isfinite(before) and after < before):
@@ -394,12 +390,11 @@ def loads(context: CheckContext) -> str:
 @_check("repeats", "renders again")
 def repeats(context: CheckContext) -> str:
     """A second run with the same seed has the same bits half-way."""
-    with as_in_new_process():
-        second = context.build("halves")
-        second.start()
-        while second.step < context.half:
-            second.take_step()
-        second.save()
+    second = context.build("halves")
+    second.start()
+    while second.step < context.half:
+        second.take_step()
+    second.save()
     context.compare(context.trainer, second, context.half, f"two runs of {context.half} steps from one seed")
     return f"{context.half} steps to the same bits"
 
@@ -407,10 +402,9 @@ def repeats(context: CheckContext) -> str:
 @_check("resumes", "loads", "repeats")
 def resumes(context: CheckContext) -> str:
     """Stopped half-way and resumed, a run ends in the bits of one that was not."""
-    with as_in_new_process():
-        resumed = context.build("halves")
-        resumed.resume()
-        resumed.train()
+    resumed = context.build("halves")
+    resumed.resume()
+    resumed.train()
     said = f"{context.half} steps, resumed for {context.steps - context.half}"
     context.compare(context.trainer, resumed, context.steps, said)
     return f"{context.half} + {context.steps - context.half} steps end in the bits of {context.steps}"
@@ -452,27 +446,25 @@ def keeps_rows_together(context: CheckContext) -> str:
         raise CheckSkippedError(f"strategy '{node.name}' changes no rows")
     method = context.load(_spread_out(node.settings, context.steps, context.loaded.config.schedule.written_for))
     copy, changed_at = context.folder / "events-resumed", 0
-    with as_in_new_process():
-        trainer = context.build("events", method=method)
-        trainer.start()
-        counts = [trainer.model.field.element_count]
-        if not counts[0]:
-            raise CheckFailedError(f"element_count of field '{context.loaded.config.field.name}' is 0: override it")
-        # Buffers of the field's parts may be of another kind.
-        of_rows = [name for name, length in _lengths(trainer)[0].items() if length == counts[0]]
-        while trainer.step < trainer.steps:
-            counts.append(_step_by_rows(trainer, of_rows))
-            if not changed_at and counts[-1] != counts[0]:
-                changed_at = trainer.step
-                trainer.save()
-                shutil.copytree(trainer.run.path, copy, dirs_exist_ok=True)
-        if not changed_at:
-            raise CheckSkippedError(f"no row came or went in {trainer.steps} steps ({trainer.strategy.plan()})")
-        trainer.save()
-    with as_in_new_process():
-        resumed = context.build(copy.name, method=method)
-        resumed.resume()
-        resumed.train()
+    trainer = context.build("events", method=method)
+    trainer.start()
+    counts = [trainer.model.field.element_count]
+    if not counts[0]:
+        raise CheckFailedError(f"element_count of field '{context.loaded.config.field.name}' is 0: override it")
+    # Buffers of the field's parts may be of another kind.
+    of_rows = [name for name, length in _lengths(trainer)[0].items() if length == counts[0]]
+    while trainer.step < trainer.steps:
+        counts.append(_step_by_rows(trainer, of_rows))
+        if not changed_at and counts[-1] != counts[0]:
+            changed_at = trainer.step
+            trainer.save()
+            shutil.copytree(trainer.run.path, copy, dirs_exist_ok=True)
+    if not changed_at:
+        raise CheckSkippedError(f"no row came or went in {trainer.steps} steps ({trainer.strategy.plan()})")
+    trainer.save()
+    resumed = context.build(copy.name, method=method)
+    resumed.resume()
+    resumed.train()
     context.compare(trainer, resumed, trainer.steps, f"resumed after the event of step {changed_at}")
     events = sum(a != b for a, b in pairwise(counts))
     return f"{counts[0]} to {counts[-1]} rows in {events} events; resumed after step {changed_at} to the same bits"
@@ -597,11 +589,10 @@ def copes_with_other_data(context: CheckContext) -> str:
     for what, change in _VARIANTS.items():
         begun = False
         try:
-            with as_in_new_process():
-                trainer = context.build("elsewhere", change(context.scene))
-                begun = True
-                _take_steps(trainer)
-                outcomes[what] = "trains"
+            trainer = context.build("elsewhere", change(context.scene))
+            begun = True
+            _take_steps(trainer)
+            outcomes[what] = "trains"
         except InputError as error:
             if begun:
                 raise CheckFailedError(f"{what}: refused only when training had begun: {error}") from error
@@ -618,10 +609,9 @@ def ignores_masked_pixels(context: CheckContext) -> str:
     """What is in masked pixels, NaN included, changes no loss and no parameter."""
     runs: list[tuple[list[dict[str, Any]], dict[str, Tensor]]] = []
     for spoilt in (False, True):
-        with as_in_new_process():
-            frames = [_masked(frame.to("cpu"), spoilt) for frame in context.scene.train]
-            trainer = context.build("masked", replace(context.scene, train=frames))
-            runs.append((_take_steps(trainer), trainer.model.state_dict()))
+        frames = [_masked(frame.to("cpu"), spoilt) for frame in context.scene.train]
+        trainer = context.build("masked", replace(context.scene, train=frames))
+        runs.append((_take_steps(trainer), trainer.model.state_dict()))
     (rows, first), (spoilt_rows, second) = runs
     for ours, theirs in zip(rows, spoilt_rows, strict=True):
         wrong = [key for key, value in ours["terms"].items() if theirs["terms"][key] != value]
@@ -689,7 +679,8 @@ def _run(check: MethodCheck, context: CheckContext, passed: set[str]) -> CheckRe
         return CheckResult(check.name, status, detail, time.monotonic() - start, trace)
 
     try:
-        with redirect_stderr(io.StringIO()):  # progress bars
+        # Progress bars are not shown; global random numbers, which :meth:`CheckContext.build` resets, go on as before.
+        with redirect_stderr(io.StringIO()), torch.random.fork_rng(devices=[]):
             return result("passed", check.run(context))
     except CheckSkippedError as reason:
         return result("skipped", str(reason))

@@ -6,7 +6,7 @@ import shutil
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -82,7 +82,12 @@ class CheckContext:
         return load_method_for(self.data, self.method, changes, self.data_format)
 
     def build(self, run: str, scene: Scene | None = None, method: LoadedMethod | None = None) -> Trainer:
-        """A trainer of the method on the scene, unless others are given; its run folder is not made yet."""
+        """A trainer of the method on the scene, unless others are given; its run folder is not made yet.
+
+        Global random numbers of torch are as they are when Python has just started: two runs in one process then draw
+        the same ones, as they would in two, and a resumed run does not go on with them.
+        """
+        torch.set_rng_state(torch.Generator().get_state())
         scene = scene or self.scene
         return Trainer(method or self.loaded, scene, str(self.data.resolve()), RunFolder(self.folder / run), SEED, CPU)
 
@@ -119,17 +124,6 @@ class MethodCheck:
     #: CheckSkippedError, or whatever a component raises.
     run: Callable[[CheckContext], str]
     needs: tuple[str, ...] = ()  # checks that must have passed
-
-
-@contextmanager
-def as_in_new_process() -> Iterator[None]:
-    """Global random numbers of torch as they are when Python has just started, and afterwards as they were.
-
-    Two runs in one process then draw the same ones, as they would in two; and a resumed run does not go on with them.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.set_rng_state(torch.Generator().get_state())
-        yield
 
 
 def difference(first: dict[str, Tensor], second: dict[str, Tensor]) -> str:
