@@ -13,7 +13,7 @@ from runpy import run_path
 import pytest
 import torch
 
-from coliags_plugin.checks.trial_views import INPUTS, strewn
+from coliags_plugin.checks.installation import INPUTS, strewn
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.scenes import write_wall
 

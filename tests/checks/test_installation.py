@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from coliags_plugin.checks import trial_views
+from coliags_plugin.checks import installation
 from coliags_plugin.checks.installation import check_installation
 from coliags_plugin.renderers import cpu_renderer, triton_renderer
 from tests.commands import refused, run
@@ -19,8 +19,8 @@ needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is
 @pytest.fixture
 def small(monkeypatch):
     """Trials of a few Gaussians on few pixels."""
-    monkeypatch.setattr(trial_views, "ACCURACY", (40, 24, 16))
-    monkeypatch.setattr(trial_views, "SPEED", (20, 16, 8))
+    monkeypatch.setattr(installation, "ACCURACY", (40, 24, 16))
+    monkeypatch.setattr(installation, "SPEED", (20, 16, 8))
 
 
 def checked(device="auto"):
