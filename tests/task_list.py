@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from coliags_plugin.execution.executors import Executor
-from coliags_plugin.execution.tasks import Task, TaskOutcome
+from coliags_plugin.execution.tasks import Executor, Task, TaskOutcome
 
 
 class TaskList(Executor):

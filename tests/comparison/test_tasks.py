@@ -13,8 +13,7 @@ import pytest
 
 from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.execution.executors import LocalExecutor
-from coliags_plugin.execution.tasks import TaskOutcome
+from coliags_plugin.execution.tasks import LocalExecutor, TaskOutcome
 
 
 @pytest.fixture

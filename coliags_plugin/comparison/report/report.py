@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_section
-from coliags_plugin.comparison.report.comparability import cautions, code_of, scene_provenance
 from coliags_plugin.comparison.report.costs import cost_table, training_device
-from coliags_plugin.comparison.report.leads import (
+from coliags_plugin.comparison.report.metric_tables import (
+    ALL_COLUMNS,
     EXPLANATION,
     choose_reference,
     compare,
     lead_table,
+    means_table,
+    metric_columns,
     stars,
     statistics_text,
 )
-from coliags_plugin.comparison.report.metric_tables import ALL_COLUMNS, means_table, metric_columns
-from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.sources import cautions, code_of, read_study, scene_provenance
 from coliags_plugin.comparison.report.study import MissingResult, Part, Study, StudyRun
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.core.errors import check_name

@@ -1,10 +1,12 @@
-"""Reading of what a report is made of: run folders, results files, and folders of a comparison."""
+"""Reading of what a report is made of; what makes results incomparable, and what merely limits their comparison."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from coliags_plugin.comparison.plan_file import (
     FAILURES,
@@ -14,13 +16,14 @@ from coliags_plugin.comparison.plan_file import (
     PlannedCell,
     read_plan,
 )
-from coliags_plugin.comparison.report.comparability import refuse_incomparable
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.scenes import held_out_uses
+from coliags_plugin.reporting.model import leaves
 from coliags_plugin.results.hashing import training_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
-from coliags_plugin.results.record import TRUTH_SUFFIX
+from coliags_plugin.results.record import TRUTH_SUFFIX, Result
 
 #: Below results and failures: scene, method, and seed with key.
 _CELL = "*/*/s*-*.json"
@@ -178,3 +181,173 @@ def _is_one_method(runs: Sequence[StudyRun]) -> bool:
 
 def _config_key(run: StudyRun) -> str:
     return training_key(run.result.config, "", run.result.steps, "")
+
+
+def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
+    """Refuse results that do not belong into one table."""
+    first: dict[tuple[str, str], StudyRun] = {}
+    for run in runs:
+        one, two = runs[0].result.protocol, run.result.protocol
+        if (one.name, one.version) != (two.name, two.version):
+            raise InputError(
+                f"{_title(runs[0])} was evaluated by protocol {one.name} version {one.version}, "
+                f"{_title(run)} by {two.name} version {two.version}",
+                "one protocol and version for every run: metrics of two protocols are not comparable",
+                "Run `coliags eval` again on the older run",
+            )
+        _refuse_other_data(first.setdefault((run.scene, run.result.scene.split), run), run)
+    _refuse_isolated(runs)
+
+
+def _refuse_other_data(first: StudyRun, other: StudyRun) -> None:
+    one, two = first.result, other.result
+    both = f"{_title(first)} and {_title(other)}"
+    if one.scene.size != two.scene.size:
+        (w1, h1), (w2, h2) = one.scene.size, two.scene.size
+        raise InputError(f"{both} are {w1} x {h1} and {w2} x {h2} px", "images of one size")
+    for name in {**one.sets, **two.sets}:
+        left, right = (result.sets[name].frames if name in result.sets else () for result in (one, two))
+        if left != right:
+            alone = ", ".join(sorted({*left} ^ {*right})[:2]) or "their order"
+            raise InputError(
+                f"{both} were evaluated on different frames (set '{name}' has {len(left)} and {len(right)} frames, "
+                f"which differ in {alone})",
+                "the same held-out frames for every run",
+                "Evaluate both on the same data and split",
+            )
+    if one.scene.train != two.scene.train:
+        raise InputError(
+            f"{both} were trained on different frames ({len(one.scene.train)} and {len(two.scene.train)})",
+            "the same training frames for every run",
+            "Train both on the same split",
+        )
+    for name, part in one.sets.items():
+        if part.truth_sha256 != two.sets[name].truth_sha256:
+            raise InputError(
+                f"{both}: their true images or depths of set '{name}' differ",
+                "runs of the same data",
+                "Train on one copy",
+            )
+
+
+def _refuse_isolated(runs: Sequence[StudyRun]) -> None:
+    """Refuse a method that no other one can be compared with."""
+    places: dict[str, set[tuple[str, str]]] = {}
+    for run in runs:
+        places.setdefault(run.method, set()).add((run.scene, run.result.scene.split))
+    for method, own in places.items():
+        others = {each for other, theirs in places.items() if other != method for each in theirs}
+        if others and not own & others:
+            one, two = (
+                ", ".join(sorted(f"{scene} by split '{split}'" for scene, split in each)) for each in (own, others)
+            )
+            raise InputError(
+                f"no scene and split in common: {method} has {one}, the other methods have {two}",
+                "methods on the same scenes and splits",
+                "Write one report for each scene, or train on the same split",
+            )
+
+
+def _title(run: StudyRun) -> str:
+    return f"{run.method} on {run.scene} ({run.stamp})"
+
+
+def cautions(study: Study) -> list[str]:
+    """Differences between the results that limit their comparison, and scenes that methods lack."""
+    results = [run.result for run in study.runs]
+    texts = [*_missing_scenes(study), *_unpaired_seeds(study), *_codes(study)]
+    steps = {method: sorted({run.result.steps for run in own}) for method, own in study.by_method.items()}
+    if len({run.steps for run in results}) > 1:
+        each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())
+        texts.append(f"The runs were trained for different numbers of steps: {each}.")
+    # How view modules treat held-out views (gains, pose corrections), if the methods differ in it.
+    treated = {name: own[0].result.provenance.get("untrained_views") or {} for name, own in study.by_method.items()}
+    if any(own != treated[study.methods[0]] for own in treated.values()):
+        texts += [f"{method}, {name}: {what}." for method, own in treated.items() for name, what in own.items()]
+    for run in study.runs:
+        warnings = {name: part.transparency_warning for name, part in run.result.sets.items()}
+        texts += [f"{run.method} on {run.scene}, set {name}: {text}." for name, text in warnings.items() if text]
+    uses = {
+        f"{run.scene}, split {run.result.scene.split}: {use}.": None
+        for run in study.runs
+        for use in held_out_uses(run.result.provenance.get("held_out_used", {}))
+    }
+    texts += uses
+    sizes = dict.fromkeys(result.scene.size for result in results)
+    if len(sizes) > 1:
+        each = ", ".join(f"{width} x {height}" for width, height in sizes)
+        texts.append(f"The scenes have images of different sizes: {each} px.")
+    differing: dict[str, None] = {}
+    for scene in study.scenes:
+        data = [dict(leaves(scene_provenance(result))) for result in results if result.scene.name == scene]
+        keys = (key for one in data for key in one)
+        differing |= {key: None for key in keys if any(one.get(key) != data[0].get(key) for one in data)}
+    if differing:
+        texts.append(f"Runs of one scene record different data, see Provenance: {', '.join(differing)}.")
+    return texts
+
+
+def _missing_scenes(study: Study) -> list[str]:
+    places = dict.fromkeys((run.scene, run.result.scene.split) for run in study.runs)
+    texts = []
+    for method, runs in study.by_method.items():
+        own = {(run.scene, run.result.scene.split) for run in runs}
+        lacking = dict.fromkeys(scene for scene, split in places if (scene, split) not in own)
+        if lacking:
+            texts.append(
+                f"{method} has no result of {', '.join(lacking)}: means and tests are over the scenes that the "
+                "compared methods have in common."
+            )
+    return texts
+
+
+def _unpaired_seeds(study: Study) -> list[str]:
+    seeds: dict[tuple[str, str], dict[str, set[int]]] = {}
+    for run in study.runs:
+        by_method = seeds.setdefault((run.scene, run.result.scene.split), {})
+        by_method.setdefault(run.method, set()).add(run.result.seed)
+    differing = []
+    for (scene, _), methods in seeds.items():
+        if len({frozenset(own) for own in methods.values()}) > 1:
+            each = "; ".join(f"{method}: {', '.join(map(str, sorted(own)))}" for method, own in methods.items())
+            differing.append(f"{scene} ({each})")
+    if not differing:
+        return []
+    more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
+    return [
+        f"The methods were trained with different seeds on {differing[0]}{more}; a mean over more seeds varies less."
+    ]
+
+
+def _codes(study: Study) -> list[str]:
+    """Which results come from which code, if not all are of one."""
+    by_code: dict[str, list[StudyRun]] = {}
+    for run in study.runs:
+        by_code.setdefault(code_of(run.result), []).append(run)
+    texts = []
+    for code, runs in by_code.items():
+        counts = {
+            method: (count, len(study.by_method[method]))
+            for method, count in Counter(run.method for run in runs).items()
+        }
+        own = [
+            method if count == total else f"{method} ({count} of {total})" for method, (count, total) in counts.items()
+        ]
+        commits = dict.fromkeys(str(run.result.software["git"]) for run in runs if run.result.software.get("git"))
+        commit = f" (commit {', '.join(commits)})" if commits else ""
+        texts.append(f"{code}{commit}: {', '.join(own)}")
+    return [f"The results come from different code: {'; '.join(texts)}."] if len(texts) > 1 else []
+
+
+def code_of(result: Result) -> str:
+    """Key of the code that trained and evaluated."""
+    training, evaluated = result.provenance.get("training", {}), str(result.software.get("code"))
+    codes = [training.get("code", evaluated), *(change["code"] for change in training.get("code_changes", []))]
+    trained = ", then ".join(dict.fromkeys(map(str, codes)))
+    return evaluated if trained == evaluated else f"{trained}, evaluated by {evaluated}"
+
+
+def scene_provenance(result: Result) -> dict[str, Any]:
+    """What is recorded of a result's data."""
+    recorded = result.provenance.get("scene")
+    return {"fingerprint": result.scene.fingerprint, **(recorded if isinstance(recorded, Mapping) else {})}

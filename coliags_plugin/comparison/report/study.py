@@ -122,7 +122,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Study:
-    """Comparable results; see :func:`coliags_plugin.comparison.report.comparability.refuse_incomparable`."""
+    """Comparable results; see :func:`coliags_plugin.comparison.report.sources.refuse_incomparable`."""
 
     runs: tuple[StudyRun, ...]  # at least one
     missing: tuple[MissingResult, ...] = ()  # cells without a result

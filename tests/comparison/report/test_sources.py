@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from coliags_plugin.comparison.report.leads import compare
+from coliags_plugin.comparison.report.metric_tables import compare
 from coliags_plugin.comparison.report.report import Choices, report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.core.errors import InputError
