@@ -113,7 +113,7 @@ class LightOfCamera(HeldLight):
 
 @dataclass(frozen=True)
 class FlattenedLight(HeldLight):
-    """The same light everywhere, which falls on every surface along its normal."""
+    """Light that is alike everywhere, and falls on every surface along its normal."""
 
     distance: float  # to the lamp, scene units
     cosine: float  # of the angle to the lamp's axis

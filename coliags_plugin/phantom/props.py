@@ -1,4 +1,4 @@
-"""What covers the wall in an image: fluid, bubbles, a tool, and drops of water on the lens.
+"""Covers of the wall in an image: fluid, bubbles, a tool, and drops of water on the lens.
 
 Bodies are triangle meshes, in the world or fixed to the camera, that are drawn over the radiance of the wall.
 """

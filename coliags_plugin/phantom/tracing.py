@@ -23,11 +23,11 @@ class Hits:
     barycentric: Float[np.ndarray, "N 2"]  # weights of the second and third corner
 
     def kept(self) -> Hits:
-        """Those of the rays that hit the wall."""
+        """Hits of the rays that meet the wall."""
         return self.only(self.found)
 
     def only(self, keep: Bool[np.ndarray, "N"]) -> Hits:
-        """Those of some of the rays."""
+        """Hits of some of the rays."""
         return Hits(self.found[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
 
 
@@ -99,13 +99,7 @@ def seen_from(
         if not len(open_points):
             break
         local = (points[open_points] - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
-        pixels = lens.project(local)
-        with np.errstate(invalid="ignore"):
-            column, row = np.floor(pixels).T
-            framed = (column >= 0) & (row >= 0) & (column < lens.width) & (row < lens.height) & (local[:, 2] > 0.0)
-        inside = np.flatnonzero(framed)
-        inside = inside[mask[row[inside].astype(int), column[inside].astype(int)]]
-        candidates = open_points[inside]
+        candidates = open_points[lens.shows(local, mask)]
         visible = tracer.visible(points[candidates], camera_to_world[:3, 3])
         seen[candidates[visible]] = True
         open_points = open_points[~seen[open_points]]

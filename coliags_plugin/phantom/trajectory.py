@@ -83,7 +83,7 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
 
 
 def _farthest(is_clear: Callable[[float], bool], most: float, steps: int) -> float:
-    """How far one can go, up to ``most``, by so many bisections."""
+    """Largest clear amount, up to ``most``, by so many bisections."""
     low, high = 0.0, most
     for _ in range(steps):
         middle = 0.5 * (low + high)

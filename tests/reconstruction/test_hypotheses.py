@@ -19,7 +19,7 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     CameraSettings,
     Picture,
     Start,
-    calibrated_camera,
+    camera_of_lens,
     distortion,
     field_of_view,
     is_refined,
@@ -214,7 +214,7 @@ def test_brightness_is_the_mean_around_a_pixel():
 
 
 def test_c3vd_at_full_size_is_the_official_calibration():
-    model, params = calibrated_camera("c3vd", 1350, 1080)
+    model, params = camera_of_lens(LENSES[CALIBRATED["c3vd"]], "", 1350, 1080)
     assert model == "OPENCV_FISHEYE"
     # REIM-NeRF's c3vd_calib.json, whose pixel centres are at integers.
     expected = (767.3861511125845, 767.5058656118406, 679.554265997005, 544.146891684636)
@@ -223,7 +223,7 @@ def test_c3vd_at_full_size_is_the_official_calibration():
 
 
 def test_undistorted_images_are_those_of_the_legacy_pinhole():
-    model, params = calibrated_camera("c3vd-undistorted", 675, 540)
+    model, params = camera_of_lens(LENSES[CALIBRATED["c3vd-undistorted"]], "", 675, 540)
     assert model == "PINHOLE"
     assert params == pytest.approx((401.1595, 400.9425, 0.5 * (668.286 + 0.5), 0.5 * (547.733 + 0.5)))
 
@@ -262,7 +262,7 @@ def test_known_cameras_have_one_start_and_are_kept(options, refined, count):
 
 def test_crops_are_refused():
     with pytest.raises(InputError, match=r"--camera c3vd, and images of 800 x 800. Expected the whole frame"):
-        calibrated_camera("c3vd", 800, 800)
+        starting_cameras(CameraSettings(model="c3vd"), [], [(800, 800)], Start("c3vd", 1.0))
 
 
 @pytest.mark.parametrize("size", [(200, 120), (120, 200)])

@@ -65,6 +65,18 @@ class Lens(ABC):
         NaN where the model does not reach and for points not in front of the camera.
         """
 
+    def shows(
+        self, points: Float[np.ndarray, "N 3"], mask: Bool[np.ndarray, "H W"] | None = None
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether points in camera axes fall into the image and, where there is a mask, on its pixels."""
+        pixels = self.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = np.asarray(((pixels >= 0.0) & (pixels < (self.width, self.height))).all(axis=1))
+        if mask is not None:
+            column, row = np.where(inside[:, None], pixels, 0.0).astype(int).T
+            inside &= mask[row, column]
+        return inside
+
     @property
     @abstractmethod
     def pinhole(self) -> Intrinsics:
@@ -277,7 +289,7 @@ class _FocalLens(CalibratedLens):
 
     @abstractmethod
     def _radius_of_tangent(self, tangent: Array) -> Array:
-        """What the model bends: the tangent itself or its angle."""
+        """The radius that the model bends: the tangent itself or its angle."""
 
     @abstractmethod
     def _tangent_of_radius(self, radius: Array) -> Array:

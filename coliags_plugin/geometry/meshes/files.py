@@ -225,7 +225,7 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
 
 
 def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """The same of faces that are all triangles of the form ``v`` or ``v/vt``, much faster; None of others."""
+    """Corners of faces that are all triangles of the form ``v`` or ``v/vt``, much faster; None of others."""
     if max(map(len, faces), default=0) > _LONGEST_TRIANGLE:
         return None
     text = "\n".join(faces)

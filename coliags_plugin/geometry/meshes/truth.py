@@ -105,7 +105,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class SurfaceComparison:
-    """How a reconstructed surface compares with the true one."""
+    """Comparison of a reconstructed surface with the true one."""
 
     accuracy: Direction  # from the reconstructed to the whole true surface
     completeness: Direction  # from the seen true to the reconstructed surface

@@ -136,7 +136,7 @@ def _neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"
 def difference_from_neighbours(
     pixels: Float[np.ndarray, "K 2"], log_depth: Float[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K"]:
-    """How far log depths of one frame are from half of the nearest observations; NaN in a frame with too few."""
+    """Difference of log depths of one frame from half of the nearest observations; NaN in a frame with too few."""
     if len(pixels) <= _NEIGHBOURS:
         return np.full(len(pixels), np.nan)
     nearest = np.asarray(cKDTree(pixels).query(pixels, _NEIGHBOURS + 1)[1])[:, 1:]

@@ -58,7 +58,7 @@ class LightPrior:
         return np.asarray((columns @ fitted).reshape(known.shape), np.float32)
 
     def described(self) -> str:
-        """What determines the prior, to tell whether work files are of the same one."""
+        """Name of the prior, by which work files of another one are told."""
         return "light"
 
 
@@ -113,7 +113,7 @@ class FilePrior:
         return prior
 
     def described(self) -> str:
-        """What determines the prior: names and a hash of the contents."""
+        """Hash of the maps' names and contents."""
         digest = hashlib.sha256()
         for name, path in self.files.items():
             digest.update(name.encode() + path.read_bytes())
@@ -242,7 +242,7 @@ def complete(log_known: Map, support: Map, belief: Map, log_prior: Map, intensit
 
 
 def first_belief(log_known: Map, support: Map, log_prior: Map, rim: Mask) -> Map:
-    """How much of a sweep without a surface to start from is believed, 0 to 1.
+    """Belief in a sweep without a surface to start from, 0 to 1.
 
     Large windows make a near surface too wide at its edges: there, its rim (:func:`near_rim`) has little weight, and
     the edges of the image decide. Depth with little support that is far off the prior is not believed.

@@ -42,7 +42,7 @@ _VOXEL = 2.0
 
 @dataclass(frozen=True)
 class DepthRequest:
-    """What is asked for."""
+    """Request for the depth of a scene."""
 
     settings: DepthEstimationSettings
     near_far: tuple[float, float] | None = None  # depth range, scene units; None: found
@@ -51,7 +51,7 @@ class DepthRequest:
 
 
 class EstimatedDepth(NamedTuple):
-    """What is said of estimated depth."""
+    """Summary of estimated depth, in words."""
 
     summary: str
     warnings: list[str]  # for each reason, which frames have confidence 0 throughout

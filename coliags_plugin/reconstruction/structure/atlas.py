@@ -42,7 +42,7 @@ _LEAST_ANGLE = 0.5
 
 @dataclass(frozen=True)
 class Again:
-    """How the wall seen before a place was found again after it.
+    """Record that the wall seen before a place was found again after it.
 
     ``similarity``, where the models were not made one, leads from the world of the later to that of the earlier one:
     three rows of scale times rotation, and translation.

@@ -56,7 +56,7 @@ def write_sfm_scene(
 
 
 def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:
-    """What ``atlas.json`` holds. Frames are numbered from 0 in the order of the images."""
+    """Contents of ``atlas.json``. Frames are numbered from 0 in the order of the images."""
     submaps = []
     for number, span in atlas.submaps():
         model = atlas.models[number]

@@ -91,7 +91,7 @@ class Hypothesis:
 
     @property
     def focal_length(self) -> float:
-        """Of the first camera, pixels."""
+        """Focal length of the first camera, pixels."""
         return float(next(iter(self.model.cameras.values())).mean_focal_length())
 
     @property
@@ -101,7 +101,7 @@ class Hypothesis:
 
     @property
     def distortion(self) -> float:
-        """Of the first camera, at the border."""
+        """Distortion by the first camera, at the border."""
         return distortion(next(iter(self.model.cameras.values())))
 
     @property
@@ -114,7 +114,7 @@ class Hypothesis:
         return all(plausible[0] <= view <= plausible[1] for view in self.fields_of_view)
 
     def described(self) -> str:
-        """What tells it from others, in words."""
+        """Camera, counts, error and light in words."""
         light = "unknown" if self.correlation is None else f"{self.correlation:.2f}"
         return (
             f"{self.camera_model}, focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees), "
@@ -166,7 +166,7 @@ def is_ambiguous(hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible
 
 
 def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those that explain the images as well as any."""
+    """Models that explain the images as well as any."""
     images = max((one.images for one in hypotheses), default=0)
     left = [one for one in hypotheses if one.images >= _ENOUGH_IMAGES * images]
     observations = max((one.observations for one in left), default=0)

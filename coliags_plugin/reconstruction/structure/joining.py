@@ -131,12 +131,12 @@ class _Posed:
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
-        """Of the camera, world."""
+        """Position of the camera, world."""
         return np.asarray(-self.pose[:, :3].T @ self.pose[:, 3])
 
     @property
     def depths(self) -> Float[np.ndarray, "K"]:
-        """Of the points."""
+        """Depths of the points."""
         return np.asarray(self.points @ self.pose[2, :3] + self.pose[2, 3])
 
 

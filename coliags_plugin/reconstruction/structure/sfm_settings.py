@@ -216,11 +216,6 @@ def is_refined(settings: CameraSettings) -> bool:
     return not has_known_camera(settings) if settings.refine is None else settings.refine
 
 
-def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and parameters of a known camera, scaled to the size of images that show its whole frame."""
-    return camera_of_lens(LENSES[CALIBRATED[name]], f"--camera {name}", width, height)
-
-
 def camera_of_lens(whole: Lens, said: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
     """COLMAP's model and parameters of a lens, scaled to images of its whole frame; ``said`` names it in errors."""
     if abs((width / height) / (whole.width / whole.height) - 1.0) > _ASPECT_TOLERANCE:
@@ -253,7 +248,7 @@ def starting_cameras(
     for width, height in dict.fromkeys(sizes):
         model, params = start.model, settings.params
         if model in CALIBRATED:
-            model, params = calibrated_camera(model, width, height)
+            model, params = camera_of_lens(LENSES[CALIBRATED[model]], f"--camera {model}", width, height)
         focal_length = start.focal_factor * max(width, height)
         camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, width, height)
         if start.radial is not None:

@@ -1,1 +1,1 @@
-"""What a camera saw of a surface, and what it missed."""
+"""Coverage: surface that a camera saw, and surface that it missed."""

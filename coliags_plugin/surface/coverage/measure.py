@@ -56,13 +56,13 @@ class MissedRegion:
 
     @property
     def diameter(self) -> float:
-        """Of the circle of the same area, mm."""
+        """Diameter of the circle of the same area, mm."""
         return float(2.0 * np.sqrt(self.area / np.pi))
 
 
 @dataclass(frozen=True, eq=False)
 class SeenWall:
-    """What a recording shows of a wall, F triangles."""
+    """Wall of F triangles, and how a recording shows it."""
 
     mesh: TriangleMesh  # the reconstructed wall and, behind it in the order of triangles, the guessed wall
     guessed: Bool[np.ndarray, "F"]  # triangles whose place is a guess, because nothing was reconstructed there
@@ -84,14 +84,14 @@ class SeenWall:
 
 @dataclass(frozen=True, eq=False)
 class PartialCoverage(SeenWall):
-    """What a recording shows of the reconstructed wall alone, where no section of a lumen can be measured."""
+    """Coverage of the reconstructed wall alone, where no section of a lumen can be measured."""
 
     reason: str  # why there is no section
 
 
 @dataclass(frozen=True, eq=False)
 class WallCoverage(SeenWall):
-    """What a recording shows of a section of a lumen, mm, and what it misses there."""
+    """Coverage of a section of a lumen, mm, and the regions that a recording misses there."""
 
     line: Centreline  # of the lumen
     arc: Float[np.ndarray, "F"]  # place of each triangle along the centreline, mm
@@ -168,7 +168,7 @@ def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool
 
 
 def _extended(views: FaceViews, more: int) -> FaceViews:
-    """The same with unseen triangles behind."""
+    """Views of the triangles, with unseen ones behind."""
     unseen = {"best_frame": -1, "frames": 0, "clear_frames": 0, "good_frames": 0}
     added = {name: np.full(more, unseen.get(name, np.nan), array.dtype) for name, array in vars(views).items()}
     return FaceViews(**{name: np.concatenate([array, added[name]]) for name, array in vars(views).items()})
@@ -208,14 +208,7 @@ def _nearest_view(points: Float[np.ndarray, "N 3"], views: Sequence[CoverageView
     merits = []
     for view in views:
         local = (points - view.center) @ view.camera_to_world[:3, :3]
-        pixels = view.lens.project(local)
-        with np.errstate(invalid="ignore"):
-            framed = (pixels >= 0.0) & (pixels < np.array([view.lens.width, view.lens.height]))
-        inside = np.asarray(framed.all(axis=1))
-        if view.mask is not None:
-            column, row = np.where(inside[:, None], pixels, 0.0).astype(int).T
-            inside = inside & view.mask[row, column]
-        merits.append(inside.mean() / (_NEAR + np.linalg.norm(local, axis=1).mean()))
+        merits.append(view.lens.shows(local, view.mask).mean() / (_NEAR + np.linalg.norm(local, axis=1).mean()))
     return int(np.argmax(merits))
 
 

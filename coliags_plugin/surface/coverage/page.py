@@ -196,7 +196,7 @@ def coverage_page(
 
 
 def _levels_note(settings: CoverageSettings) -> str:
-    """What the levels mean."""
+    """Meaning of the levels."""
     near = f" from at most {settings.far:g} mm" if np.isfinite(settings.far) else ""
     return (
         f"Seen: {settings.glance_frames} frames or more show the surface{near}, in pixels of a grey value of "

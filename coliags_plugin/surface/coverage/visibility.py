@@ -1,4 +1,4 @@
-"""What a camera recorded, and which triangles of a mesh it saw, how often and how well, by casting its viewing rays.
+"""Recorded views, and the triangles of a mesh that they saw, how often and how well, by casting viewing rays.
 
 Rays go through the lens of the stored images, which are not undistorted.
 """
@@ -28,7 +28,7 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
 
 class CoverageSettings(Settings):
-    """What counts as seen, and which missed regions are listed. Lengths are mm."""
+    """Options of what counts as seen, and of which missed regions are listed. Lengths are mm."""
 
     max_distance: float = Field(default=100.0, gt=0.0)  # farthest z-depth at which surface counts as seen, mm
     far: float = Field(default=60.0, gt=0.0)  # surface that no frame shows from nearer is seen too far away, mm
@@ -172,7 +172,7 @@ _PROBE_FRAMES, _PROBE_RAYS = 8, 20_000
 
 @dataclass(frozen=True, eq=False)
 class FaceViews:
-    """How the frames of a recording saw each triangle of a mesh. All [F]."""
+    """Counts and extremes over the frames that saw each triangle of a mesh. All [F]."""
 
     frames: Int[np.ndarray, "F"]  # number of frames that saw it at all
     clear_frames: Int[np.ndarray, "F"]  # those that saw it near enough and bright enough
@@ -203,7 +203,7 @@ class RayHits:
 def view_hits(
     mesh: TriangleMesh, view: CoverageView, grid: RayGrid, max_depth: float, both_sides: bool = False
 ) -> RayHits:
-    """What the rays of a view hit first, up to a z-depth in mm, from the front; or, cosines below 0, from behind."""
+    """First hits of the rays of a view, up to a z-depth in mm, from the front; or, cosines below 0, from behind."""
     rays = grid.world_rays(view)
     triangle, z_depth = mesh.rays.cast(view.center, rays)
     hit = np.flatnonzero((triangle >= 0) & (z_depth <= max_depth))
@@ -345,7 +345,7 @@ class _Tally:
 
 
 class Level(IntEnum):
-    """How well a piece of surface was seen."""
+    """Level at which a piece of surface was seen."""
 
     UNSEEN = 0
     POOR = 1

@@ -15,6 +15,7 @@ from torch import Tensor
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.datamanagers.recording import portable_name
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
@@ -79,7 +80,7 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Fused
 
 
 def images_of(trained: TrainedRun, settings: MeshSettings) -> Callable[[DepthView], UInt8[Tensor, "H W 3"]]:
-    """What gives the image to colour by of a view: the frame as recorded, or rendered in flattened light."""
+    """A function from a view to the image to colour by: the frame as recorded, or rendered in flattened light."""
     if settings.color == "plain":
         return lambda view: view.frame.image.cpu()
     light = held_light("flattened", trained.model, [frame.camera for frame in trained.scene.train])
@@ -163,7 +164,7 @@ def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, 
 
 
 def _same_world(scene: Scene, truth: Path) -> Scene:
-    """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
+    """Accept the truth of a scene with the same poses for one of unknown scale, which then shares its scale."""
     if not truth.is_dir():
         raise InputError(
             f"scene '{scene.name}' is of unknown scale, {truth} in mm",
@@ -209,17 +210,9 @@ def _summary(
         "texture": None if fused.texture is None else fused.texture.image.shape[0],
         "area": float(mesh.areas.sum()),
         "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
-        "truth": None if truth is None else _relative_path(truth.path, scene),
+        "truth": None if truth is None else portable_name(truth.path.resolve(), scene.folder or Path()),
         "comparison": None if compared is None else compared.as_json(),
     }
-
-
-def _relative_path(path: Path, scene: Scene) -> str:
-    """The path of a file in the scene's folder, or the name of another."""
-    file = path.resolve()
-    if scene.folder is not None and file.is_relative_to(scene.folder):
-        return file.relative_to(scene.folder).as_posix()
-    return file.name
 
 
 def comparison_blocks(compared: SurfaceComparison) -> list[Block]:

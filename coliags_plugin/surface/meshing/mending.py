@@ -148,7 +148,7 @@ def _bent_least(mesh: TriangleMesh, known: int) -> TriangleMesh:
 
 
 def _sightings(mesh: TriangleMesh, views: Sequence[DepthView]) -> Float[np.ndarray, "V"]:
-    """Of each vertex, views that see wall there, from its front, less those that see through it. [V]"""
+    """Number of views that see wall at each vertex, from its front, less those that see through it. [V]"""
     places = torch.from_numpy(mesh.vertices).double()
     normals = torch.from_numpy(mesh.to_open3d().compute_vertex_normals().vertex.normals.numpy()).double()
     total = torch.zeros(len(places))

@@ -128,7 +128,7 @@ def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[Dept
 
 
 def trust(frame: Frame) -> Float[Tensor, "H W"]:
-    """How far the pixels of a frame show the wall: the confidence of its depth, and little at highlights. [H, W]"""
+    """Trust that the pixels of a frame show the wall: the confidence of its depth, and little at highlights. [H, W]"""
     glints = torch.from_numpy(dilated(highlights(image_and_mask(frame)[0], FeatureSettings()), _MARGIN))
     confidence = 1.0 if frame.depth_confidence is None else frame.depth_confidence.cpu()
     return torch.where(glints, _GLINT, 1.0) * confidence
