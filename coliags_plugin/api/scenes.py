@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coliags_plugin.config.assignments import assignments, parse_assignments
-from coliags_plugin.config.options import CoverageOptions, takes
+from coliags_plugin.config.options import CoverageOptions, ReconstructOptions, takes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing
 
@@ -89,35 +89,11 @@ def coverage_settings(options: CoverageOptions) -> CoverageSettings:
     return validated(CoverageSettings, given, "coverage option")
 
 
-def reconstruct(
-    video: str | Path,
-    output: str | Path,
-    *,
-    settings: Mapping[str, Any] | None = None,
-    mask: str | Path | None = None,
-    device: str = "auto",
-    overwrite: bool = False,
-    executor: str | None = None,
-    jobs: int | None = None,
-    threads: int | None = None,
-    ray_address: str | None = None,
-) -> Record:
+@takes(ReconstructOptions)
+def reconstruct(options: ReconstructOptions) -> Record:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
     What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
-
-    Args:
-        video: Video file, folder of one with its calibration, folder of images, or folder of a scene with poses.
-        output: Folder of the results.
-        settings: Of the stages by key path, for instance ``{"steps": 5000, "diameter": 40.0, "frames.every": 2}``.
-        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
-        device: ``auto``, ``cpu``, ``cuda`` (the first CUDA device) or ``cuda:N``.
-        overwrite: Repeat stages that were made with other settings, and what follows them.
-        executor: ``local``: in worker processes of this machine, sub-maps at the same time; ``ray``: of a Ray cluster.
-            None: in this process, one after the other, unless ``jobs`` are given.
-        jobs: Worker processes at a time; None: one per CPU, or per GPU.
-        threads: CPU threads of each; None: the CPUs divided by the jobs.
-        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
 
     Returns:
         The record: what each stage made, with which options, in what time; of a video that is longer than a segment
@@ -134,10 +110,11 @@ def reconstruct(
     from coliags_plugin.pipeline.reconstruct import reconstruct as run
     from coliags_plugin.pipeline.settings import ReconstructionSettings
 
-    chosen = settings_of(ReconstructionSettings, assignments(settings))
-    by_workers = executor is not None or jobs is not None
-    execution = ExecutionOptions(jobs, threads, device, executor or "local", ray_address) if by_workers else None
-    masked = None if mask is None else Path(mask)
+    chosen = settings_of(ReconstructionSettings, options.settings)
+    by_workers, where, execution = options.executor is not None or options.jobs is not None, options.device, None
+    if by_workers:
+        executor, address = options.executor or "local", options.ray_address
+        execution = ExecutionOptions(options.jobs, options.threads, where, executor, address)
+    device = choose_device("cpu" if by_workers else where)
     with progress_callback() as progress:
-        where = choose_device("cpu" if by_workers else device)
-        return run(Path(video), Path(output), chosen, where, masked, overwrite, progress, execution)
+        return run(options.video, options.output, chosen, device, options.mask, options.overwrite, progress, execution)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from inspect import signature
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -32,12 +31,6 @@ class CommandGroup:
     def run(self) -> None:
         """Execute the subcommand."""
         self.subcommand.run()
-
-
-def call(function: Callable[..., R], command: object, **others: object) -> R:
-    """Call a function with the options of a command that have the names of its arguments, and with others."""
-    names = [name for name in signature(function).parameters if name not in others and hasattr(command, name)]
-    return function(**{name: getattr(command, name) for name in names}, **others)
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,17 +19,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ReconstructCommand:
+class ReconstructCommand(options.ReconstructOptions):
     """Reconstruct a colon from a video alone: frames, poses, depth, training, mesh, coverage and report.
 
     Each stage is kept: repeated, the command goes on with what is missing, also after a kill.
     """
 
-    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
-    """Video file, folder of one with its calibration, folder of images ordered by the numbers in their names, or folder
-    of a scene with poses."""
-    output: options.Output
-    """Folder of the results."""
     camera: options.OptionalText = None
     """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted; NAME.xml: of a calibration
     file), or a camera model of COLMAP; default: of the calibration file in the folder, else found from the frames."""
@@ -45,35 +40,18 @@ class ReconstructCommand:
     """Use the sharpest of every n frames; default: all."""
     frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
     """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate."""
-    mask: options.OptionalPath = None
-    """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
     size: options.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
     method: options.OptionalText = None
     """Method to train; default: coliags-in-vivo, or coliags for a scene with depth."""
     steps: options.OptionalInt = None
     """Training steps of 100 frames, and at least of the largest sub-map; default 2000 (docs/reconstruct.md 1)."""
-    executor: Annotated[options.OptionalText, tyro.conf.arg(metavar="local|ray")] = None
-    """Have sub-maps done at the same time, by processes of this machine or of a Ray cluster; default: one after the
-    other, unless --jobs is given."""
-    jobs: options.OptionalInt = None
-    """Processes at a time; default: one per CPU, or per GPU."""
-    threads: options.OptionalInt = None
-    """CPU threads of each process; default: the CPUs divided by the processes at a time."""
-    ray_address: Annotated[options.OptionalText, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Head of the Ray cluster; default: RAY_ADDRESS, or the cluster of this machine."""
-    set: options.Assignments = ()
-    """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
-    (docs/reconstruct.md)."""
-    overwrite: bool = False
-    """Repeat the stages that were made with other options, and what follows them."""
-    device: options.Device = "auto"
     json: options.AsJson = False
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.scenes import reconstruct
-        from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.config.assignments import assignments, parse_assignments
         from coliags_plugin.pipeline.contents import read_contents
         from coliags_plugin.pipeline.stages import PAGE_FILE
 
@@ -89,7 +67,7 @@ class ReconstructCommand:
             "steps": self.steps,
         }
         settings = {key: value for key, value in given.items() if value is not None}
-        record = arguments.call(reconstruct, self, settings={**settings, **parse_assignments(self.set)})
+        record = reconstruct(replace(self, settings=(*assignments(settings), *self.settings)))
         contents = read_contents(self.output, record, scene=self.video)
         is_long = contents.whole is None
         export = coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")

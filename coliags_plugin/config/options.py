@@ -64,7 +64,7 @@ AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 Light = Literal["recorded", "mean", "flattened"]
 
 #: Fields of options that are paths, which may be given as texts.
-_PATHS = ("file", "data", "output", "along", "mesh", "truth", "scene")
+_PATHS = ("file", "video", "data", "output", "along", "mask", "mesh", "truth", "scene")
 
 
 def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
@@ -363,6 +363,37 @@ class ReportOptions(Options):
         tyro.conf.arg(name="format"),
         tyro.conf.UseAppendAction,
     ] = ()
+
+
+@dataclass(frozen=True)
+class ReconstructOptions(Options):
+    """What to reconstruct, and where its stages are done.
+
+    Args:
+        video: Video file, folder of one with its calibration, folder of images ordered by the numbers in their names,
+            or folder of a scene with poses.
+        output: Folder of the results.
+        mask: Image of the frames' size, black where pixels are ignored; default: black surroundings are found.
+        executor: Have sub-maps done at the same time, by processes of this machine or of a Ray cluster; default: one
+            after the other, unless a number of jobs is given.
+        jobs: Processes at a time; default: one per CPU, or per GPU.
+        threads: CPU threads of each process; default: the CPUs divided by the processes at a time.
+        ray_address: Head of the Ray cluster; default: RAY_ADDRESS, or the cluster of this machine.
+        settings: Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
+            (docs/reconstruct.md).
+        overwrite: Repeat the stages that were made with other options, and what follows them.
+    """
+
+    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
+    output: Output
+    mask: OptionalPath = None
+    executor: Annotated[OptionalText, tyro.conf.arg(metavar="local|ray")] = None
+    jobs: OptionalInt = None
+    threads: OptionalInt = None
+    ray_address: Annotated[OptionalText, tyro.conf.arg(metavar="HOST:PORT")] = None
+    settings: Assignments = ()
+    overwrite: bool = False
+    device: Device = "auto"
 
 
 #: Bytes of a unit.
