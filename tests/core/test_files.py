@@ -1,15 +1,28 @@
-"""Atomic writes under faults, kills and umasks: a target is as it was, or whole."""
+"""Atomic writes under faults, kills and umasks, and locks between processes."""
 
 from __future__ import annotations
 
+import logging
 import os
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_path, atomic_write, write_json
-from tests.faults import broken_disk, content, fault, killed, no_space
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.engine.checkpoints import save_tensors
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.outputs.video import write_video
+from tests.faults import broken_disk, content, fault, killed, largest_file, no_space
 
 OLD, NEW = b"old" * 5000, b"new!" * 7000
 
@@ -157,3 +170,135 @@ def test_errors_of_the_block_that_are_not_the_disks_pass(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "target"):
         (tmp_path / "missing").read_bytes()
     assert not list(tmp_path.iterdir())
+
+
+# Locks between processes: one holder at a time, named by the others, and freed however it ends
+
+
+HOLDER = """if True:
+    import sys, time
+    from pathlib import Path
+    from coliags_plugin.core.locks import locked
+    with locked(Path(sys.argv[1]), "it"):
+        print("held", flush=True)
+        time.sleep(60)
+"""
+
+
+def test_a_killed_process_frees_its_lock(tmp_path, caplog):
+    file = tmp_path / "deep" / "lock"
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(file)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        name = rf"process {holder.pid} on {os.uname().nodename} since 20"
+        for wait in (0.0, 0.3):
+            with (
+                caplog.at_level(logging.INFO),
+                pytest.raises(LockedError, match=f"the run is in use by {name}"),
+                locked(file, "the run", wait),
+            ):
+                pass
+        (waiting,) = (record.message for record in caplog.records)
+        assert waiting.startswith(f"waiting for process {holder.pid} on") and waiting.endswith("which has the run")
+        holder.kill()
+    with locked(file, "the run", wait=5.0):
+        assert str(os.getpid()) in file.read_text()
+    assert not file.exists()
+    with locked(file, "the run"):
+        pass
+
+
+def test_a_lock_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write to"), locked(tmp_path / "file" / "lock", "it"):
+        pass
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="cannot write to"), locked(tmp_path / "folder", "it"):
+        pass
+
+
+@pytest.mark.thorough
+def test_no_module_needs_fcntl():
+    """Which Windows does not have; torch and filelock do without it."""
+    code = """if True:
+        import sys
+        import torch, filelock
+        sys.modules["fcntl"] = None
+        import coliags_plugin.comparison.compare, coliags_plugin.pipeline.reconstruct
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# Writers of other libraries on a disk that is full: a limit on the size of files stands for it
+
+
+FRAMES = np.random.default_rng(0).integers(0, 255, (12, 48, 64, 3)).astype(np.uint8)
+
+
+def a_trajectory(count):
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 2, 3] = np.arange(count)
+    names = tuple(f"{index:04d}.png" for index in range(count))
+    return Trajectory(poses, names=names, intrinsics=Intrinsics(50.0, 50.0, 32.0, 24.0, 64, 48))
+
+
+def colmap_binary(target, count):
+    colmap.write(target, a_trajectory(count))
+
+
+def colmap_text(target, count):
+    colmap.write_text(target, a_trajectory(count))
+
+
+def video(target, count):
+    write_video(FRAMES[:count], target.with_suffix(".mp4"), 10.0)
+
+
+def checkpoint(target, count):
+    with atomic_folder(target, overwrite=True) as scratch:
+        save_tensors({"a": torch.arange(100.0 * count)}, scratch / "state.safetensors")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("write", [colmap_binary, colmap_text, video, checkpoint])
+def test_what_was_there_stays_until_all_fits(tmp_path, write):
+    target = tmp_path / "target"
+
+    def found():
+        return content(target) if target.exists() else content(target.with_suffix(".mp4"))
+
+    write(target, 5)
+    old = found()
+    write(target, 9)
+    new = found()
+    assert old != new
+    refused = 0
+    for size in (0, 1, 40, 100, 300, 500, 700, 1000, 2000, 4000, 8000, 16000, 10**9):
+        write(target, 5)
+        with largest_file(size):
+            try:
+                write(target, 9)
+            except InputError as error:
+                refused += 1
+                assert "space" in str(error)
+                assert found() == old
+                continue
+        assert found() == new
+    assert refused >= 3
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_the_training_log_on_a_full_disk_is_a_message(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_file.symlink_to("/dev/full")
+    with pytest.raises(InputError, match="No space left"):
+        run.log({"step": 1})
+
+
+@pytest.mark.thorough
+def test_a_training_log_that_is_no_file_is_a_message(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_file.symlink_to("metrics.jsonl")
+    with pytest.raises(InputError, match="cannot write"):
+        run.log({"step": 1})

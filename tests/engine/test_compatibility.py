@@ -115,6 +115,8 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     with pytest.raises(InputError, match=r"train the method coliags-sparse-depth on its points, or .* depth estimate"):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
     assert start(tmp_path / "run", method="coliags-sparse-depth", scene=replace(scene, train=sparse))
+    with pytest.raises(InputError, match=r"'depth' needs depth at single points.*losses\.depth=null"):
+        start(tmp_path / "run", method="coliags-sparse-depth")
     estimated = [replace(frame, depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
     for method, warned in (("coliags", True), ("coliags-in-vivo", False), ("scaffold-gs", False)):
         caplog.clear()

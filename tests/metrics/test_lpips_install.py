@@ -22,8 +22,7 @@ from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
 from coliags_plugin.metrics.lpips_network import LPIPSNetwork
 from coliags_plugin.metrics.lpips_weights import BACKBONE_FILES, DEFAULT_NETS, find_weights, load_network, weights_in
 from tests.commands import refused, run
-from tests.metrics.made import images, make
-from tests.metrics.weight_files import lay_out, random_backbone, random_heads
+from tests.metrics.made import images, lay_out, make, random_backbone, random_heads
 
 NETS = ("alex", "squeeze")
 ALEX = (BACKBONE_FILES["alex"][0], "v0.1/alex.pth")

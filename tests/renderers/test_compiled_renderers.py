@@ -8,8 +8,6 @@ little in float64; there may be few of them, and all others, and the gradients t
 """
 
 import dataclasses
-import subprocess
-import sys
 from importlib.util import find_spec
 
 import pytest
@@ -457,13 +455,6 @@ def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
     output, gradients = drawn(renderer, gaussians, pinhole(9, 7, dtype=torch.float32), torch.float32)
     assert all(torch.isfinite(output[name]).all() for name in OUTPUTS)
     assert all(torch.isfinite(gradients[name]).all() for name in ("opacities", "colors"))
-
-
-@pytest.mark.thorough
-def test_importing_the_component_does_not_load_numba():
-    code = "import sys, coliags_plugin.renderers.cpu_renderer; print('numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.strip() == "False"
 
 
 def test_triton_refuses_what_its_kernels_cannot_take():
