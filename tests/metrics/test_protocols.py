@@ -53,6 +53,7 @@ def test_what_a_protocol_promises(name):
     for metric, options in (made.metrics | made.optional_metrics).values():
         make(metric, **options)
     if name in ("paper", "authors-code"):
+        assert {"psnr", "ssim", "lpips", "depth_mse"} <= made.metrics.keys()
         assert made.metrics["lpips"] == ("lpips", {"net": "vgg", "input_range": "zero-one"})
 
 

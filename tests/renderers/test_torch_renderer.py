@@ -11,12 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import Availability, GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS
 from coliags_plugin.core.render_output import SURFEL_OUTPUTS
+from coliags_plugin.renderers.choice import choose_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from tests.renderers.naive import extent
 
@@ -340,3 +343,35 @@ def test_a_pose_of_another_precision_is_cast():
     gaussians, camera = smooth_scene()
     output = render_gaussians(cast(gaussians, torch.float32), camera)
     assert output.rgb.dtype == torch.float32
+
+
+# Choice of renderers: impossible pairs are refused, and the reason for a choice is given
+
+
+CPU = torch.device("cpu")
+
+
+def test_auto_chooses_cpu_on_the_cpu_falls_back_to_torch_and_says_why(monkeypatch):
+    renderer = make_component("renderers", {"name": "auto", "background": (0.5, 0.0, 0.0)})
+    chosen = choose_renderer(renderer, "gaussians3d", CPU)
+    assert chosen.name == "cpu" and "auto chose cpu" in chosen.reason
+    assert chosen.renderer.settings.background == (0.5, 0.0, 0.0)
+    unavailable = classmethod(lambda cls: Availability(False, "numba is at lunch"))
+    monkeypatch.setattr(registry.renderers.get("cpu"), "availability", unavailable)
+    chosen = choose_renderer(renderer, "gaussians3d", CPU)
+    assert chosen.name == "torch" and "cpu cannot run here: numba is at lunch" in chosen.reason
+    with pytest.raises(InputError, match="numba is at lunch"):
+        choose_renderer(make_component("renderers", "cpu"), "gaussians3d", CPU)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "message"),
+    [
+        ("torch", r"draws gaussians3d, surfels, the field is made of radiance"),
+        ("auto", r"no renderer can serve.*--set renderer=NAME, NAME being volume"),
+        ({"name": "auto", "prefer": ("volum",)}, r"renderer auto, prefer: .*Did you mean 'volume'"),
+    ],
+)
+def test_an_impossible_pair_names_both_sides(renderer, message):
+    with pytest.raises(InputError, match=message):
+        choose_renderer(make_component("renderers", renderer), "radiance", CPU)
