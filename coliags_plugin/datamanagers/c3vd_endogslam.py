@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -64,16 +63,12 @@ class PreparedFiles(NamedTuple):
     cloud: Path | None  # the optimised Gaussians of PR-Endo's release
 
 
-@dataclass(frozen=True)
-class SequencePoses:
-    """The poses of a sequence in one world. Rigid, OpenCV axes, mm.
-
-    ``from_slam`` and ``from_file`` transform from EndoGSLAM's world and from that of pose.txt; None without the file.
-    """
+class SequencePoses(NamedTuple):
+    """The poses of a sequence in one world. Rigid, OpenCV axes, mm."""
 
     camera_to_world: Float[np.ndarray, "N 4 4"]
-    from_slam: Float[np.ndarray, "4 4"] | None
-    from_file: Float[np.ndarray, "4 4"] | None
+    from_slam: Float[np.ndarray, "4 4"] | None  # from EndoGSLAM's world; None without its result
+    from_file: Float[np.ndarray, "4 4"] | None  # from the world of pose.txt; None without the file
     facts: Mapping[str, Any]
 
 
@@ -144,8 +139,7 @@ def _align_slam(
         compared = _compared(files, params.true_camera_to_world, true, indices)
     from_true = _rigid_alignment(params.true_camera_to_world, params.camera_to_world)
     aligned = from_true @ params.true_camera_to_world
-    errors = np.linalg.norm(aligned[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
-    angles = _angles(aligned, params.camera_to_world)
+    errors, angles = _apart(aligned, params.camera_to_world)
     ate, spread = float(np.sqrt(np.mean(errors**2))), float(aligned[:, :3, 3].std(axis=0).max())
     if ate > LOST * spread:
         log.warning(
@@ -175,8 +169,7 @@ def _compared(
     indices: Int[np.ndarray, "F"],
 ) -> dict[str, float]:
     """Largest differences between the true poses of params.npz and pose.txt."""
-    distances = np.linalg.norm(stored[:, :3, 3] - true[:, :3, 3], axis=1)
-    angles = _angles(stored, true)
+    distances, angles = _apart(stored, true)
     worst = int(np.argmax(np.maximum(distances, angles)))
     if max(distances[worst], angles[worst]) > SAME_SEQUENCE:
         raise InputError(
@@ -202,8 +195,10 @@ def _rigid_alignment(
     return rigid(rotation[None], translation[None])[0]
 
 
-def _angles(first: Float[np.ndarray, "F 4 4"], second: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F"]:
-    return rotation_angles_deg(first[:, :3, :3] @ second[:, :3, :3].transpose(0, 2, 1))
+def _apart(first: Float[np.ndarray, "F 4 4"], second: Float[np.ndarray, "F 4 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Distances between cameras, mm, and angles between their orientations, degrees. [F] each"""
+    distances = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1)
+    return distances, rotation_angles_deg(first[:, :3, :3] @ second[:, :3, :3].transpose(0, 2, 1))
 
 
 def _inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -109,7 +109,8 @@ class RGBDDataManager(RecordedDataManager):
         """See :class:`RecordedDataManager`."""
         settings = self.settings
         images = _find_images(path)
-        depths = _find_depths(path) if settings.depth == "metric" else []
+        is_metric = settings.depth == "metric"
+        depths = _files(path, DEPTH_FOLDERS, reading.DEPTH_SUFFIXES)[1] if is_metric else []
         file = _find_trajectory(path, settings.trajectory)
         trajectory = tum.read(file)
         pair = self._paired_by_time if self._is_by_time(images) else self._paired_by_order
@@ -121,10 +122,8 @@ class RGBDDataManager(RecordedDataManager):
         rectification = self.rectification_of(lens, camera_file)
         seen = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
         masks = _files_of_images(path, MASK_FOLDERS, used, "mask")
-        confidences: dict[str, Path] = {}
-        if settings.depth == "metric":
-            confidences = _files_of_images(path, CONFIDENCE_FOLDERS, used, "confidence")
-        if confidences and not depths:
+        confidences = _files_of_images(path, CONFIDENCE_FOLDERS if is_metric else (), used, "confidence")
+        if any(confidences) and not depths:
             raise InputError(
                 f"{path} holds confidence/, but no depth",
                 "confidence beside the depth that it is about",
@@ -138,10 +137,10 @@ class RGBDDataManager(RecordedDataManager):
                 trajectory.camera_to_world[pose],
                 depth,
                 form,
-                mask=masks.get(image.stem),
-                confidence=confidences.get(image.stem),
+                mask=mask,
+                confidence=confidence,
             )
-            for image, depth, pose in rows
+            for (image, depth, pose), mask, confidence in zip(rows, masks, confidences, strict=True)
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
@@ -151,8 +150,8 @@ class RGBDDataManager(RecordedDataManager):
             "focal_scale": None if isinstance(lens, PinholeLens) else settings.focal_scale,
             "depth_scale": scale,
             "association": association,
-            "masks": len(masks),
-            "depth_is_estimated": bool(confidences),
+            "masks": sum(mask is not None for mask in masks),
+            "depth_is_estimated": any(confidences),
             **rectification.facts(),
             "pose_convention": {
                 "order": "TUM: camera-to-world, quaternion with w last",
@@ -162,7 +161,7 @@ class RGBDDataManager(RecordedDataManager):
         }
         meshes = list(path.glob("*.obj"))
         points = next((file for file in (path / POINTS_FILE, *meshes[: len(meshes) == 1]) if file.is_file()), None)
-        large = (*used, *(depth for _, depth, _ in rows), *masks.values(), *confidences.values())
+        large = (*used, *(depth for _, depth, _ in rows), *masks, *confidences)
         return Recording(
             kind=f"TUM RGB-D, associated by {association['by']}",
             shots=shots,
@@ -299,39 +298,36 @@ class EndoMapperDataManager(RGBDDataManager):
     is_calibrated = True
 
 
+def _files(folder: Path, names: tuple[str, ...], suffixes: frozenset[str]) -> tuple[Path | None, list[Path]]:
+    """The only folder of one of these names, and its files, unordered; None and none without such a folder."""
+    folders = [folder / name for name in names if (folder / name).is_dir()]
+    if len(folders) > 1:
+        listed = " and ".join(f"{path.name}/" for path in folders)
+        raise InputError(f"{folder} holds {listed}", "only one of them", "Move the other away")
+    files = [path for found in folders for path in found.iterdir() if path.suffix.lower() in suffixes]
+    return next(iter(folders), None), files
+
+
 def _find_images(folder: Path) -> list[Path]:
     """The colour images, unordered; there must be one folder of them."""
     reading.require_folder(folder, EXPECTED)
-    image_folder = _only(folder, IMAGE_FOLDERS)
+    image_folder, images = _files(folder, IMAGE_FOLDERS, reading.IMAGE_SUFFIXES)
     if image_folder is None:
         raise InputError(f"{folder} holds {reading.inventory(folder)}", EXPECTED, "Name the scene's own folder")
-    images = [path for path in image_folder.iterdir() if path.suffix.lower() in reading.IMAGE_SUFFIXES]
     if not images:
         raise InputError(f"{image_folder} holds {reading.inventory(image_folder)}", "PNG or JPEG images")
     return images
 
 
-def _find_depths(folder: Path) -> list[Path]:
-    """The depth files, unordered; empty without a folder of them."""
-    depths = _only(folder, DEPTH_FOLDERS)
-    return (
-        [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in reading.DEPTH_SUFFIXES]
-    )
+def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> list[Path | None]:
+    """Files of the stems of images, such as masks, where there is a folder of one of the ``names``, else None for each.
 
-
-def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
-    """Files of images, such as masks, by the stem of their image; empty without a folder of one of the ``names``.
-
-    Such a folder must have one for every image; ``what`` they are is for the error.
+    The folder must have one for every image; ``what`` they are is for the error.
     """
-    file_folder = _only(folder, names)
-    if file_folder is None:
-        return {}
-    files = {path.stem: path for path in file_folder.iterdir() if path.suffix.lower() in reading.IMAGE_SUFFIXES}
-    found = {image.name: files.get(image.stem) for image in images}
-    return {
-        path.stem: path for path in reading.for_all(found, file_folder, f"a {what}", or_none=False) if path is not None
-    }
+    file_folder, files = _files(folder, names, reading.IMAGE_SUFFIXES)
+    by_stem = {path.stem: path for path in files}
+    found = {image.name: by_stem.get(image.stem) for image in images}
+    return reading.for_all(found, file_folder, f"a {what}", or_none=file_folder is None)
 
 
 def _find_trajectory(folder: Path, named: str | None) -> Path:
@@ -373,14 +369,6 @@ def _read_mesh_points(path: Path) -> PointCloud:
     """The vertices of a mesh, and their colours if all have one."""
     mesh = read_mesh(path)
     return PointCloud(torch.from_numpy(mesh.vertices), None if mesh.colors is None else torch.from_numpy(mesh.colors))
-
-
-def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
-    folders = [folder / name for name in names if (folder / name).is_dir()]
-    if len(folders) > 1:
-        listed = " and ".join(f"{path.name}/" for path in folders)
-        raise InputError(f"{folder} holds {listed}", "only one of them", "Move the other away")
-    return folders[0] if folders else None
 
 
 def _trajectories(folder: Path) -> list[Path]:

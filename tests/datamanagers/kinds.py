@@ -695,7 +695,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         ),
     ],
     "rgbd": [
-        (lambda folder: shutil.rmtree(folder / "rgb"), r"data holds camera\.json, depth\.txt, depth/"),
+        (lambda folder: shutil.rmtree(folder / "rgb"), r"data holds camera\.json, depth\.txt, depth/, .* and 2 more"),
         (lambda folder: (folder / "images").mkdir(), "holds rgb/ and images/"),
         (lambda folder: (folder / "depths").mkdir(), "holds depth/ and depths/"),
         (

@@ -18,7 +18,7 @@ from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings
 from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.built_in import depth_steps
-from tests.datamanagers.kinds import remove, repaint, write
+from tests.datamanagers.kinds import remove, repaint
 from tests.datamanagers.wall_scenes import (
     colors,
     manager,
@@ -250,10 +250,3 @@ def test_no_file_stays_open(walls):
     before = len(os.listdir("/proc/self/fd"))
     load(walls("c3vd"))
     assert len(os.listdir("/proc/self/fd")) <= before
-
-
-def test_a_folder_of_something_else(tmp_path):
-    for index in range(9):
-        write(f"{index}.txt", "")(tmp_path)
-    with pytest.raises(InputError, match=r"holds 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 4 more"):
-        load(tmp_path)

@@ -200,14 +200,6 @@ def test_npz(tmp_path, colored):
     assert len(read_points(tmp_path / "p.npz", 4, rng())) == 4
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
-    positions = np.ones((4, 3))
-    positions[2, 1] = np.nan
-    np.savez(tmp_path / "p.npz", positions=positions)
-    assert len(read_points(tmp_path / "p.npz", 100, rng())) == 3
-    assert "1 of 4 points" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
