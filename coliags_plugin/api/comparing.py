@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.options import CompareOptions, ReportOptions, takes
-from coliags_plugin.core.errors import check_name
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
@@ -90,21 +89,15 @@ def report(
             cannot be written.
     """
     from coliags_plugin.comparison.compare import FinishedComparison
-    from coliags_plugin.comparison.report.report import FORMATS, SUFFIXES, Choices, write_report
+    from coliags_plugin.comparison.report.report import write_report
 
     parts = [of] if isinstance(of, (Run, FinishedComparison, str, Path)) else of
     paths = [
         part.path if isinstance(part, Run) else part.folder if isinstance(part, FinishedComparison) else Path(part)
         for part in parts
     ]
-    for each in options.formats:
-        check_name("format", each, (*FORMATS, "all"))
-    named = tuple(each for each in options.formats if each != "all") or FORMATS[:1]
-    wanted = FORMATS if "all" in options.formats else named
-    file = options.output or Path(f"report{SUFFIXES[wanted[0]]}")
-    section = _scene_section(options.scene) if options.scene is not None and "html" in wanted else None
-    choices = Choices(options.columns, options.reference, options.title, options.note, options.frames)
-    return write_report(paths, file, wanted, choices, options.protocol, options.methods, section)
+    is_html = not options.formats or not {"html", "all"}.isdisjoint(options.formats)
+    return write_report(paths, options, _scene_section(options.scene) if options.scene and is_html else None)
 
 
 def _scene_section(of: Run | str | Path) -> Section:

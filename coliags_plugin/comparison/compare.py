@@ -271,17 +271,7 @@ def make_request(methods: str | Variant | Sequence[str | Variant], options: Comp
     for split in options.splits:
         check_name("split", split, get_args(Split))
     _check_decision([variant.name for variant in variants], options.protocol, options.reference, options.primary)
-    return Request(
-        variants,
-        find_scenes([str(scene) for scene in options.scenes], options.data),
-        range(options.seeds),
-        options.protocol,
-        tuple(dict.fromkeys(options.splits)),
-        options.steps,
-        options.settings,
-        options.reference,
-        tuple(dict.fromkeys(options.primary)),
-    )
+    return Request(variants, find_scenes([str(scene) for scene in options.scenes], options.data), options)
 
 
 def _check_decision(methods: Sequence[str], protocol: str, reference: str | None, primary: Sequence[str]) -> None:

@@ -92,24 +92,27 @@ class ComparisonFolder:
 
     def check_extends(self, request: Request) -> None:
         """Refuse to mix runs of different length or with different changes, and to decide after the first run."""
-        before = read_plan(self.path)
-        decided, now = None if before is None else before.decided, (request.reference, tuple(request.primary))
+        before, options = read_plan(self.path), request.options
+        decided, now = (
+            None if before is None else before.decided,
+            (options.reference, tuple(dict.fromkeys(options.primary))),
+        )
         is_begun = before is not None or (self.path / RESULTS).is_dir()
-        if is_begun and request.reference is not None and now != (decided and (decided.reference, decided.primary)):
+        if is_begun and options.reference is not None and now != (decided and (decided.reference, decided.primary)):
             earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
             raise InputError(
-                f"--reference {request.reference} --primary {' '.join(request.primary)}, where {self.path} had decided "
+                f"--reference {options.reference} --primary {' '.join(options.primary)}, where {self.path} had decided "
                 f"{earlier} when it was begun",
                 "no other decision after the first run",
                 "Leave both out, or choose another --output",
             )
         if before is None:
             return
-        plans = (before, request)
-        lengths = [f"--steps {each.steps}" if each.steps else "each method's own steps" for each in plans]
-        changes = [" ".join(f"--set {change}" for change in each.overrides) or "no --set" for each in plans]
-        values = [list(parse_assignments(each.overrides).items()) for each in plans]  # 1e-3 is 0.001
-        for (earlier, later), is_same in ((lengths, before.steps == request.steps), (changes, values[0] == values[1])):
+        lengths = [f"--steps {each.steps}" if each.steps else "each method's own steps" for each in (before, options)]
+        sets = (before.overrides, options.settings)
+        changes = [" ".join(f"--set {change}" for change in each) or "no --set" for each in sets]
+        values = [list(parse_assignments(each).items()) for each in sets]  # 1e-3 is 0.001
+        for (earlier, later), is_same in ((lengths, before.steps == options.steps), (changes, values[0] == values[1])):
             if not is_same:
                 raise InputError(
                     f"{self.path} compares runs with {earlier}, not {later}", "the same, or another --output"
@@ -120,7 +123,7 @@ class ComparisonFolder:
 
         Only a new plan takes up a decision.
         """
-        former_plan = read_plan(self.path)
+        former_plan, options = read_plan(self.path), request.options
         before = former_plan or ComparisonPlan()
         entries = {entry.identity: entry for entry in before.cells}
         changed = [
@@ -143,12 +146,12 @@ class ComparisonFolder:
                 phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__
             )
         decided = before.decided
-        if former_plan is None and request.reference is not None:
+        if former_plan is None and options.reference is not None:
             today = datetime.now(timezone.utc).date().isoformat()
-            decided = Decision(reference=request.reference, primary=tuple(request.primary), date=today)
+            decided = Decision(reference=options.reference, primary=tuple(dict.fromkeys(options.primary)), date=today)
         plan = ComparisonPlan(
-            steps=request.steps,
-            overrides=tuple(request.overrides),
+            steps=options.steps,
+            overrides=options.settings,
             decided=decided,
             scenes=scenes,
             cells=tuple(entries.values()),

@@ -15,6 +15,7 @@ from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import MethodConfig, load_method
+from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.engine.data_formats import data_manager, load_method_for
 from coliags_plugin.results.hashing import code_key, result_key, training_key
 
@@ -99,23 +100,14 @@ class Request:
 
     variants: Sequence[Variant]
     scenes: Sequence[SceneSource]
-    seeds: Sequence[int] = (0,)  # one run for each
-    protocol: str = "paper"
-    splits: Sequence[str] = ()  # names of splits, one run for each; empty: each scene's own
-    steps: int | None = None  # length of all runs; None: each method's own
-    overrides: Sequence[str] = ()  # ``key.path=value`` changes of all methods
-    reference: str | None = None  # method that was decided to compare the others with
-    primary: Sequence[str] = ()  # metrics that were decided to compare them by; none without a reference
-
-    @property
-    def changes(self) -> tuple[str, ...]:
-        """The changes of all methods, with the length of the runs."""
-        return (*(() if self.steps is None else (f"schedule.steps={self.steps}",)), *self.overrides)
+    options: CompareOptions  # of which the runs' are used: their seeds, protocol, splits, steps, and settings
 
 
 def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[ComparisonCell]:
     """All cells, those of one seed together, and within it those of one scene."""
-    version = registry.protocols.get(request.protocol).version
+    options, seeds = request.options, range(request.options.seeds)
+    version = registry.protocols.get(options.protocol).version
+    steps = () if options.steps is None else (f"schedule.steps={options.steps}",)
     known: dict[tuple[str, str, str], str] = {}  # fingerprints, each computed once for each way of reading a scene
 
     def fingerprint(scene: SceneSource, component: Component) -> str | None:
@@ -128,23 +120,25 @@ def make_cells(request: Request, recorded: RecordedFingerprint | None = None) ->
 
     cells: list[ComparisonCell] = []
     with _warnings_only():
-        for scene, split, variant in product(request.scenes, request.splits or (None,), request.variants):
+        for scene, split, variant in product(
+            request.scenes, dict.fromkeys(options.splits) or (None,), request.variants
+        ):
             chosen = () if split is None else (f"datamanager.split={split}",)
-            overrides = (*scene.overrides, *chosen, *variant.overrides, *request.changes)
+            overrides = (*scene.overrides, *chosen, *variant.overrides, *steps, *options.settings)
             config = _config(scene, variant.method, overrides)
             own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
             label = scene.name if used in (None, own) else f"{scene.name}-{used}"
             data, plain = fingerprint(scene, config.datamanager), config.model_dump()
-            for seed in request.seeds:
+            for seed in seeds:
                 keys = None
                 if data is not None:
                     keys = CellKeys(
                         data,
                         training_key(plain, data, seed, code_key()),
-                        result_key(plain, data, seed, code_key(), request.protocol, version),
+                        result_key(plain, data, seed, code_key(), options.protocol, version),
                     )
-                cells.append(ComparisonCell(variant, scene, label, seed, request.protocol, overrides, config, keys))
-    return sorted(cells, key=lambda cell: request.seeds.index(cell.seed))
+                cells.append(ComparisonCell(variant, scene, label, seed, options.protocol, overrides, config, keys))
+    return sorted(cells, key=lambda cell: cell.seed)
 
 
 def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> MethodConfig:

@@ -328,10 +328,12 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
 
 def report(context: StageContext) -> StageOutcome:
     """Write the report of the run."""
-    from coliags_plugin.comparison.report.report import Choices, write_report
+    from coliags_plugin.comparison.report.report import write_report
+    from coliags_plugin.config.options import ReportOptions
     from coliags_plugin.engine.run_folder import RunFolder
 
     protocol = RunFolder(context.run).method().config.protocol
     title = f"Reconstruction of {context.source.name}"
-    write_report([context.run], context.folder / "report.html", ("html",), Choices(title=title), protocol)
+    options = ReportOptions(context.folder / "report.html", title=title, protocol=protocol)
+    write_report([context.run], options)
     return StageOutcome("report.html", {"report.html": "views, metrics, training, provenance"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -86,7 +87,7 @@ def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
 def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
     phantom = PhantomSettings(layout=layout, frames=9)
     request = requested(tmp_path)
-    request = type(request)(request.variants, [SceneSource("made", tmp_path / "made", phantom=phantom)], steps=5)
+    request = replace(request, scenes=[SceneSource("made", tmp_path / "made", phantom=phantom)])
     (unknown,) = make_cells(request)
     assert unknown.keys is None and unknown.config.schedule.steps == 5
     (known,) = make_cells(request, lambda scene: "abc")

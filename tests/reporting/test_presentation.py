@@ -10,8 +10,9 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.report import Choices, report_page
+from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
@@ -96,7 +97,7 @@ def report(tmp_path_factory):
     """A report with every kind of table."""
     methods = {"coliags": 2.0, "scaffold-gs": 0.5, "ablations/none": 0.0}
     folder = write_comparison(tmp_path_factory.mktemp("comparison"), made_scenes(methods, seeds=2)[:-2])
-    return report_page(decided(read_study([folder]), "psnr", "depth_mse"), Choices(note=NASTY))
+    return report_page(decided(read_study([folder]), "psnr", "depth_mse"), ReportOptions(note=NASTY))
 
 
 def tables_of(blocks):

@@ -5,9 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_section
 from coliags_plugin.comparison.report.costs import cost_table, training_device
@@ -25,6 +23,7 @@ from coliags_plugin.comparison.report.metric_tables import (
 from coliags_plugin.comparison.report.sources import cautions, code_of, read_study, scene_provenance
 from coliags_plugin.comparison.report.study import MissingResult, Part, Study, StudyRun
 from coliags_plugin.comparison.report.views import view_section
+from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import check_name
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
@@ -52,45 +51,25 @@ _LISTED = 12
 #: Hexadecimal digits of a hash that are shown.
 _DIGITS = 12
 
-Format = Literal["html", "markdown", "latex", "csv", "json"]
-
-FORMATS: tuple[Format, ...] = get_args(Format)
-SUFFIXES: dict[Format, str] = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
+#: Formats with their suffixes.
+SUFFIXES = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 
 
-@dataclass(frozen=True)
-class Choices:
-    """What the reader of a report chooses."""
-
-    columns: Sequence[str] = ()  # metrics to show, in this order; empty: the default ones
-    reference: str | None = None  # what others are compared with; None: coliags, or else the best
-    title: str | None = None  # heading; None: made from methods and scenes
-    note: str | None = None  # remark under the heading
-    frames: int = 4  # held-out views to show per scene and test set, beside the worst ones
-
-
-def write_report(
-    paths: Sequence[Path],  # run folders, results files, and folders of a comparison
-    output: Path,
-    formats: Sequence[Format] = ("html",),
-    choices: Choices | None = None,
-    protocol: str = "paper",  # name of the evaluation to read from folders
-    methods: Sequence[str] = (),  # to show, in this order; empty: all
-    scene: Section | None = None,  # a scene to fly through, of the HTML page alone
-) -> list[Path]:
-    """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
+def write_report(paths: Sequence[Path], options: ReportOptions, scene: Section | None = None) -> list[Path]:
+    """Write a report of run folders, results files and folders of comparisons.
 
     Returns the files: the output, replaced if it is there, or that with the suffix of each of several formats. CSV has
-    every metric of every frame, JSON the tables.
+    every metric of every frame, JSON the tables. The scene to fly through is of the HTML page alone.
     """
-    choices = choices or Choices()
-    files = {
-        each: output if len(formats) == 1 else output.with_suffix(SUFFIXES[each]) for each in dict.fromkeys(formats)
-    }
+    for name in options.formats:
+        check_name("format", name, (*SUFFIXES, "all"))
+    formats = [*SUFFIXES] if "all" in options.formats else [*dict.fromkeys(options.formats or ("html",))]
+    output = options.output or Path(f"report{SUFFIXES[formats[0]]}")
+    files = {each: output if len(formats) == 1 else output.with_suffix(SUFFIXES[each]) for each in formats}
     for file in files.values():
         refuse_folder(file)
-    study = read_study(paths, protocol, methods)
-    page = report_page(study, choices, screen="html" in files, scene=scene)
+    study = read_study(paths, options.protocol, options.methods)
+    page = report_page(study, options, screen="html" in files, scene=scene)
     for each, file in files.items():
         match each:
             case "html":
@@ -104,31 +83,31 @@ def write_report(
     return [*files.values()]
 
 
-def report_page(study: Study, choices: Choices, screen: bool = False, scene: Section | None = None) -> Page:
+def report_page(study: Study, options: ReportOptions, screen: bool = False, scene: Section | None = None) -> Page:
     """The page; with what only a screen shows, views, charts, provenance and a scene to fly through, if asked for."""
-    for name in choices.columns:
+    for name in options.columns:
         check_name("metric", name, [*study.metrics, ALL_COLUMNS])
-    reference = choose_reference(study, choices.reference)
+    reference = choose_reference(study, options.reference)
     title = f"{study.methods[0]} on" if len(study.methods) == 1 else f"{len(study.methods)} methods compared on"
     where = study.scenes[0] if len(study.scenes) == 1 else counted(len(study.scenes), "scene")
-    sections = [_metrics(study, choices, reference), _missing(study.missing)]
+    sections = [_metrics(study, options, reference), _missing(study.missing)]
     if screen:
         sections += [
-            view_section(study, reference, choices.frames),
+            view_section(study, reference, options.frames),
             *([scene] if scene else []),
             profile_section(study),
         ]
     sections.append(Section("Costs", [cost_table(study)]))
     if screen:
         sections.append(training_section(study))
-    sections.append(_scenes(study, choices))
+    sections.append(_scenes(study, options))
     if screen:
         sections += [_frames(study), _provenance(study)]
     return Page(
-        title=choices.title if choices.title is not None else f"{title} {where}",
+        title=options.title if options.title is not None else f"{title} {where}",
         sections=sections,
         facts=[*_facts(study), Fact("How the metrics are computed", study.protocol.description, wide=True)],
-        note=choices.note or "",
+        note=options.note or "",
         cautions=cautions(study),
     )
 
@@ -153,7 +132,7 @@ def _facts(study: Study) -> list[Fact]:
     return [Fact(name, value) for name, value in facts.items()]
 
 
-def _metrics(study: Study, choices: Choices, reference: str) -> Section:
+def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
     text = "Means over the frames of each set."
     if len(study.scenes) > 1:
         text = "Means over the scenes of each set, of each the mean over its frames."
@@ -163,12 +142,12 @@ def _metrics(study: Study, choices: Choices, reference: str) -> Section:
     blocks: list[Block] = [Paragraph(text)]
     for part in study.parts:
         # What holds for several parts is said once.
-        blocks += [block for block in _part_blocks(part, choices, reference) if block not in blocks]
+        blocks += [block for block in _part_blocks(part, options, reference) if block not in blocks]
     return Section("Metrics", blocks)
 
 
-def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
-    columns = metric_columns(part, choices.columns)
+def _part_blocks(part: Part, options: ReportOptions, reference: str) -> list[Block]:
+    columns = metric_columns(part, options.columns)
     compared = {column.key: compare(part, column, reference) for column in columns}
     marks = {
         metric: {row.rival: stars(part.study, metric, reference, row) for row in rows}
@@ -184,10 +163,10 @@ def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
     return blocks
 
 
-def _scenes(study: Study, choices: Choices) -> Section:
+def _scenes(study: Study, options: ReportOptions) -> Section:
     tables: dict[str, list[Table]] = {scene: [] for scene in study.scenes}
     for part in study.parts if len(tables) > 1 else ():
-        columns = metric_columns(part, choices.columns)
+        columns = metric_columns(part, options.columns)
         for scene in part.scenes:
             tables[scene].append(means_table(part, columns, scene))
     return Section("Every scene", [Folded(scene, own) for scene, own in tables.items() if own])

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.report import Choices, write_report
+from coliags_plugin.comparison.report.report import write_report
 from coliags_plugin.comparison.report.views import error_limit, evenly
+from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch
 from coliags_plugin.outputs.image_files import encode_png, write_depth_tiff
@@ -75,9 +76,9 @@ class Page(HTMLParser):
         return [attributes["aria-label"] for attributes in self.all("svg") if attributes["class"] == "chart"]
 
 
-def report(tmp_path, paths, *, choices=None, **options):
+def report(tmp_path, paths, **options):
     output = tmp_path / "out" / "report.html"
-    write_report(paths, output, choices=choices, **options)
+    write_report(paths, ReportOptions(output, **options))
     return Page(output.read_text(encoding="utf-8"))
 
 
@@ -93,7 +94,7 @@ def two_runs(tmp_path):
 
 
 def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
-    page = report(tmp_path, two_runs, choices=Choices(title="My <title>", note="A demonstration: 40 steps <only>"))
+    page = report(tmp_path, two_runs, title="My <title>", note="A demonstration: 40 steps <only>")
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["report.html"]
     assert not {tag for tag, _ in page.tags} & {"link", "iframe", "object"}
     assert page.all("script") == [{}]
@@ -120,7 +121,7 @@ def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
 
 def test_the_same_runs_give_the_same_bytes(tmp_path, two_runs):
     for name in ("a", "b"):
-        write_report(two_runs, tmp_path / name)
+        write_report(two_runs, ReportOptions(tmp_path / name))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -131,7 +132,7 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
     psnr = (30.0, 29.0, 31.0, 20.0, 30.0)
     depth = (0.1, 0.5, 0.1, 0.1, 0.1)
     result = result_of("coliags", values={"psnr": psnr, "depth_mse": depth})
-    page = report(tmp_path, [write_run(tmp_path / "run", result)], choices=Choices(frames=2))
+    page = report(tmp_path, [write_run(tmp_path / "run", result)], frames=2)
     found = re.findall(r"frame (\d{4}) (\d of \d)(?: · (worst [\w ]+ of coliags))?", page.words)
     assert found == [
         ("0004", "1 of 5", ""),
@@ -264,7 +265,7 @@ def test_profiles_are_pooled_by_pixels(tmp_path):
     results = [result_of("coliags"), result_of("coliags", "sigmoid"), result_of("3dgs")]
     folder = write_comparison(tmp_path, results)
     html = (tmp_path / "page").resolve()
-    write_report([folder], html)
+    write_report([folder], ReportOptions(html))
     chart = re.search(r'aria-label="PSNR \[dB\] over distance.*?</svg>', html.read_text()).group()
     titles = re.findall(r"<title>([\w-]+), ([\d.]+): ([\d.]+)</title>", chart)
     assert titles == [(method, x, y) for method in ("3dgs", "coliags") for x, y in (("5", "30"), ("15", "23.98"))]
@@ -302,7 +303,7 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
     write_plan(folder, results)
     for result in results:
         write_run(folder / f"runs/{result.scene.name}/{result.method}/s0-{result.key[:8]}", result)
-    page = report(tmp_path, [folder], choices=Choices(frames=1))
+    page = report(tmp_path, [folder], frames=1)
     assert len(page.images("rendered by")) == 2 * len(page.all("article")) == 16
     summaries = [text for text in page.text if text.startswith("scene-")]
     assert summaries.count("scene-1") >= 3  # views, curves, tables
@@ -320,17 +321,19 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
 
 
 def test_formats(tmp_path, two_runs):
-    files = write_report(two_runs, tmp_path / "out/tables.html", ("markdown", "html", "latex", "csv", "json"))
+    files = write_report(two_runs, ReportOptions(tmp_path / "out/tables.html", formats=("all",)))
     assert {file.stem for file in files} == {"tables"}
     text = {file.suffix: file.read_text() for file in files}
-    assert list(text) == [".md", ".html", ".tex", ".csv", ".json"]
+    assert list(text) == [".html", ".md", ".tex", ".csv", ".json"]
     assert text[".md"].startswith("# 2 methods compared on cecum")
     assert r"\toprule" in text[".tex"]
     assert text[".csv"].startswith("scene,split,set,frame,method,seed,psnr")
     values = json.loads(text[".json"])
     (summary, _) = values["sections"][0]["tables"]
     assert [(row["method"], row["psnr"]) for row in summary["rows"]] == [("coliags", 32.0), ("3dgs", 30.0)]
-    assert write_report(two_runs, tmp_path / "table.txt", ("markdown",)) == [tmp_path / "table.txt"]
+    assert write_report(two_runs, ReportOptions(tmp_path / "table.txt", formats=("markdown",))) == [
+        tmp_path / "table.txt"
+    ]
 
 
 # Refusals
@@ -338,18 +341,18 @@ def test_formats(tmp_path, two_runs):
 
 def refuses(tmp_path, runs, match, **options):
     with pytest.raises(InputError, match=match):
-        write_report(runs, tmp_path / "report.html", **options)
+        write_report(runs, ReportOptions(tmp_path / "report.html", **options))
     assert not (tmp_path / "report.html").exists()
 
 
 def test_what_is_missing_is_refused(tmp_path, two_runs):
-    refuses(tmp_path, two_runs, "at least one", choices=Choices(frames=0))
-    refuses(tmp_path, two_runs, "no metric 'x'", choices=Choices(columns=("x",)))
+    refuses(tmp_path, two_runs, "at least one", frames=0)
+    refuses(tmp_path, two_runs, "no metric 'x'", columns=("x",))
     (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
     refuses(tmp_path, two_runs, r"renders/test/0004\.png is missing")
-    write_report(two_runs, tmp_path / "table.txt", ("markdown",))  # which has no images
+    write_report(two_runs, ReportOptions(tmp_path / "table.txt", formats=("markdown",)))  # which has no images
     with pytest.raises(InputError, match="is a folder"):
-        write_report(two_runs, tmp_path)
+        write_report(two_runs, ReportOptions(tmp_path))
 
 
 @pytest.mark.parametrize(

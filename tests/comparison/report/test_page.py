@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from coliags_plugin.comparison.report.published import _C3VD_FRAMES
-from coliags_plugin.comparison.report.report import Choices, per_frame_csv, report_page
+from coliags_plugin.comparison.report.report import per_frame_csv, report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.comparison.report.study import MissingResult
+from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_cell
 from coliags_plugin.results.hashing import metrics_sha256
@@ -45,7 +46,7 @@ def paragraphs(page):
 
 
 def of(study_of, results, **choices):
-    return report_page(study_of(results), Choices(**choices))
+    return report_page(study_of(results), ReportOptions(**choices))
 
 
 def test_facts_and_title(study_of):
@@ -219,7 +220,7 @@ def test_reference(study_of):
 )  # fmt: skip
 def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
     methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
-    page = report_page(decided(study_of(made_scenes(methods, scenes)), "psnr"), Choices())
+    page = report_page(decided(study_of(made_scenes(methods, scenes)), "psnr"), ReportOptions())
     assert said in paragraphs(page)
     table = tables(page)["summary-test"]
     stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
@@ -249,15 +250,15 @@ def stars(page, metric, name="summary-test"):
 
 def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
     study = study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0}))
-    page = report_page(study, Choices())
+    page = report_page(study, ReportOptions())
     assert "before the first run (nothing); all other p-values are exploratory." in paragraphs(page)
     assert not stars(page, "psnr") and page.cautions == []
-    page = report_page(decided(study, "depth_mse"), Choices())
+    page = report_page(decided(study, "depth_mse"), ReportOptions())
     assert stars(page, "depth_mse") == {"3dgs": "*", "2dgs": "*"} and not stars(page, "psnr")
     assert "(coliags against the others by Depth MSE, on 2026-11-01)" in paragraphs(page)
-    other = report_page(decided(study, "psnr"), Choices(reference="3dgs"))
+    other = report_page(decided(study, "psnr"), ReportOptions(reference="3dgs"))
     assert not stars(other, "psnr")
-    best = report_page(decided(study, "psnr", reference="2dgs"), Choices())
+    best = report_page(decided(study, "psnr", reference="2dgs"), ReportOptions())
     assert stars(best, "psnr") == {"coliags": "*", "3dgs": "*"}
 
 
@@ -362,13 +363,13 @@ def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
 
 def test_cells_without_a_result(tmp_path, study_of):
     failed = [("cecum", "3dgs", 0, "ran out of memory"), ("sigmoid", "3dgs", 1, "")]
-    page = report_page(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())
+    page = report_page(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), ReportOptions())
     assert [list(row.values()) for row in tables(page)["failed"].rows] == [
         ["3dgs", "cecum", 0, "ran out of memory"],
         ["3dgs", "sigmoid", 1, "no reason was recorded"],
     ]
     missing = tuple(MissingResult(scene, "3dgs", 0, None) for scene in "pq")
-    page = report_page(replace(study_of([result_of("coliags")]), missing=missing), Choices())
+    page = report_page(replace(study_of([result_of("coliags")]), missing=missing), ReportOptions())
     assert "failed" not in tables(page)
     assert Paragraph("2 cells not finished: 3dgs (2).") in page.sections[1].blocks
 

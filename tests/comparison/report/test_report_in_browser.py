@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.comparison.report.report import Choices, write_report
+from coliags_plugin.comparison.report.report import write_report
+from coliags_plugin.config.options import ReportOptions
 from tests.comparison.report.made import made_scenes, write_comparison, write_run
 
 pytestmark = pytest.mark.thorough
@@ -22,7 +23,7 @@ def page(tmp_path_factory):
     for result in results:
         run = folder / f"c/runs/{result.scene.name}/{result.method}/s0-{result.key[:8]}"
         write_run(run, result, depth=0.5 + len(result.method) / 40)
-    write_report([folder / "c"], folder / "report.html", choices=Choices(title="Two scenes", frames=3))
+    write_report([folder / "c"], ReportOptions(folder / "report.html", title="Two scenes", frames=3))
     return folder / "report.html"
 
 

@@ -7,8 +7,9 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from coliags_plugin.comparison.report.metric_tables import compare
-from coliags_plugin.comparison.report.report import Choices, report_page
+from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Column, Paragraph
 from coliags_plugin.results.reading import write_result
@@ -110,7 +111,7 @@ def test_the_family_is_all_that_was_planned_shown_or_not(compared):
         raw = [stats.wilcoxon(values(study, "coliags"), values(study, name)).pvalue for name in rivals]
         expected = multipletests([*raw, *[1.0] * (4 - len(raw))], method="holm")[1]  # the others may have any p
         assert [holm_of(study)[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
-        page = report_page(study, Choices())
+        page = report_page(study, ReportOptions())
         said = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
         assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in said
 
