@@ -208,6 +208,7 @@ def test_phantom_trains(tmp_path):
         ("train coliags --data SCENE --renderer magic", "no renderer 'magic'"),
         ("train coliags --data SCENE --resume", "no run under"),
         ("train coliags --data . --output GONE --resume", "not a run folder"),
+        ("train coliags --data SCENE --output RUN", "already exists"),
         ("train scaffold-gs-depth --data SCENE --output RUN --resume", "run of method 'coliags'"),
         ("eval .", "not a run folder"),
         ("eval RUN --protocol papper", "Did you mean 'paper'"),
@@ -221,6 +222,15 @@ def test_what_is_refused(capsys, scene, trained, tmp_path, monkeypatch, command,
     words = [{"SCENE": scene, "RUN": trained}.get(word, word) for word in command.split()]
     assert part in refused(capsys, *words)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", ["{", "{}"])
+def test_damaged_provenance_is_named_and_can_be_replaced(capsys, scene, trained, tmp_path, content):
+    copy = shutil.copytree(trained, tmp_path / "copy")
+    (copy / "provenance.json").write_text(content)
+    assert "provenance.json" in refused(capsys, "eval", copy)
+    assert run("train", "coliags", "--data", scene, "--output", copy, "--steps", 1, *SETS, "--overwrite") == 0
+    assert len((copy / "metrics.jsonl").read_text().splitlines()) == 1 and not (copy / "eval").exists()
 
 
 def test_output_that_is_a_file(capsys, scene, tmp_path):
