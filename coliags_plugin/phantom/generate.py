@@ -30,7 +30,7 @@ from coliags_plugin.phantom.light import CameraLight, IndirectLight, indirect_li
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.props import bodies_at, wet_lens
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, meter_weights, white_balances
-from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
+from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, slow_drift, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import RotationView, camera_path, poses_during, turn_away
@@ -140,11 +140,11 @@ def world_at(world: World, motion: WallMotion | None, settings: PhantomSettings,
 
 
 def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
-    """Settings with every None replaced, and without rotation views if the layout does not support them."""
+    """Settings with the image size, the layout's if none is given, and without rotation views if it has none."""
     width, height = layout.default_size
-    size = {"width": value_or_default(settings.width, width), "height": value_or_default(settings.height, height)}
     views = settings.rotation_views if layout.has_rotation else 0
-    return settings.model_copy(update={**size, "rotation_views": views}).resolved()
+    size = {"width": settings.width or width, "height": settings.height or height}
+    return settings.model_copy(update={**size, "rotation_views": views})
 
 
 def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.phantom.colon import RADIUS, ColonSurface
-from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, value_or_default
+from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw
 from coliags_plugin.phantom.streams import smoothstep
 from coliags_plugin.phantom.tracing import Tracer
 
@@ -49,7 +49,7 @@ class CameraLight:
         """Lamps from settings; they are tilted downwards in the image, and their shares sum to 1."""
         preset = settings.light_preset
         tilt = np.radians(preset.tilt)
-        offsets = settings.lamps or (value_or_default(settings.light_offset, preset.light_offset),)
+        offsets = settings.lamps or (settings.light_offset or (0.0, 0.0, 0.0),)
         shares = settings.lamp_shares or (1.0,) * len(offsets)
         one = cls(
             offset=offsets[0],

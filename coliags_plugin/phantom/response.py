@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.phantom.imaging import Sensor
-from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings, value_or_default
+from coliags_plugin.phantom.settings import SAME_COLORS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, slow_drift, smoothstep, stream
 
 #: Linear level above which the soft shoulder approaches 1.
@@ -88,7 +88,7 @@ def exposures(
     reference = float(np.median(wanted))
     if settled is not None:
         wanted = np.log(np.asarray(settled, np.float64))
-    if value_or_default(settings.gain, settings.light_preset.gain) == "fixed":
+    if settings.gain == "fixed":
         return np.full(len(wanted), np.exp(reference))
     half_span = 0.5 * np.log(settings.gain_span)
     followed = np.clip(wanted, reference - half_span, reference + half_span)
@@ -107,8 +107,7 @@ def exposures(
 def white_balances(settings: PhantomSettings) -> Float[np.ndarray, "T 3"]:
     """Smooth gains of red and blue against green, of log standard deviation ``white_balance_drift``."""
     generator = stream(settings.seed, Purpose.WHITE_BALANCE)
-    deviation = value_or_default(settings.white_balance_drift, settings.light_preset.white_balance_drift)
-    drift = slow_drift(generator, settings.frames, 2, deviation)
+    drift = slow_drift(generator, settings.frames, 2, settings.white_balance_drift or 0.0)
     return np.exp(np.stack([drift[:, 0], np.zeros(settings.frames), drift[:, 1]], axis=1))
 
 

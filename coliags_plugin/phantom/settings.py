@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -21,8 +21,6 @@ from coliags_plugin.core.settings import Settings, validated
 
 #: A colour matrix that changes nothing.
 SAME_COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-_T = TypeVar("_T")
 
 GainMode = Literal["auto", "fixed"]
 #: Of a lamp: exp(-spread (1 - cos psi)), Modrzejewski 2020, or cos^spread psi.
@@ -124,16 +122,11 @@ IN_VIVO: dict[str, Any] = {
 }
 
 
-def value_or_default(value: _T | None, otherwise: _T) -> _T:
-    """The value, or the default if it is None."""
-    return otherwise if value is None else value
-
-
 class PhantomSettings(Settings):
     """Settings of a phantom: colon, endoscope, light, motion and folder layout.
 
-    Ranges cover published values of colons and endoscopes (docs/phantom.md 1, 2, 3). A setting left at None takes the
-    value of the preset named by ``light``.
+    Ranges cover published values of colons and endoscopes (docs/phantom.md 1, 2, 3). Light offset, gain and drift of
+    the white balance that are None take the values of the preset named by ``light``.
     """
 
     seed: int = Field(0, ge=0)  # seed of all random numbers of the phantom
@@ -223,8 +216,13 @@ class PhantomSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _preset_where_not_given(cls, given: Any) -> Any:
-        return {**IN_VIVO, **given} if isinstance(given, dict) and given.get("preset") == "in-vivo" else given
+    def _presets_where_not_given(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        given = {**IN_VIVO, **given} if given.get("preset") == "in-vivo" else given
+        light = PRESETS.get(str(given.get("light", "c3vd")))
+        left_open = [name for name in ("light_offset", "gain", "white_balance_drift") if given.get(name) is None]
+        return given if light is None else {**given, **{name: getattr(light, name) for name in left_open}}
 
     @field_validator("layout")
     @classmethod
@@ -268,15 +266,8 @@ class PhantomSettings(Settings):
 
     @property
     def light_preset(self) -> Preset:
-        """The preset for settings left at None."""
+        """The preset of light and motion."""
         return PRESETS[self.light]
-
-    def resolved(self) -> PhantomSettings:
-        """Settings with None replaced by the preset's values; sizes are left to the layout."""
-        names = ("light_offset", "gain", "white_balance_drift")
-        return self.model_copy(
-            update={name: value_or_default(getattr(self, name), getattr(self.light_preset, name)) for name in names}
-        )
 
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:

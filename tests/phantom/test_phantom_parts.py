@@ -399,10 +399,10 @@ def test_bad_settings_are_named(options, named):
 
 
 def test_presets_fill_what_is_left_open():
-    strong = PhantomSettings(light="strong").resolved()
+    strong = PhantomSettings(light="strong")
     assert (strong.gain, strong.light_offset, strong.white_balance_drift) == ("fixed", (0.0, 0.0, 0.0), 0.0)
     assert phantom_settings({"lamps": [[3.0, 0.0, 0.0]]}).lamps == ((3.0, 0.0, 0.0),)
-    mild = phantom_settings({"gain": "fixed", "layout": "nerfstudio", "white_balance_drift": 0.0}).resolved()
+    mild = phantom_settings({"gain": "fixed", "layout": "nerfstudio", "white_balance_drift": 0.0})
     assert (mild.gain, mild.white_balance_drift, mild.light_offset) == ("fixed", 0.0, (0.0, 0.0, -3.6))
 
 
