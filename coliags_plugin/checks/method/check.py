@@ -134,21 +134,12 @@ def has_all_groups(context: CheckContext) -> str:
     groups, named = model.parameter_groups(), dict(model.named_parameters())
     counts = Counter(id(parameter) for group in groups.values() for parameter in group)
     strangers = counts.keys() - set(map(id, named.values()))
-    refuse(
-        (
-            "in no parameter group, so never trained",
-            [name for name, parameter in named.items() if parameter.requires_grad and not counts[id(parameter)]],
-        ),
-        (
-            "in more than one parameter group",
-            [name for name, parameter in named.items() if counts[id(parameter)] > 1],
-        ),
-        ("empty parameter groups", [name for name, group in groups.items() if not group]),
-        (
-            "parameter groups that hold a parameter that is no attribute of the model",
-            [name for name, group in groups.items() if strangers.intersection(map(id, group))],
-        ),
-    )
+    ungrouped = [name for name, value in named.items() if value.requires_grad and not counts[id(value)]]
+    foreign = [name for name, group in groups.items() if strangers.intersection(map(id, group))]
+    refuse("in no parameter group, so never trained", ungrouped)
+    refuse("in more than one parameter group", [name for name, value in named.items() if counts[id(value)] > 1])
+    refuse("empty parameter groups", [name for name, group in groups.items() if not group])
+    refuse("parameter groups that hold a parameter that is no attribute of the model", foreign)
     return ", ".join(groups)
 
 
@@ -163,7 +154,7 @@ def trains(context: CheckContext) -> str:
     trainer.train()
     context.rows = trainer.run.log_rows()
     spoilt = [name for name, value in trainer.model.named_parameters() if not torch.isfinite(value).all()]
-    refuse((f"after {context.steps} steps these are not finite", spoilt))
+    refuse(f"after {context.steps} steps these are not finite", spoilt)
     rate = context.steps / max(trainer.seconds, 1e-6)
     return f"{context.steps} steps, {rate:.0f} a second, loss {context.rows[-1]['loss']:.4g} at the last"
 
@@ -184,7 +175,7 @@ def every_term_counts(context: CheckContext) -> str:
         for key, step in first.items()
         if step is None
     ]
-    refuse((f"never active in {context.steps} steps", idle))
+    refuse(f"never active in {context.steps} steps", idle)
     return ", ".join(key if step == 1 else f"{key} from step {step}" for key, step in first.items())
 
 
@@ -318,9 +309,7 @@ def renders_again(context: CheckContext) -> str:
     view = frame.view(trained=True)
     first = _maps(model, frame.camera, view)
     _maps(model, _resized(frame.camera), None)
-    apart = difference(first, _maps(model, frame.camera, view))
-    if apart:
-        raise CheckFailedError(f"two renderings of frame {frame.name}: {apart}")
+    refuse(f"two renderings of frame {frame.name}", difference(first, _maps(model, frame.camera, view)))
     threads = torch.get_num_threads()
     other = 2 if threads == 1 else 1
     torch.set_num_threads(other)
@@ -378,12 +367,11 @@ def loads(context: CheckContext) -> str:
     models, frames = (context.trainer.model.eval(), context.trained.model), context.scene.train[:2]
     for frame in frames:
         for view in (frame.view(trained=True), frame.view(trained=False)):
-            apart = difference(*(_maps(model, frame.camera, view) for model in models))
-            if apart:
-                raise CheckFailedError(
-                    f"the run read back renders otherwise: frame {frame.name}: {apart}; what changes in training must "
-                    "be a parameter or a buffer, and from_state must restore it"
-                )
+            refuse(
+                f"the run read back renders otherwise: frame {frame.name}",
+                difference(*(_maps(model, frame.camera, view) for model in models)),
+                "what changes in training must be a parameter or a buffer, and from_state must restore it",
+            )
     return f"{len(frames)} frames render the same bits"
 
 
@@ -539,7 +527,7 @@ def evaluates(context: CheckContext) -> str:
         for name, value in metrics.items()
         if not (summary["reasons"].get(name) if value is None else math.isfinite(value))
     ]
-    refuse(("metrics without value or reason", unexplained))
+    refuse("metrics without value or reason", unexplained)
     values = [f"{name} {value:.4g}" for name, value in metrics.items() if value is not None]
     if not values:
         raise CheckFailedError(f"no metric has a value: {next(iter(summary['reasons'].values()))}")
@@ -556,7 +544,7 @@ def writes_images(context: CheckContext) -> str:
     kinds = {"rgb", "depth", "rgb_error"} | ({"depth_error"} if frames[0].depth is not None else set())
     wanted = [folder / kind / f"{frame.name}.png" for kind in sorted(kinds) for frame in frames]
     missing = [path for path in wanted if not path.is_file() or not path.stat().st_size]
-    refuse(("no image", [str(path.relative_to(folder)) for path in missing]))
+    refuse("no image", [str(path.relative_to(folder)) for path in missing])
     return f"{len(wanted)} images"
 
 
@@ -615,10 +603,8 @@ def ignores_masked_pixels(context: CheckContext) -> str:
     (rows, first), (spoilt_rows, second) = runs
     for ours, theirs in zip(rows, spoilt_rows, strict=True):
         wrong = [key for key, value in ours["terms"].items() if theirs["terms"][key] != value]
-        refuse(("see coliags_plugin.core.masked; loss terms that depend on masked pixels", wrong))
-    apart = difference(first, second)
-    if apart:
-        raise CheckFailedError(f"masked pixels change the model: {apart}; see coliags_plugin.core.masked")
+        refuse("loss terms that depend on masked pixels", wrong, "see coliags_plugin.core.masked")
+    refuse("masked pixels change the model", difference(first, second), "see coliags_plugin.core.masked")
     return "masked pixels change nothing"
 
 

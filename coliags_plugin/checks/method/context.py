@@ -99,12 +99,12 @@ class CheckContext:
         """Fail the check where two runs have not the same bits at a step; the message begins with what they are."""
         ours, theirs = (self.saved(trainer, step) for trainer in (first, second))
         planned = "the sampler plans other frames" if ours.frame_queue != theirs.frame_queue else ""
-        apart = planned or difference(ours.tensors, theirs.tensors)
-        if apart:
-            raise CheckFailedError(
-                f"{what}: {apart}; random numbers must come from the generators given, and what decides on the steps "
-                "to come must be in them, in parameters, buffers or counters"
-            )
+        refuse(
+            what,
+            planned or difference(ours.tensors, theirs.tensors),
+            "random numbers must come from the generators given, and what decides on the steps to come must be in "
+            "them, in parameters, buffers or counters",
+        )
 
     def describe(self, error: BaseException) -> str:
         """An exception in one line: its message, with type and line in the user's code unless it is a reported one."""
@@ -141,11 +141,11 @@ def difference(first: dict[str, Tensor], second: dict[str, Tensor]) -> str:
     return ""
 
 
-def refuse(*faults: tuple[str, Sequence[str]]) -> None:
-    """Fail the check by the first fault that some names have; it ends where their list begins."""
-    for fault, names in faults:
-        if names:
-            raise CheckFailedError(f"{fault}: {', '.join(names)}")
+def refuse(fault: str, seen: str | Sequence[str], advice: str = "") -> None:
+    """Fail the check where something is seen: a difference, or names that have a fault."""
+    if seen:
+        told = seen if isinstance(seen, str) else ", ".join(seen)
+        raise CheckFailedError(f"{fault}: {told}{'; ' if advice else ''}{advice}")
 
 
 def components(config: MethodConfig) -> dict[str, Component]:
