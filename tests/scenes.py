@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -63,28 +64,23 @@ def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24,
     """:func:`wall_scene` on disk, in C3VD's undistorted layout; without depth, its points stand in a file."""
     scene = wall_scene(frames, width, height, depth)
     ordered = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
-    write_c3vd_scene(
-        folder,
-        [frame.image.numpy() for frame in ordered],
-        torch.stack([frame.camera.camera_to_world for frame in ordered]).numpy(),
-        ordered[0].camera.intrinsics,
-        depths=[frame.depth.numpy() for frame in ordered] if depth else None,
-        points=None if depth else scene.points,
-    )
-    return folder
+    return write_frames(folder, ordered, depth, None if depth else scene.points)
 
 
-def write_c3vd_scene(folder, images, camera_to_world, intrinsics, *, depths=None, points=None):
-    """A whole undistorted scene, with all digits of its poses; depth in mm, NaN where unknown."""
-    for index, image in enumerate(images):
-        write_image(folder / f"images/{index:04d}_color.png", image)
-        if depths is not None:
-            write_image(folder / f"depths/{index:04d}_depth.png", depth_steps(depths[index]))
-    atomic_write(folder / "camera_pose.txt", matrix_lines(camera_to_world))
+def write_frames(folder: Path, frames: Sequence[Frame], depth: bool = True, points: PointCloud | None = None) -> Path:
+    """A whole scene of C3VD's undistorted layout, with all digits of its poses; depth in mm, NaN where unknown."""
+    for index, frame in enumerate(frames):
+        write_image(folder / f"images/{index:04d}_color.png", frame.image.numpy())
+        if depth:
+            write_image(folder / f"depths/{index:04d}_depth.png", depth_steps(frame.depth.numpy()))
+    poses = torch.stack([frame.camera.camera_to_world.double() for frame in frames])
+    atomic_write(folder / "camera_pose.txt", matrix_lines(poses.numpy()))
+    intrinsics = frames[0].camera.intrinsics
     write_camera_json(folder / "camera.json", intrinsics, w=intrinsics.width, h=intrinsics.height)
     if points is not None:
         colors = None if points.colors is None else points.colors.numpy()
         write_ply(folder / "points3D.ply", point_properties(points.positions.numpy(), colors))
+    return folder
 
 
 #: Overrides that make a shipped method small enough for a test.

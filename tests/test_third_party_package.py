@@ -24,13 +24,9 @@ RENDERER = EXAMPLE.with_name("example_renderer")
 
 
 @pytest.fixture
-def example():
-    return EXAMPLE
-
-
-@pytest.fixture
-def coliags(example, tmp_path):
+def coliags(request, tmp_path):
     """Runs the command line where an example is installed."""
+    example = getattr(request, "param", EXAMPLE)
     project = tomllib.loads((example / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     info = tmp_path / "site" / f"{project['name']}-{project['version']}.dist-info"
     info.mkdir(parents=True)
@@ -88,7 +84,7 @@ def test_a_method_whose_file_is_missing_is_named(coliags, tmp_path):
     )
 
 
-@pytest.mark.parametrize("example", [RENDERER])
+@pytest.mark.parametrize("coliags", [RENDERER], indirect=True)
 def test_a_renderer_of_another_package_is_registered(coliags):
     done = coliags("list", "renderers")
     assert done.returncode == 0, done.stderr

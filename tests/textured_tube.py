@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
-from tests.scenes import write_c3vd_scene
+from tests.scenes import write_frames
 
 RADIUS, END = 20.0, 60.0
 WIDTH, HEIGHT = 160, 128
@@ -64,11 +64,4 @@ def tube_frames(
 
 def write_tube(folder: Path, count: int = 10, step: float = 1.6) -> Path:
     """:func:`tube_frames` in C3VD's undistorted layout, without depth or points."""
-    frames = tube_frames(count, step)
-    write_c3vd_scene(
-        folder,
-        [frame.image.numpy() for frame in frames],
-        torch.stack([frame.camera.camera_to_world for frame in frames]).numpy(),
-        frames[0].camera.intrinsics,
-    )
-    return folder
+    return write_frames(folder, tube_frames(count, step), depth=False)

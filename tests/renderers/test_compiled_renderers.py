@@ -22,7 +22,7 @@ from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_render
 from coliags_plugin.renderers.numba_kernels import pipeline
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
-from tests.renderers.test_surfels import as_surfels, make_surfels
+from tests.renderers.test_surfels import as_surfels, make_surfels, outputs_of
 from tests.renderers.test_torch_renderer import INPUTS, cast, make, pinhole, random_gaussians, relative
 
 PRIMITIVES = ("gaussians3d", "surfels")
@@ -96,10 +96,6 @@ def scene(primitive, name="random"):
 
 def of_primitive(primitive, gaussians):
     return gaussians if primitive == "gaussians3d" else as_surfels(gaussians)
-
-
-def outputs_of(gaussians):
-    return OUTPUTS if gaussians.scales.shape[1] == 2 else solids.OUTPUTS
 
 
 def on_a_cutoff(gaussians, camera):

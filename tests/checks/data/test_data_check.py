@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,12 +15,12 @@ from coliags_plugin.checks.data.check import check_scene, video_pairs
 from coliags_plugin.checks.data.findings import findings_of, image_facts, lamp_facts, moving_step, path_facts
 from coliags_plugin.checks.data.hypotheses import CHANGES, FrameMatches, Pair, agreement, best_scale, match, supported
 from coliags_plugin.checks.data.page import check_page
-from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
 from coliags_plugin.reporting.text_formats import page_text
 from tests.commands import run
-from tests.scenes import write_c3vd_scene
+from tests.scenes import write_frames
 from tests.textured_tube import tube_frames
 
 
@@ -29,18 +28,6 @@ from tests.textured_tube import tube_frames
 def frames():
     """A tube that a camera goes into, swaying and turning; 32 mm in 24 frames."""
     return tube_frames(24, 0.6)
-
-
-def write_frames(path: Path, frames: list[Frame], depth: bool = True) -> Path:
-    """Frames in C3VD's undistorted layout."""
-    write_c3vd_scene(
-        path,
-        [frame.image.numpy() for frame in frames],
-        np.stack([frame.camera.camera_to_world.double().numpy() for frame in frames]),
-        frames[0].camera.intrinsics,
-        depths=[frame.depth.numpy() for frame in frames] if depth else None,
-    )
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -228,12 +215,13 @@ def test_constant_and_unknown_depth(scene):
 
 def test_carrying_a_plane_is_exact(tmp_path):
     """Two cameras before a plane: depth there is known in closed form."""
-    pinhole, size = Intrinsics(60.0, 60.0, 40.0, 30.0, 80, 60), (60, 80)
-    poses = np.stack([np.eye(4)] * 3)
-    poses[:, 2, 3] = 0.0, 2.0, 4.0
-    depths = [np.full(size, 20.0 - z) for z in poses[:, 2, 3]]
-    images = [np.full((*size, 3), 90, np.uint8)] * 3
-    write_c3vd_scene(tmp_path / "plane", images, poses, pinhole, depths=depths)
+    frames = []
+    for index, z in enumerate((0.0, 2.0, 4.0)):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[2, 3] = z
+        camera, image = Camera(60.0, 60.0, 40.0, 30.0, 80, 60, pose), torch.full((60, 80, 3), 90, dtype=torch.uint8)
+        frames.append(Frame(f"{index:04d}", index, image, camera, torch.full((60, 80), 20.0 - z)))
+    write_frames(tmp_path / "plane", frames)
     plane = C3VDDataManager(C3VDSettings(split="all-train")).load(tmp_path / "plane")
     pairs = [Pair(a, b) for a, b in video_pairs(plane.train)]
     assert agreement(pairs).depth_error < 1e-4

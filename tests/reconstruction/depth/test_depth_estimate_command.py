@@ -25,25 +25,15 @@ from coliags_plugin.reconstruction.depth.work_files import WorkFolder
 from tests import commands
 from tests.commands import run
 from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames
-from tests.scenes import write_c3vd_scene
+from tests.scenes import write_frames
 
 COUNT = 9
 OPTIONS = ("--set", "depth.features.highlight_level=256", "--jobs", 2)
 
 
-def write_wall(folder: Path, frames) -> Path:
-    write_c3vd_scene(
-        folder,
-        [frame.image.numpy() for frame in frames],
-        np.stack([frame.camera.camera_to_world.numpy() for frame in frames]),
-        frames[0].camera.intrinsics,
-    )
-    return folder
-
-
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("walls") / "wall", wall_frames(sideways(COUNT)))
+    return write_frames(tmp_path_factory.mktemp("walls") / "wall", wall_frames(sideways(COUNT)), depth=False)
 
 
 @pytest.fixture(scope="module")
@@ -276,13 +266,13 @@ def test_frames_of_several_sizes_are_refused():
 
 def test_what_gives_no_depth_is_refused(tmp_path, capsys):
     out = ("--output", tmp_path / "out", *OPTIONS)
-    few = write_wall(tmp_path / "few", wall_frames(sideways(3)))
+    few = write_frames(tmp_path / "few", wall_frames(sideways(3)), depth=False)
     assert "3 frames. Expected at least 4" in refused(capsys, few, *out, "--set", "split=all-train")
-    still = write_wall(tmp_path / "still", wall_frames(sideways(6, 0.0)))
+    still = write_frames(tmp_path / "still", wall_frames(sideways(6, 0.0)), depth=False)
     assert "all 5 cameras are at the same position" in refused(capsys, still, *out)
     turning = sideways(6, 1e-4)
     turning[:, :3, :3] = Rotation.from_euler("y", 3.0 * np.arange(6)[:, None], degrees=True).as_matrix()
-    turned = write_wall(tmp_path / "turned", wall_frames(turning))
+    turned = write_frames(tmp_path / "turned", wall_frames(turning), depth=False)
     assert "the depth range is unknown" in refused(capsys, turned, *out)
     assert "no frame has 3 others" in refused(capsys, turned, *out, "--near", 20, "--far", 80)
     assert not (tmp_path / "out").exists()
@@ -302,11 +292,11 @@ def noisy(frames, level, seed=0):
 @pytest.mark.parametrize("level", [2, 90])
 def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, caplog, level):
     frames = wall_frames(sideways(COUNT))
-    nothing = write_wall(tmp_path / "nothing", noisy(frames, level))
+    nothing = write_frames(tmp_path / "nothing", noisy(frames, level), depth=False)
     assert "the depth range is unknown" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS)
     told = ("--near", 20, "--far", 80)
     assert "no surface that 9 frames agree on" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS, *told)
-    some = write_wall(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]])
+    some = write_frames(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]], depth=False)
     assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *told) == 0
     found = frames_of(tmp_path / "b")
     reason = f"mean weight of their own matches below 0.1: {found[4].name}"
