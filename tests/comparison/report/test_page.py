@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_cell
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import MetricRecord
-from tests.comparison.report.made import FRAMES, NO_LPIPS, decided, made_scenes, result_of, write_comparison
+from tests.comparison.report.made import FRAMES, METRICS, NO_LPIPS, decided, made_scenes, result_of, write_comparison
 
 
 def blocks_of(section):
@@ -66,135 +66,150 @@ def test_facts_and_title(study_of):
 # Summary
 
 
-def test_lpips_of_another_net_where_there_is_no_vgg(study_of):
-    ours = result_of("coliags")
-    part = ours.sets["test"]
-    values = {**part.values, "lpips_squeeze": (0.1,) * len(part.frames)}
-    sets = {**ours.sets, "test": part.model_copy(update={"values": values})}
-    metrics = {**ours.metrics, "lpips_squeeze": ours.metrics["lpips"]}
-    squeezed = ours.model_copy(update={"metrics": metrics, "sets": sets, "metrics_sha256": metrics_sha256(sets)})
-    both = tables(of(study_of, [squeezed]))
-    assert [column.key for column in both["summary-test"].columns if column.shown][3] == "lpips_squeeze"
-    assert not {"lpips", "lpips_squeeze"} & {c.key for c in both["summary-rotation"].columns if c.shown}
-    chosen = tables(of(study_of, [squeezed], columns=["lpips"]))["summary-test"]
-    assert [column.key for column in chosen.columns[1:] if column.shown] == ["lpips"]
+def measured(name, unit, value, reasons=None):
+    """A result without true depth, with a metric of the test set that others do not have."""
+    result = result_of("coliags", depth=None)
+    part = result.sets["test"]
+    values = {**part.values, name: (value,) * len(part.frames)}
+    changed = part.model_copy(update={"values": values, "reasons": {**part.reasons, **(reasons or {})}})
+    sets = {**result.sets, "test": changed}
+    metrics = {**result.metrics, name: MetricRecord(unit=unit, direction="lower")}
+    return result.model_copy(update={"metrics": metrics, "sets": sets, "metrics_sha256": metrics_sha256(sets)})
 
 
-def test_the_summary_of_one_scene_is_the_mean_of_its_frames(study_of):
-    page = of(study_of, [result_of("coliags", psnr=32.126, depth=0.5), result_of("3dgs", psnr=30.0, depth=1.0)])
-    table = tables(page)["summary-test"]
-    assert [column.key for column in table.columns[1:] if column.shown] == [
-        "psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error",
-    ]  # fmt: skip
-    assert f"Not shown, without values: LPIPS: {NO_LPIPS}" in table.notes
-    assert [(e.text, e.rank, e.spread) for e in entries(table, "psnr").values()] == [("32.13", 1, ""), ("30.00", 2, "")]
-    assert [(e.text, e.rank) for e in entries(table, "ssim").values()] == [("0.9000", 1), ("0.9000", 1)]
-    assert [(e.text, e.rank) for e in entries(table, "depth_mse").values()] == [("0.250", 1), ("1.000", 2)]
-    assert {e.note for e in entries(table, "lpips").values()} == {f"LPIPS: {NO_LPIPS}"}
-    assert table.count == "5 frames"
-    rotation = tables(page)["summary-rotation"]
-    assert [column.key for column in rotation.columns][1:3] == ["psnr", "psnr_seen"]
-    assert "psnr_seen" not in [column.key for column in table.columns]
-    assert [section.title for section in page.text_sections] == ["Metrics", "Costs"]
+def shown(table):
+    return [column.key for column in table.columns[1:] if column.shown]
 
 
-def test_the_summary_of_many_scenes_is_the_mean_over_scenes(study_of):
-    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, seeds=3)
-    table = tables(of(study_of, results))["summary-test"]
-    means = [
-        np.mean([r.sets["test"].mean("psnr") for r in results if r.method == "coliags" and r.scene.name == scene])
-        for scene in dict.fromkeys(r.scene.name for r in results)
-    ]
-    entry = entries(table, "psnr")["coliags"]
-    assert entry.value == pytest.approx(np.mean(means))
-    assert float(entry.spread) == pytest.approx(np.std(means, ddof=1), abs=0.005)
-    assert table.count == "8 scenes, 40 frames"
-    assert any("standard deviation over scenes" in note for note in table.notes)
+NO_TRUTH = {name: "estimated depth is no truth" for name in METRICS if name.startswith("depth")}
+TWO = [result_of("coliags", psnr=32.126, depth=0.5), result_of("3dgs", psnr=30.0, depth=1.0)]
 
 
-def test_means_that_one_scene_rules_are_named_with_their_medians(study_of):
-    depths = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
-    results = [result_of(m, f"s{i}", depth=depth) for m, own in depths.items() for i, depth in enumerate(own)]
-    table = tables(of(study_of, results))["summary-test"]
-    means = entries(table, "depth_mse").values()
-    assert [(cell.value, cell.rank) for cell in means] == [(pytest.approx(1.0075), 2), (pytest.approx(0.0525), 1)]
-    ruled = [note for note in table.notes if "rule the mean" in note]
-    assert ruled[0] == (
-        "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags (0.0100)"
-    )
+@pytest.mark.parametrize(
+    ("results", "options", "table", "columns"),
+    [
+        (TWO, {}, "test", ["psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error"]),
+        (TWO, {}, "rotation", ["psnr", "psnr_seen", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error"]),
+        (TWO, {"columns": ("depth_abs_rel", "psnr")}, "test", ["depth_abs_rel", "psnr"]),
+        (TWO, {"columns": ("all",)}, "test", [name for name in METRICS if name != "psnr_seen"]),
+        (TWO, {"columns": ("psnr_seen", "ssim")}, "test", ["ssim"]),  # the first is the rotation set's
+        # LPIPS of another net where there is no VGG; metrics at points where there is no true depth.
+        ([measured("lpips_squeeze", "", 0.1)], {}, "test", ["psnr", "ssim", "lpips_squeeze"]),
+        ([measured("lpips_squeeze", "", 0.1)], {}, "rotation", ["psnr", "psnr_seen", "ssim"]),
+        ([measured("lpips_squeeze", "", 0.1)], {"columns": ("lpips",)}, "test", ["lpips"]),
+        ([measured("sparse_depth_median", "%", 3.0, NO_TRUTH)], {}, "test", ["psnr", "ssim", "sparse_depth_median"]),
+    ],
+)
+def test_columns(study_of, results, options, table, columns):
+    assert shown(tables(of(study_of, results, **options))[f"summary-{table}"]) == columns
 
 
-def test_seeds_of_one_scene_spread_over_seeds(study_of):
-    results = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
-    for name, more in (("summary-test", []), ("scene-cecum-test", [result_of("coliags", "sigmoid")])):
-        table = tables(of(study_of, [*results, *more]))[name]
-        assert entries(table, "psnr")["coliags"].spread == "1.00"
-        assert "± standard deviation over seeds" in table.notes
-
-
-def test_a_missing_scene_is_left_out_for_all(study_of):
+def scenes_without(method, scene):
+    """Results of three methods, one of which lacks a scene."""
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
-    page = of(study_of, [r for r in results if (r.method, r.scene.name) != ("3dgs", "scene-5")])
+    return [r for r in results if (r.method, r.scene.name) != (method, scene)]
+
+
+FLAT = [result_of(m, s, depth=d) for m in ("coliags", "3dgs") for s, d in (("p", 0.5), ("q", 0.5), ("flat", None))]
+SEEDS = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
+RULED = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
+
+
+@pytest.mark.parametrize(
+    ("results", "table", "metric", "cells"),
+    [
+        (TWO, "summary-test", "psnr", {"coliags": ("32.13", "", 1, ""), "3dgs": ("30.00", "", 2, "")}),
+        (TWO, "summary-test", "ssim", {"coliags": ("0.9000", "", 1, ""), "3dgs": ("0.9000", "", 1, "")}),
+        (TWO, "summary-test", "depth_mse", {"coliags": ("0.250", "", 1, ""), "3dgs": ("1.000", "", 2, "")}),
+        (TWO, "summary-test", "lpips", dict.fromkeys(("coliags", "3dgs"), ("", "", None, f"LPIPS: {NO_LPIPS}"))),
+        (SEEDS, "summary-test", "psnr", {"coliags": ("31.00", "1.00", None, "")}),
+        ([*SEEDS, result_of("coliags", "q")], "scene-cecum-test", "psnr", {"coliags": ("31.00", "1.00", None, "")}),
+        (
+            [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})],
+            "summary-test",
+            "ssim",
+            {"coliags": ("0.7500", "", None, "SSIM: mean over 4 of 5 frames; no reason was recorded")},
+        ),
+        (
+            [result_of("a", "p"), result_of("b", "p"), result_of("b", "q"), result_of("c", "q")],
+            "summary-test",
+            "psnr",
+            dict.fromkeys("abc", ("", "", None, "PSNR: no scene that all methods have")),
+        ),
+        (  # a scene without depth counts for PSNR, and for no depth metric
+            FLAT,
+            "summary-test",
+            "depth_mse",
+            dict.fromkeys(
+                ("coliags", "3dgs"),
+                ("0.250", "0.000", 1, "Depth MSE: not available for flat; the frame has no true depth"),
+            ),
+        ),
+        (
+            FLAT,
+            "scene-flat-test",
+            "depth_mse",
+            dict.fromkeys(("coliags", "3dgs"), ("", "", None, "Depth MSE: the frame has no true depth")),
+        ),
+    ],
+)
+def test_means_of_metrics(study_of, results, table, metric, cells):
+    found = entries(tables(of(study_of, results))[table], metric)
+    assert {method: (c.text, c.spread, c.rank, c.note) for method, c in found.items()} == cells
+
+
+@pytest.mark.parametrize(
+    ("results", "notes"),
+    [
+        (TWO, [f"Not shown, without values: LPIPS: {NO_LPIPS}"]),
+        (
+            [measured("sparse_depth_median", "%", 3.0, NO_TRUTH)],
+            ["Not shown, without values: Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: estimated"],
+        ),
+        (SEEDS, ["± standard deviation over seeds"]),
+        (scenes_without("3dgs", "scene-5"), ["Means over 7 of 8 scenes, without scene-5, which not every method has"]),
+        (
+            FLAT,
+            [
+                "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
+                "means over 2 of 3 scenes, without flat, which not every method has"
+            ],
+        ),
+        (
+            [result_of(m, f"s{i}", depth=depth) for m, own in RULED.items() for i, depth in enumerate(own)],
+            [
+                "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags "
+                "(0.0100)",
+                "± standard deviation over scenes",
+            ],
+        ),
+    ],
+)
+def test_notes_below_the_means(study_of, results, notes):
+    found = tables(of(study_of, results))["summary-test"].notes
+    assert all(any(note.startswith(said) for note in found) for said in notes), found
+
+
+def test_the_summary_of_many_scenes_is_the_mean_over_those_that_all_have(study_of):
+    results = scenes_without("3dgs", "scene-5")
+    page = of(study_of, results)
     table = tables(page)["summary-test"]
     others = [r.sets["test"].mean("psnr") for r in results if r.method == "coliags" and r.scene.name != "scene-5"]
-    assert entries(table, "psnr")["coliags"].value == pytest.approx(np.mean(others))
-    assert "Means over 7 of 8 scenes, without scene-5, which not every method has" in table.notes
+    entry = entries(table, "psnr")["coliags"]
+    assert (entry.value, table.count) == (pytest.approx(np.mean(others)), "8 scenes, 40 frames")
+    assert float(entry.spread) == pytest.approx(np.std(others, ddof=1), abs=0.005)
     assert any(caution.startswith("3dgs has no result of scene-5") for caution in page.cautions)
-    lead = tables(page)["lead-test-psnr"]
-    assert [e.text for e in entries(lead, "scenes").values()] == ["7", "8"]
-    missing = entries(tables(page)["scene-scene-5-test"], "psnr")["3dgs"]
-    assert (missing.text, missing.note) == ("", "3dgs: no result")
+    assert [e.text for e in entries(tables(page)["lead-test-psnr"], "scenes").values()] == ["7", "8"]
+    assert entries(tables(page)["scene-scene-5-test"], "psnr")["3dgs"].note == "3dgs: no result"
+    assert [section.title for section in page.text_sections] == ["Metrics", "Costs", "Every scene"]
 
 
-def test_a_metric_missing_on_a_scene_leaves_it_out_of_that_column(study_of):
-    """A scene without depth: it counts for PSNR, and for no depth metric."""
-    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=3)
-    flat = [result_of(method, "flat", depth=None) for method in ("coliags", "3dgs")]
-    page = of(study_of, [*results, *flat])
-    table = tables(page)["summary-test"]
-    left_out = [note for note in table.notes if "which not every method has" in note]
-    assert left_out == [
-        "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
-        "means over 3 of 4 scenes, without flat, which not every method has"
-    ]
-    assert entries(table, "depth_mse")["coliags"].note == (
-        "Depth MSE: not available for flat; the frame has no true depth"
-    )
-    scene = entries(tables(page)["scene-flat-test"], "depth_mse")["3dgs"]
-    assert (scene.text, scene.note) == ("", "Depth MSE: the frame has no true depth")
-
-
-def test_a_mean_over_some_frames_says_so(study_of):
-    page = of(study_of, [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})])
-    entry = entries(tables(page)["summary-test"], "ssim")["coliags"]
-    assert (entry.text, entry.rank) == ("0.7500", None)
-    assert entry.note == "SSIM: mean over 4 of 5 frames; no reason was recorded"
-
-
-def test_no_scene_that_all_have(study_of):
-    results = [result_of("a", "p"), result_of("b", "p"), result_of("b", "q"), result_of("c", "q")]
-    table = tables(of(study_of, results))["summary-test"]
-    assert {e.note for e in entries(table, "psnr").values()} == {"PSNR: no scene that all methods have"}
-
-
-# Columns and reference
-
-
-def test_columns_are_chosen(study_of):
-    results = [result_of("coliags"), result_of("3dgs")]
-
-    def shown(**choices):
-        table = tables(of(study_of, results, **choices))["summary-test"]
-        return [column.key for column in table.columns[1:] if column.shown]
-
-    assert shown(columns=("depth_abs_rel", "psnr")) == ["depth_abs_rel", "psnr"]
-    assert len(shown(columns=("all",))) == 7
-    assert shown(columns=("psnr_seen", "ssim")) == ["ssim"]  # which the rotation set has
-    with pytest.raises(InputError, match=r"no metric 'depth_mes'.*Did you mean 'depth_mse'"):
-        of(study_of, results, columns=("depth_mes",))
+# Reference
 
 
 def test_reference(study_of):
+    with pytest.raises(InputError, match=r"no metric 'depth_mes'.*Did you mean 'depth_mse'"):
+        of(study_of, TWO, columns=("depth_mes",))
     results = made_scenes({"a": 0.0, "b": 1.0, "c": 0.5})
     assert "lead of b" in tables(of(study_of, results))["lead-test-psnr"].title
     chosen = of(study_of, results, reference="a")
@@ -344,21 +359,6 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
 )
 def test_cautions(study_of, results, said):
     assert of(study_of, results).cautions == said
-
-
-def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
-    result = result_of("coliags", depth=None)
-    part = result.sets["test"]
-    reasons = {name: "estimated depth is no truth" for name in result.metrics if name.startswith("depth")}
-    values = {**part.values, "sparse_depth_median": (3.0,) * len(part.frames)}
-    sets = {**result.sets, "test": part.model_copy(update={"values": values, "reasons": reasons})}
-    metrics = {**result.metrics, "sparse_depth_median": MetricRecord(unit="%", direction="lower")}
-    changed = result.model_copy(update={"sets": sets, "metrics": metrics, "metrics_sha256": metrics_sha256(sets)})
-    table = tables(of(study_of, [changed]))["summary-test"]
-    shown = [column.key for column in table.columns[1:] if column.shown]
-    assert "sparse_depth_median" in shown and not any(name.startswith("depth") for name in shown)
-    (note,) = [note for note in table.notes if "estimated depth is no truth" in note]
-    assert note.startswith("Not shown, without values: Depth MSE; ")
 
 
 def test_cells_without_a_result(tmp_path, study_of):
