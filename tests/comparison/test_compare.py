@@ -178,20 +178,34 @@ def test_progress_ends_with_the_last_cell_not_with_its_last_step(wall, tmp_path,
 # What fails
 
 
-def test_a_scene_without_depth_fails_the_methods_that_need_it_alone(wall, bare, tmp_path):
-    done = compare_inline(["coliags", "scaffold-gs"], [wall, bare], tmp_path / "new")
-    assert [(failure.scene, failure.method) for failure in done.failures] == [("bare", "coliags")]
-    assert "depth" in done.failures[0].reason
-    assert len(done.results) == 3
+WILD = ("optimizers.opacity_mlp.lr=1e39", "optimizers.opacity_mlp.final_lr=1e39")
+
+
+@pytest.mark.parametrize(
+    ("methods", "options", "failed", "reason", "done"),
+    [
+        (
+            ["coliags", "scaffold-gs"],
+            {},
+            ("bare", "coliags"),
+            "depth",
+            ["wall coliags", "wall scaffold-gs", "bare scaffold-gs"],
+        ),
+        ([Variant("wild", "coliags", WILD), "coliags"], {"steps": 6}, ("wall", "wild"), "not finite", ["wall coliags"]),
+        (["coliags"], {"splits": ["all-train"]}, ("wall-all-train", "coliags"), "has no test frames", []),
+    ],
+)
+def test_what_cannot_be_done_fails_alone(wall, bare, tmp_path, methods, options, failed, reason, done):
+    found = compare_inline(methods, [wall] if options else [wall, bare], tmp_path / "new", **options)
+    (failure,) = found.failures
+    assert (failure.scene, failure.method) == failed and reason in failure.reason
+    assert [f"{result.scene.name} {result.method}" for result in found.results] == done
     (file,) = (tmp_path / "new" / "failures").rglob("*.json")
-    assert json.loads(file.read_text())["reason"] == done.failures[0].reason
-    assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(done.table()))
-
-
-def test_a_split_without_test_frames_fails_before_training(wall, tmp_path, monkeypatch):
-    monkeypatch.setattr(Trainer, "train", None)
-    done = compare_inline(["coliags"], [wall], tmp_path / "new", splits=["all-train"])
-    assert "has no test frames" in done.failures[0].reason
+    assert json.loads(file.read_text())["reason"] == failure.reason
+    if "splits" in options:
+        assert not [*(tmp_path / "new").rglob("metrics.jsonl")], "it fails before training"
+    elif not options:
+        assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(found.table()))
 
 
 def test_a_failure_is_forgotten_when_the_cell_is_done(wall, tmp_path, monkeypatch):
@@ -201,14 +215,6 @@ def test_a_failure_is_forgotten_when_the_cell_is_done(wall, tmp_path, monkeypatc
     monkeypatch.undo()
     done = compare_inline(["coliags"], [wall], tmp_path / "new")
     assert not done.failures and not list((tmp_path / "new" / "failures").rglob("*.json"))
-
-
-def test_a_run_that_becomes_nan_fails_alone(wall, tmp_path):
-    wild = ("optimizers.opacity_mlp.lr=1e39", "optimizers.opacity_mlp.final_lr=1e39")
-    methods = [Variant("wild", "coliags", wild), "coliags"]
-    done = compare_inline(methods, [wall], tmp_path / "new", steps=6)
-    assert [failure.method for failure in done.failures] == ["wild"] and "not finite" in done.failures[0].reason
-    assert [result.method for result in done.results] == ["coliags"]
 
 
 def test_a_full_disk_in_the_middle(wall, tmp_path, monkeypatch):
@@ -261,17 +267,13 @@ def test_a_stop_names_what_is_done(wall, tmp_path):
 # Damaged and foreign folders
 
 
-def test_a_half_written_result_is_reported_and_written_again(wall, folder, caplog):
+def test_a_damaged_result_is_written_again_and_a_newer_one_refused(wall, folder, caplog):
     (path,) = (folder / "results" / "wall" / "coliags").iterdir()
     whole = path.read_bytes()
     path.write_bytes(whole[:300])
     _, ran = again(wall, folder)
     assert ran == ["wall coliags seed 0"] and "not counted as done" in caplog.text and path.name in caplog.text
     assert read_result(path).metrics_sha256 == json.loads(whole)["metrics_sha256"]
-
-
-def test_a_result_of_a_newer_version_is_refused_by_name(wall, folder):
-    (path,) = (folder / "results" / "wall" / "coliags").iterdir()
     path.write_text(path.read_text().replace('"version": 1', '"version": 99', 1))
     with pytest.raises(NewerResultError, match=re.escape(str(path))):
         again(wall, folder)

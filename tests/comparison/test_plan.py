@@ -42,9 +42,6 @@ def test_one_cell_for_each_method_split_and_seed_the_seeds_together(wall):
     assert {cell.config.datamanager.settings.split for cell in made if cell.scene_label == "wall"} == {"every-8th"}
     assert len({cell.keys.result for cell in made}) == len(made)
     assert {cell.config.schedule.steps for cell in made} == {5}
-
-
-def test_the_split_of_a_change_is_in_the_label_too(wall):
     (cell,) = cells(wall, overrides=["datamanager.split=block"])
     assert cell.scene_label == "wall-block"
 
@@ -70,9 +67,6 @@ def test_a_method_under_another_name_has_the_same_key(wall):
     )
     assert ours.keys == same.keys and ours.keys != other.keys
     assert ours.run_path != same.run_path
-
-
-def test_places_are_made_of_scene_method_seed_and_key(wall):
     (cell,) = cells(wall, ["ablations/depth"])
     assert str(cell.run_path) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
     assert str(cell.result_path) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"

@@ -213,17 +213,6 @@ def test_splits_are_parts_of_their_own(study_of):
     assert study.methods == ["a", "b"]
 
 
-def test_values_by_method_scene_and_seed(study_of):
-    study = study_of([result_of("a", psnr=30.0), result_of("a", seed=1, psnr=32.0), result_of("b", psnr=20.0)])
-    test, rotation = study.parts
-    assert test.values("psnr") == {"a": {"cecum": {0: 30.0, 1: 32.0}}, "b": {"cecum": {0: 20.0}}}
-    assert test.values("lpips") == {"a": {}, "b": {}}
-    assert rotation.values("psnr_seen")["b"] == {"cecum": {0: 22.0}}
-    assert list(study.metrics)[:2] == ["psnr", "psnr_seen"]
-    assert test.reason("a", "lpips_seen") == "no VGG weights & none to be had"
-    assert test.reason("a", "unheard") == "no reason was recorded"
-
-
 @pytest.mark.parametrize(
     ("results", "labels"),
     [
