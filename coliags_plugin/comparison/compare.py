@@ -20,7 +20,7 @@ from coliags_plugin.config.method_config import method_name
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number, did_you_mean
-from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.scene_settings import Split
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.queue import Job, JobQueue, make_executor
 from coliags_plugin.execution.tasks import Ending, ExecutionOptions, Executor

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from coliags_plugin.core.settings import read_validated
-from coliags_plugin.datamanagers.units import Unit, read_unit
+from coliags_plugin.datamanagers.scene_settings import Unit, read_unit
 
 #: Name of the file, in the scene's folder.
 ATLAS_FILE = "atlas.json"

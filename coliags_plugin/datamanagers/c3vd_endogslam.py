@@ -32,8 +32,7 @@ from coliags_plugin.datamanagers.recording import (
     poses_of_images,
 )
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses

@@ -26,9 +26,15 @@ from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampl
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, StoredFrame, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.splits import Split, divide
-from coliags_plugin.datamanagers.units import FACTORS, Unit, read_unit
+from coliags_plugin.datamanagers.scene_settings import (
+    FACTORS,
+    POINTS_FILE,
+    SceneSettings,
+    Split,
+    Unit,
+    divide,
+    read_unit,
+)
 from coliags_plugin.geometry.lenses.models import Lens
 
 log = logging.getLogger(__name__)

@@ -22,8 +22,7 @@ from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.images import DepthSteps, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.units import printed_unit
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
 from coliags_plugin.geometry.meshes.files import read_mesh

@@ -26,8 +26,7 @@ from coliags_plugin.datamanagers.reading.files import for_all, inventory, number
 from coliags_plugin.datamanagers.reading.images import DepthFormat, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import ROTATION, Recording, Shot, find_seen_masks, fingerprint, make_shots
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.datamanagers.atlas import AtlasRecord, read_atlas
-from coliags_plugin.datamanagers.units import Unit
+from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin

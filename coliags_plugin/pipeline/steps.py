@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.method_config import load_method, method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.datamanagers.units import Unit
+from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import Span, frame_source

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.config.assignments import settings_of
-from coliags_plugin.datamanagers.units import read_unit
+from coliags_plugin.datamanagers.scene_settings import read_unit
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from tests import commands

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.splits import held_out, split_options
-from coliags_plugin.datamanagers.units import read_unit, write_unit
+from coliags_plugin.datamanagers.scene_settings import held_out, read_unit, split_options, write_unit
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import not_writable
-from coliags_plugin.datamanagers.units import read_unit
+from coliags_plugin.datamanagers.scene_settings import read_unit
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses import colmap

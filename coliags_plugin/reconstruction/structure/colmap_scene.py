@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.datamanagers.atlas import ATLAS_FILE
-from coliags_plugin.datamanagers.units import Unit, write_unit
+from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
