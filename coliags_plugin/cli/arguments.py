@@ -1,4 +1,4 @@
-"""Arguments that several commands share, each with its help; parsing of their values, and checks of output folders."""
+"""Groups of commands; parsing of values of arguments, and checks of output folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
 
 S = TypeVar("S", bound="Settings")
-R = TypeVar("R")
 
 
 class Runnable(Protocol):
