@@ -81,7 +81,7 @@ def import_splats(options: ImportOptions) -> Run:
             exists or cannot be written.
     """
     from coliags_plugin.engine.devices import choose_device
-    from coliags_plugin.export.baking.importing import import_run
+    from coliags_plugin.export.baking.exporting import import_run
 
     scene = options.data.resolve().name
     folder = RunFolder.default(scene, "imported") if options.output is None else RunFolder(options.output)

@@ -12,12 +12,10 @@ import tyro
 
 from coliags_plugin._version import __version__
 from coliags_plugin.cli.arguments import Runnable
-from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
-from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
-from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, ListCommand
+from coliags_plugin.cli.comparing import AblateCommand, CompareCommand, ReportCommand, ResultsCommand
+from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, DoctorCommand, ListCommand, WeightsCommand
 from coliags_plugin.cli.poses import PosesCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
-from coliags_plugin.cli.results import ReportCommand, ResultsCommand
 from coliags_plugin.cli.runs import (
     CoverageCommand,
     EvaluateCommand,

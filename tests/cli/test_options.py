@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.cli import results, runs
-from coliags_plugin.cli.comparing import CompareCommand
+from coliags_plugin.cli import runs
+from coliags_plugin.cli.comparing import CompareCommand, ReportCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
 from coliags_plugin.config.options import Options, TrainOptions, takes
 
@@ -26,7 +26,7 @@ from coliags_plugin.config.options import Options, TrainOptions, takes
         (runs.MeshCommand, cp.Run.mesh, "path data device json"),
         (runs.ViewCommand, cp.Run.save_view, "path data device json host port open"),
         (CompareCommand, cp.compare, "dry_run json"),
-        (results.ReportCommand, cp.report, "paths json"),
+        (ReportCommand, cp.report, "paths json"),
         (
             ReconstructCommand,
             cp.reconstruct,

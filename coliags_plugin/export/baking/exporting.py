@@ -1,4 +1,4 @@
-"""Runs as files of Gaussians, with a record of what they are and what they lose."""
+"""Runs as files of Gaussians, with a record of what they are and what they lose; and such files as runs."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, check_name
-from coliags_plugin.core.files import refuse_existing, write_json
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.files import atomic_folder, refuse_existing, write_json
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
-from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
-from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, write_splats
+from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud, load_cloud
+from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.reporting.numbers import counted
 
@@ -33,6 +36,12 @@ log = logging.getLogger(__name__)
 
 #: Of the record beside a file; incremented when a reader of the older version would misread it.
 RECORD_VERSION = 1
+#: Metrics of protocols that are compared.
+_METRICS = ("psnr", "depth_mse")
+#: Methods of imported Gaussians, by the number of their scales.
+_METHODS = {3: "3dgs", 2: "2dgs"}
+#: Training cameras, approximately, that are asked what they see of a file; and the share of it that is too few.
+_CAMERAS, _FEW = 16, 0.01
 
 
 @dataclass(frozen=True)
@@ -156,10 +165,6 @@ def _checked(cloud: SplatCloud, trained: TrainedRun) -> SplatCloud:
     return cloud.part(usable)
 
 
-#: Metrics of protocols that are compared.
-_METRICS = ("psnr", "depth_mse")
-
-
 def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> dict[str, dict[str, Any]]:
     """Compare a cloud with its run on every held-out view, by the run's protocol; means per test set.
 
@@ -234,3 +239,52 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means of the metrics that some frame has, over the frames that have them."""
     values = {name: [row[name] for row in rows if name in row] for name in _METRICS}
     return {name: sum(found) / len(found) for name, found in values.items() if found}
+
+
+def import_run(
+    file: Path,
+    data: Path,
+    output: RunFolder,
+    device: torch.device,
+    data_format: str | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
+
+    The file is in the frame and unit of the scene in the folder ``data``, which the named data manager reads, or the
+    one that recognises it; ``device`` is recorded.
+    """
+    output.check_free(overwrite)
+    cloud = read_splats(file)
+    method = load_method_for(data, _METHODS[cloud.scales.shape[1]], data_format=data_format)
+    config = method.config
+    scene = load_scene(config, data)
+    _warn_of_another_frame(scene, cloud, file)
+    field = config.field.target(config.field.settings, len(cloud))
+    load_cloud(field, cloud)
+    trainer = Trainer(method, scene, str(data.resolve()), output, 0, device, field)
+    provenance = trainer.provenance()
+    del provenance["plan"]
+    provenance["imported"] = {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree}
+    with atomic_folder(output.path, overwrite=True) as scratch:
+        trainer.run = RunFolder(scratch)
+        trainer.run.rewrite(config.to_yaml(), provenance)
+        trainer.save()
+
+
+def _warn_of_another_frame(scene: Scene, cloud: SplatCloud, file: Path) -> None:
+    """Say so where the training cameras have hardly any Gaussian in their images."""
+    means = torch.from_numpy(cloud.means).double()
+    seen = torch.zeros(len(means), dtype=torch.bool)
+    for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
+        seen |= frame.camera.to(dtype=torch.float64).sees(means)[1]
+    share = float(seen.float().mean())
+    if share < _FEW:
+        log.warning(
+            "%s: %.2g %% of the Gaussians lie in the view of a training camera; is it in the world frame and unit (%s) "
+            "of scene '%s'?",
+            file,
+            100.0 * share,
+            scene.length_unit,
+            scene.name,
+        )
