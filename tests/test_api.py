@@ -285,9 +285,11 @@ def test_the_command_goes_on_with_what_a_notebook_began(wall, compared, inline, 
     assert "coliags  1 of 1" in capsys.readouterr().out
 
 
-def test_what_fails_is_in_the_table(wall, tmp_path, inline):
+def test_what_fails_is_in_the_table(wall, tmp_path, inline, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     settings = {**TINY_SETTINGS, "datamanager.split": "all-train"}
-    done = cp.compare("coliags", str(wall), tmp_path / "new", steps=3, settings=settings)
+    done = cp.compare("coliags", str(wall), steps=3, settings=settings)
+    assert [path.name for path in tmp_path.iterdir()] == ["comparison"]
     assert done.table().rows == [{"method": "coliags", "done": "0 of 1", "psnr": None, "ssim": None, "depth_mse": None}]
     (note,) = done.table().notes
     assert note.startswith("failed: wall-all-train coliags seed 0: ") and "no test frames" in note

@@ -312,7 +312,7 @@ class CompareOptions(Options):
     """
 
     scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
-    output: Output
+    output: Output = Path("comparison")
     seeds: int = 1
     protocol: str = "paper"
     steps: OptionalInt = None
