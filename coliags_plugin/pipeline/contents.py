@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.datamanagers.atlas import AtlasRecord, read_atlas
@@ -22,10 +21,8 @@ from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, Record, StageRecord
-from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Video
+from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
-#: Arrays of the survey that are shown.
-SURVEYED = ("sharpness", "followed", "motion")
 _FRAME_NAME = re.compile(r"frame_(\d+)")
 #: Stages that are of no sub-map.
 _OF_ALL = ("survey", "joins", "frames", "poses")
@@ -131,7 +128,7 @@ class Contents:
     segments: Sequence[SegmentContents]
     submaps: Sequence[SubmapContents]  # of all segments, by their first frames
     joins: Sequence[SegmentJoin] = ()
-    survey: Mapping[str, Float[np.ndarray, "N"]] = field(default_factory=dict)  # numbers of each frame, by name
+    survey: Survey | None = None
     problems: Sequence[str] = ()  # what cannot be read, and why
 
     @property
@@ -186,7 +183,7 @@ def read_contents(out: Path, record: Record | None = None, segment: str = "", sc
         for span in video.segments
     ]
     problems += [": ".join(filter(None, (one.span.name, one.problem))) for one in segments if one.problem]
-    survey = _attempt(partial(_read_survey, out, video), out, problems) or {}
+    survey = _attempt(partial(_read_survey, out, video), out, problems)
     submaps = sorted((submap for one in segments for submap in one.submaps), key=lambda submap: submap.first)
     return Contents(folder, video, segments, submaps, joins, survey, problems)
 
@@ -201,14 +198,14 @@ def figures_as(stages: Mapping[str, StageRecord], name: str, kind: type[ModelT],
         return kind.model_validate(stages[name].figures)
 
 
-def _read_survey(out: Path, video: Video) -> dict[str, np.ndarray]:
+def _read_survey(out: Path, video: Video) -> Survey | None:
+    """The survey of a video's frames; None without one."""
     if not (out / SURVEY_FILE).is_file():
-        return {}
-    survey = read_arrays(out / SURVEY_FILE, MADE, optional=SURVEYED)
-    if any(values.shape != (video.frames,) or values.dtype.kind != "f" for values in survey.values()):
-        shapes = ", ".join(f"{name} {values.dtype} {[*values.shape]}" for name, values in survey.items())
-        raise InputError(f"{out / SURVEY_FILE} has {shapes}", f"a number for each of {video.frames} frames")
-    return survey
+        return None
+    survey = Survey.read(out)
+    if not survey.first <= video.first < video.stop <= survey.first + len(survey):
+        raise InputError(f"{out / SURVEY_FILE} has {len(survey)} frames", f"a number for each of {video.frames} frames")
+    return survey.part(video.first, video.stop - 1)
 
 
 def _attempt(read: Callable[[], T], folder: Path, problems: list[str]) -> T | None:

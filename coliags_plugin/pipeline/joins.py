@@ -23,8 +23,6 @@ _FEWEST = 6
 #: Largest residuals of a join: rotation in degrees, and position as a share of the median depth; and the largest ratio
 #: of the depths of a point-wise scale to its median, as a share.
 _ROTATION, _POSITION, _SCALE = 3.0, 0.1, 0.2
-
-
 #: Error of a rotation matrix in double precision that is written as JSON.
 _SKEW = 1e-4
 
@@ -101,10 +99,9 @@ def read_posed(scene: Path) -> list[PosedFrames]:
 
 def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
     """Joins of every two neighbouring segments in the folder of a reconstruction."""
-    found, posed = (
-        list[SegmentJoin](),
-        [read_posed(scene) if (scene := out / segment.name / "poses").is_dir() else [] for segment in segments],
-    )
+    scenes = [out / segment.name / "poses" for segment in segments]
+    posed = [read_posed(scene) if scene.is_dir() else [] for scene in scenes]
+    found = list[SegmentJoin]()
     for (first, before), (second, after) in pairwise(zip(segments, posed, strict=True)):
         names, gap = (first.name, second.name), second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"

@@ -97,7 +97,7 @@ def write_page(out: Path, record: Record | None = None, segment: str = "", scene
     whole, sections = contents.whole, list[Section]()
     states, codes = frame_states(contents)
     groups = _groups(contents)
-    has_frames = bool(contents.kept or contents.survey or whole is None)
+    has_frames = bool(contents.kept or contents.survey is not None or whole is None)
     if has_frames:
         told = Paragraph(_TIMELINE + ("" if whole else _BRACKETS) + "Point at a place for frames and reasons.")
         sections.append(Section("Time line", [told, timeline(contents, states, codes)]))

@@ -125,8 +125,9 @@ def _segments(context: StageContext, record: Record, overwrite: bool, is_long: b
     stage = Stage("survey", options, run, outputs)
     if not others:
         record.forget(["survey"], [])
+    was_done = record.is_done("survey")
     check_options([stage], record, overwrite)
-    if "survey" not in record.stages:  # but as it was before, with other options
+    if was_done and not record.is_done("survey"):  # removed along with all that was made by it
         record.forget(list(record.stages), [])
     if not (out / SURVEY_FILE).is_file():
         record.forget(["survey"], [])

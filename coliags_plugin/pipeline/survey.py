@@ -14,12 +14,14 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt32
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.pipeline.frame_selection import lens_mask, motion_and_survival, overlays, reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.stages import MADE
 from coliags_plugin.reconstruction.structure.texture import sharpness
 from coliags_plugin.reconstruction.structure.video import cut_where_lost
 
@@ -73,12 +75,15 @@ class Survey:
 
     @classmethod
     def read(cls, folder: Path) -> Survey:
-        """Read ``survey.npz``."""
-        with np.load(folder / SURVEY_FILE) as arrays:
-            own = {name: arrays[name] for name in _ARRAYS}
-            height, width = arrays["size"].tolist()
-            mask = arrays["mask"] if arrays["mask"].size else None
-            return cls(**own, size=(height, width), mask=mask, first=int(arrays["first"]))
+        """Read ``survey.npz``; InputError where it is damaged."""
+        arrays = read_arrays(folder / SURVEY_FILE, MADE, (*_ARRAYS, "size", "first", "mask"))
+        own, mask = {name: arrays[name] for name in _ARRAYS}, arrays["mask"]
+        shapes = {name: array.shape for name, array in arrays.items() if name != "mask"}
+        expected = dict.fromkeys(_ARRAYS, (len(np.ravel(own["sharpness"])),)) | {"size": (2,), "first": ()}
+        if shapes != expected or any(array.dtype.kind not in "fiu" for array in own.values()) or mask.dtype != bool:
+            raise InputError(f"{folder / SURVEY_FILE} has {shapes}", "a number for each frame")
+        height, width = arrays["size"].tolist()
+        return cls(**own, size=(height, width), mask=mask if mask.size else None, first=int(arrays["first"]))
 
 
 class FrameSurvey:

@@ -231,8 +231,8 @@ def _ticks(contents: Contents) -> Iterator[tuple[float, list[str]]]:
 
 def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
     """Means of the survey's numbers over columns, as SVG paths in a box of 1000 x 100."""
-    for name, (title, unit, factor) in _CURVES.items():
-        values = factor * contents.survey.get(name, np.zeros(0)).astype(np.float64)
+    for name, (title, unit, factor) in _CURVES.items() if contents.survey is not None else ():
+        values = factor * getattr(contents.survey, name).astype(np.float64)
         values[~np.isfinite(values)] = np.nan
         if not np.isfinite(values).any():
             continue

@@ -18,6 +18,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.pipeline.steps import PICTURES, SCENE
+from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.results.reading import write_result
 from tests.pipeline.conftest import COUNTS, write_atlas
 from tests.results.made import made_result, made_set
@@ -154,12 +155,16 @@ def write_long(out: Path, **changes) -> Path:
             stages[f"{name}/{key}"] = replace(
                 stage, files={f"{name}/{path}": what for path, what in stage.files.items()}
             )
-    followed = np.linspace(0.0, 1.0, FRAMES, dtype=np.float32)
-    motion = np.where(followed < 0.1, np.inf, 0.01).astype(np.float32)
-    np.savez(out / "survey.npz", sharpness=followed * 0.02, followed=followed, motion=motion)
+    write_survey(out)
     Record(out, stages).write()
     change_video(out, **changes)
     return out
+
+
+def write_survey(out: Path, frames: int = FRAMES) -> None:
+    followed = np.linspace(0.0, 1.0, frames, dtype=np.float32)
+    motion = np.where(followed < 0.1, np.inf, 0.01).astype(np.float32)
+    Survey(followed * 0.02, followed, motion, np.arange(frames, dtype=np.uint32), (32, 40), None).write(out)
 
 
 def write_short(out: Path) -> Path:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import coliags_plugin as cp
-from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.context import StageContext
@@ -90,50 +90,6 @@ def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
     worker.put("submap-3/depth", StageRecord({}, "done"))
     worker.put("submap-3/train", StageRecord({}))
     assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3 train", 2)
-
-
-@pytest.mark.thorough
-def test_a_failure_ends_its_sub_map_alone_and_is_told(done, atlas, tmp_path, workers, monkeypatch):
-    mesh, failing = steps.mesh, [1]
-
-    def fails(context):
-        if context.submap.number in failing:
-            raise InputError("no surface")
-        return mesh(context)
-
-    monkeypatch.setattr(steps, "mesh", fails)
-    workers()
-    record = cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert record.stages["submap-1/mesh"].state == "failed" and record.stages["report"].state == "done"
-    failing[:] = [0]
-    with pytest.raises(InputError, match="stage mesh: no surface"):
-        cp.reconstruct(atlas, tmp_path / "first", jobs=1)
-    failing.clear()
-    done.clear()
-    cp.reconstruct(atlas, tmp_path / "first", jobs=1)
-    assert done == list(TRAINING[2:])
-
-
-@pytest.mark.thorough
-def test_it_stops_and_goes_on(done, atlas, tmp_path, workers):
-    workers(None, KeyboardInterrupt())
-    with pytest.raises(InterruptedRunError, match="goes on where it stopped"):
-        cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert done == list(SUBMAP)
-    workers()
-    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert done == [*SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
-
-
-@pytest.mark.thorough
-def test_other_options_are_refused_or_repeated(done, atlas, tmp_path, workers):
-    workers()
-    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    with pytest.raises(InputError, match="stage train was made with steps 2000, not 4000"):
-        cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, jobs=1)
-    done.clear()
-    cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, jobs=1, overwrite=True)
-    assert done == [*TRAINING, *(f"submap-1/{name}" for name in TRAINING)]
 
 
 @pytest.mark.thorough

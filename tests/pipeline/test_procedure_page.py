@@ -32,6 +32,7 @@ from tests.pipeline.reconstructions import (
     three_submaps,
     video,
     write_frames,
+    write_survey,
 )
 
 
@@ -153,6 +154,7 @@ def test_the_page_of_a_segment_is_that_of_a_short_video_of_its_frames(out, short
     for kind in ("recorded", "depth", "flattened light"):
         assert text.count(f'<div class="name">{kind}</div>') == 1
     assert text.index("sub-map 0, 0:02 to 0:03</option>") < text.index("sub-map 1, ")
+    assert text.count('class="curve"') == 3 and 'class="curve"' not in whole, "of the survey, which one has"
     assert 'href="frames/images"' in text and 'href="submap-1/check.html"' in text and "the camera jumps" in text
     assert "31 of 32 used (97 %)" in text and "2 reconstructed of 3 (1 failed)" in text and "blurred" in text
 
@@ -292,8 +294,8 @@ def garble(path):
         ("segment-000", remove, ""),
         ("survey.npz", garble, "cannot read survey.npz"),
         ("survey.npz", remove, ""),
-        ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros(99)), "a number for each of 100 frames"),
-        ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros((100, 2))), "a number for each of 100 frames"),
+        ("survey.npz", lambda path: np.savez(path, sharpness=np.zeros(100)), "survey.npz lacks followed"),
+        ("survey.npz", lambda path: write_survey(path.parent, 99), "a number for each of 100 frames"),
     ],
 )
 def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, short, part, spoil, told):
