@@ -415,10 +415,7 @@ class Truth:
 
     def wrong_within(self, segment: SegmentContents, models: Mapping[ModelKey, Model]) -> list[bool | None]:
         """Whether each join within the models of a segment contradicts the true poses; None for too few frames."""
-        if segment.atlas is None:
-            return []
-        numbers = {Path(name).stem: number for number, name in segment.kept.items()}
-        after = [numbers[Path(segment.atlas.frames[join.after]).stem] for join in segment.atlas.joins if join.joined]
+        after = [number for number, place in segment.places.items() if place.joined]
         owners = [[one for one in segment.submaps if number in one.names] for number in after]
         return [self._wrong(models[own[0].key], number) for own, number in zip(owners, after, strict=True) if own]
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
-from coliags_plugin.datamanagers.atlas import AtlasRecord, read_atlas
+from coliags_plugin.datamanagers.atlas import AtlasJoin, AtlasRecord, read_atlas
 from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
@@ -98,7 +98,7 @@ class SegmentContents:
     span: Segment
     stages: Mapping[str, StageRecord]  # by their names within it
     submaps: Sequence[SubmapContents]  # the largest first
-    atlas: AtlasRecord | None
+    places: Mapping[int, AtlasJoin]  # between two stretches of frames, by the last frame before
     images: Path  # folder of the frames of use
     kept: Mapping[int, str]  # their names, by their number in the video
     why: Mapping[int, str]  # why frames have no pose, by their numbers
@@ -221,7 +221,7 @@ def _read_segment(
     folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video, given: Path | None
 ) -> SegmentContents:
     """Read a segment; of a scene with poses, which is ``given``, its frames are those of its atlas."""
-    problems, scene = list[str](), given or folder / "poses"
+    problems, scene, places = list[str](), given or folder / "poses", dict[int, AtlasJoin]()
     atlas = _attempt(partial(read_atlas, scene), folder, problems)
     if given is not None:
         frames, kept, images = None, dict(enumerate(atlas.frames if atlas else ())), given / IMAGES
@@ -246,6 +246,7 @@ def _read_segment(
         try:
             numbers = _numbers(atlas, {Path(name).stem: number for number, name in kept.items()}, video)
             why |= {numbers[lost.frame]: lost.reason for lost in atlas.lost}
+            places = {numbers[place.after]: place for place in atlas.joins}
             names: dict[str, dict[int, str]] = {}
             for stretch in atlas.submaps:
                 own = {numbers[index]: atlas.frames[index] for index in stretch.frames}
@@ -257,9 +258,8 @@ def _read_segment(
         except (LookupError, ValueError) as error:
             told = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
             problems.append(f"poses/atlas.json does not fit the frames: {told}")
-            atlas = None
     ordered = [submaps[number] for number in sorted(submaps)]
-    return SegmentContents(span, stages, ordered, atlas, images, kept, why, "; ".join(problems))
+    return SegmentContents(span, stages, ordered, places, images, kept, why, "; ".join(problems))
 
 
 def _numbers(atlas: AtlasRecord, known: Mapping[str, int], video: Video) -> list[int]:

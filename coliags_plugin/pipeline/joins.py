@@ -43,8 +43,8 @@ class SegmentJoin(BaseModel):
     reason: str = ""  # why not
     #: similarity from the world of the second to that of the first; None where they are not joined. [4][4]
     transform: Annotated[list[Row], Field(min_length=4, max_length=4)] | None = None
-    rotation_deg: float | None = None  # residual of the shared frames, degrees
-    position: float | None = None  # residual of their positions, relative to the median depth
+    rotation_deg: float = 0.0  # residual of the shared frames, degrees
+    position: float = 0.0  # residual of their positions, relative to the median depth
 
     @model_validator(mode="after")
     def _transform_of_joined(self) -> Self:
@@ -118,9 +118,7 @@ def joins(segments: tuple[str, str], first: list[PosedFrames], second: list[Pose
 
 def apart(segments: tuple[str, str], reason: str, models: tuple[str, str] = ("", ""), frames: int = 0) -> SegmentJoin:
     """A place at which nothing could be compared."""
-    return SegmentJoin(
-        segments=segments, models=models, frames=frames, joined=False, reason=reason, rotation_deg=0.0, position=0.0
-    )
+    return SegmentJoin(segments=segments, models=models, frames=frames, joined=False, reason=reason)
 
 
 def _join_models(segments: tuple[str, str], first: PosedFrames, second: PosedFrames) -> SegmentJoin:

@@ -247,7 +247,7 @@ def _map(contents: Contents, groups: Mapping[ModelKey, str]) -> Iterator[Block]:
                 "joined" if join.joined else "apart",
                 join.frames,
                 join.rotation_deg if join.joined else None,
-                None if join.position is None or not join.joined else 100.0 * join.position,
+                100.0 * join.position if join.joined else None,
                 join.reason,
             ]
             for join in contents.joins

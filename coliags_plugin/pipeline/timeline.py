@@ -20,7 +20,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.charts import COLORS
 from coliags_plugin.outputs.image_files import encode_jpeg
-from coliags_plugin.pipeline.contents import Contents, SubmapContents
+from coliags_plugin.pipeline.contents import Contents, SegmentContents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
 from coliags_plugin.pipeline.stages import PAGE_FILE
 from coliags_plugin.reporting.model import EncodedImage, Template
@@ -253,34 +253,23 @@ def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
 
 
 def submap_between(contents: Contents, one: SubmapContents, other: SubmapContents) -> tuple[bool, str]:
-    """Whether a sub-map and the one that follows it are joined, and how well, or why they are not."""
-    for join in contents.joins:
+    """Whether a sub-map and the one that follows it are joined, and how well, or why they are not, as far as known."""
+    between = [join for join in contents.joins if {one.segment, other.segment} == set(join.segments)]
+    for join in between:
         if {one.key, other.key} == set(join.keys):
-            if not join.joined:
-                return False, join.reason
-            residuals = [f"{counted(join.frames, 'shared frame')}"]
-            residuals += [] if join.rotation_deg is None else [f"cameras turned by {join.rotation_deg:.2g} degrees"]
-            residuals += [] if join.position is None else [f"{100.0 * join.position:.2g} % of the depth apart"]
-            return True, ", ".join(residuals)
-    return False, _reason_apart(contents, one, other)
+            turn, apart = f"cameras turned by {join.rotation_deg:.2g} degrees", f"{100.0 * join.position:.2g} %"
+            how = f"{counted(join.frames, 'shared frame')}, {turn}, {apart} of the depth apart"
+            return join.joined, how if join.joined else join.reason
+    if between and not any(join.joined for join in between):
+        return False, between[0].reason  # of the models that share most frames
+    places = {} if one.segment != other.segment else _segment_of(contents, one).places
+    if one.last in places and not places[one.last].joined:
+        return False, places[one.last].reason
+    return False, _lost_between(contents, one.last, other.first)
 
 
-def _reason_apart(contents: Contents, one: SubmapContents, other: SubmapContents) -> str:
-    """Why two sub-maps that no join of segments names are apart, as far as it was recorded."""
-    segments = {segment.span.name: segment for segment in contents.segments}
-    if one.segment == other.segment and (atlas := segments[one.segment].atlas) is not None:
-        names = {name: number for number, name in one.names.items()} | {
-            name: number for number, name in other.names.items()
-        }
-        cuts = [join for join in atlas.joins if not join.joined and join.after < len(atlas.frames)]
-        if reason := next((c.reason for c in cuts if names.get(atlas.frames[c.after], -1) == one.last), ""):
-            return reason
-    if one.segment != other.segment:
-        pair = {one.segment, other.segment}
-        between = [join for join in contents.joins if set(join.segments) == pair]
-        if between and not any(join.joined for join in between):
-            return between[0].reason  # of the models that share most frames
-    return _lost_between(contents, one.last, other.first)
+def _segment_of(contents: Contents, submap: SubmapContents) -> SegmentContents:
+    return next(segment for segment in contents.segments if segment.span.name == submap.segment)
 
 
 def _lost_between(contents: Contents, last: int, first: int) -> str:

@@ -78,7 +78,7 @@ def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, video, tmp_path
     cp.reconstruct(scene, tmp_path / "out")
     with_depth = any(path.name.startswith("depth") for path in scene.iterdir())
     assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINING]
-    with pytest.raises(InputError, match="stage check was made with source.name tube, not None"):
+    with pytest.raises(InputError, match=r"stage check was made with source\.name tube, not None"):
         cp.reconstruct(video, tmp_path / "out")
     with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
         cp.reconstruct(scene, tmp_path / "other", settings={"diameter": 40.0, "frames.every": 2})
