@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 from dataclasses import replace
 from itertools import pairwise
@@ -16,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
-from coliags_plugin.core.files import not_writable
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.outputs.video import write_video
@@ -162,7 +160,9 @@ OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharp
 
 
 @pytest.mark.thorough
-def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, workers):
+def test_a_long_video_is_reconstructed_segment_by_segment_and_what_is_done_is_not_done_again(
+    long_video, tmp_path, workers, done
+):
     executor = workers()
     record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     made = read_contents(tmp_path / "out", record)
@@ -185,12 +185,6 @@ def test_a_long_video_is_reconstructed_segment_by_segment(long_video, tmp_path, 
         Path("out/reconstruction.json")
     ]
     assert "segment-000" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.thorough
-def test_what_is_done_is_not_done_again_and_other_cuts_begin_anew(long_video, tmp_path, workers, done):
-    workers()
-    names = segments_of(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS))
     before, executor = list(done), workers()
     cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     assert executor.tasks == [] and done == before
@@ -316,21 +310,6 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
     with pytest.raises(InputError, match=r"does not see long\.mp4"):
         cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     assert not any((tmp_path / "out").glob("[!.]*"))
-
-
-@pytest.mark.thorough
-def test_a_survey_that_cannot_be_written_is_made_again(long_video, tmp_path, workers, monkeypatch):
-    workers()
-    full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
-
-    def fails(*_):
-        raise full
-
-    with monkeypatch.context() as patched, pytest.raises(InputError, match="No space left"):
-        patched.setattr(Survey, "write", fails)
-        cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    assert not (tmp_path / "out" / "survey.npz").exists()
-    assert len(segments_of(cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS))) == 3
 
 
 def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):
