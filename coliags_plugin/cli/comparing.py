@@ -106,8 +106,7 @@ class ResultsShowCommand:
         """Print a table for each."""
         from coliags_plugin.reporting.model import Block, Fact, FactList
         from coliags_plugin.reporting.text_formats import terminal_text
-        from coliags_plugin.results.reading import find_results
-        from coliags_plugin.results.summaries import facts, means_summary
+        from coliags_plugin.results.reading import facts, find_results, means_summary
 
         blocks: list[Block] = []
         summaries = []
@@ -131,8 +130,7 @@ class ResultsExportCommand:
     def run(self) -> None:
         """Write the table."""
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.results.reading import find_results
-        from coliags_plugin.results.summaries import write_csv
+        from coliags_plugin.results.reading import find_results, write_csv
 
         if not self.paths:
             raise InputError("no results to export", "at least one file or folder")

@@ -72,7 +72,7 @@ class EvaluateCommand(RunCommand, options.EvaluateOptions):
 
     def run(self) -> None:
         """Evaluate and print a table."""
-        from coliags_plugin.results.summaries import means_summary
+        from coliags_plugin.results.reading import means_summary
 
         run = self.opened()
         result = run.evaluate(self)

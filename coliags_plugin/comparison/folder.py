@@ -160,10 +160,8 @@ class ComparisonFolder:
 
     def recorded_fingerprint(self, scene: SceneSource) -> str | None:
         """Fingerprint of a phantom that is not there, if this version made the same one for this folder before."""
-        entry = self.plan().scenes.get(scene.name)
-        if entry is None or entry.phantom is None or entry.package_version != __version__:
-            return None
-        return entry.fingerprint if entry.phantom == scene.phantom_record else None
+        entry, same = self.plan().scenes.get(scene.name), (scene.phantom_record, __version__)
+        return entry.fingerprint if entry and (entry.phantom, entry.package_version) == same else None
 
     def read_results(self) -> None:
         """Read the results that are there; half-written and damaged files are reported and left as they are.

@@ -32,7 +32,7 @@ from coliags_plugin.outputs.colormaps import (
 )
 from coliags_plugin.outputs.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
-from coliags_plugin.results.reading import RESULT_FILE, write_result
+from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, write_result
 from coliags_plugin.results.record import (
     REFINED_SUFFIXES,
     CostRecord,
@@ -41,7 +41,6 @@ from coliags_plugin.results.record import (
     Result,
     SceneRecord,
 )
-from coliags_plugin.results.summaries import means_summary, per_frame_table
 
 logger = logging.getLogger(__name__)
 

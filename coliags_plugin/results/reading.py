@@ -1,17 +1,21 @@
-"""Reading and writing of results files."""
+"""Results files, and what is made of them: ``metrics.json``, facts in words, and tables of single frames."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import write_json
+from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
+from coliags_plugin.reporting.numbers import duration
 from coliags_plugin.results.hashing import metrics_sha256
-from coliags_plugin.results.record import FORMAT, VERSION, Result
+from coliags_plugin.results.record import FORMAT, SEEN_SUFFIX, VERSION, Result
 
 #: Name of the results file in the folder of an evaluation.
 RESULT_FILE = "result.json"
@@ -94,3 +98,104 @@ def _files(path: Path) -> list[Path]:
             f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
         )
     return matches
+
+
+#: Columns of the long table: one row per run, test set, frame and metric.
+VALUE_COLUMNS = (
+    *("key", "method", "scene", "split", "seed", "protocol", "protocol_version"),
+    *("set", "frame", "metric", "value", "unit"),
+)
+
+
+def means_summary(result: Result) -> dict[str, Any]:
+    """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
+    main = result.sets[result.main_set]
+    protocols_own = [name for name in result.metrics if not _over_seen_pixels(name, result)]
+    reasons: dict[str, str] = {}
+    for part in reversed(result.sets.values()):
+        reasons |= part.reasons
+    return {
+        "protocol": result.protocol.model_dump(),
+        "method": result.method,
+        "scene": result.scene.name,
+        "step": result.steps,
+        "untrained_views": result.provenance.get("untrained_views", {}),
+        **{name: result.provenance[name] for name in ("held_out_used", "learned") if name in result.provenance},
+        **{name: main.mean(name) for name in protocols_own},
+        "reasons": reasons,
+        "directions": {name: metric.direction for name, metric in result.metrics.items()},
+        "units": {name: metric.unit for name, metric in result.metrics.items()},
+        "sets": {
+            name: {"frames": len(part.frames), **{metric: part.mean(metric) for metric in result.metrics}}
+            for name, part in result.sets.items()
+        },
+        "software": result.software,
+    }
+
+
+def _over_seen_pixels(name: str, result: Result) -> bool:
+    return name.endswith(SEEN_SUFFIX) and name.removesuffix(SEEN_SUFFIX) in result.metrics
+
+
+def facts(result: Result) -> dict[str, str]:
+    """What was run and what it cost, in words; nothing about what was not measured."""
+    cost = result.cost
+    threads = "" if cost.threads is None else f", {cost.threads} threads"
+    reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
+    mib = None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
+    texts = {
+        "key": result.key,
+        "seed": str(result.seed),
+        "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
+        "trained on": f"{cost.device}{threads}",
+        "training": _said(cost.train_seconds, duration),
+        "psnr reached": ", ".join(f"{mark} dB after {duration(seconds)}" for mark, seconds in reached.items()),
+        "processor time": _said(cost.processor_seconds, duration),
+        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB".format),
+        "rendering": _said(cost.render_fps, "{:.2f} views a second".format),
+        "gaussians": _said(cost.gaussians, "{:.0f} in a view".format),
+        "checkpoint": _said(mib, "{:.1f} MiB".format),
+    }
+    return {name: text for name, text in texts.items() if text}
+
+
+def _said(value: float | None, text: Callable[[float], str]) -> str:
+    return "" if value is None else text(value)
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Rows below a heading as CSV: numbers with all their digits, None empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def frame_rows(result: Result, metrics: Iterable[str]) -> Iterator[list[Any]]:
+    """Test set and name of every frame with its metrics; None where it lacks one."""
+    names = list(metrics)
+    for set_name, part in result.sets.items():
+        for index, frame in enumerate(part.frames):
+            values = (part.values[name][index] if name in part.values else None for name in names)
+            yield [set_name, frame, *values]
+
+
+def per_frame_table(result: Result) -> str:
+    """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
+    return csv_text(["set", "frame", *result.metrics], frame_rows(result, result.metrics))
+
+
+def value_rows(result: Result) -> Iterator[tuple[Any, ...]]:
+    """Rows of :data:`VALUE_COLUMNS`, one for each value of each frame; None where the frame has none."""
+    run = (result.key, result.method, result.scene.name, result.scene.split, result.seed)
+    protocol = (result.protocol.name, result.protocol.version)
+    for set_name, part in result.sets.items():
+        for metric, values in part.values.items():
+            for frame, value in zip(part.frames, values, strict=True):
+                yield (*run, *protocol, set_name, frame, metric, value, result.metrics[metric].unit)
+
+
+def write_csv(path: Path, results: Sequence[Result]) -> None:
+    """Write the values of results as CSV, with all their digits, missing ones empty."""
+    atomic_write(path, csv_text(VALUE_COLUMNS, (row for result in results for row in value_rows(result))))

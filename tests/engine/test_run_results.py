@@ -20,8 +20,7 @@ from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.results.hashing import code_key, result_key
-from coliags_plugin.results.reading import RESULT_FILE, read_result
-from coliags_plugin.results.summaries import means_summary, per_frame_table
+from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, read_result
 from tests.engine.test_trainer import make_trainer
 from tests.scenes import SMALL, wall_scene
 

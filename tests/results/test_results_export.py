@@ -8,9 +8,8 @@ import os
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.results.reading import find_results, write_result
+from coliags_plugin.results.reading import VALUE_COLUMNS, find_results, value_rows, write_csv, write_result
 from coliags_plugin.results.record import CostRecord, ProtocolRecord
-from coliags_plugin.results.summaries import VALUE_COLUMNS, value_rows, write_csv
 from tests.commands import refused, run
 from tests.results.made import made_result, made_set
 

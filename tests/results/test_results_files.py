@@ -16,9 +16,8 @@ from pydantic import ValidationError
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
-from coliags_plugin.results.reading import read_result, write_result
+from coliags_plugin.results.reading import means_summary, per_frame_table, read_result, write_result
 from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
-from coliags_plugin.results.summaries import means_summary, per_frame_table
 from tests.results.made import METRICS, made_result, made_set, numbers, results
 
 quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -43,7 +43,7 @@ from coliags_plugin.reporting.model import (
 )
 from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.reporting.text_formats import latex_text, markdown_text, page_values
-from coliags_plugin.results.summaries import csv_text, frame_rows
+from coliags_plugin.results.reading import csv_text, frame_rows
 
 _TIMES = "\N{MULTIPLICATION SIGN}"
 #: Scenes listed by name; of more, only their number is given.
