@@ -1,14 +1,18 @@
+"""Files of Gaussians, as this package and other programs read them; and their frame and unit, those of meshes too."""
+
 from __future__ import annotations
 
 import gzip
 import logging
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import gsply
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +29,8 @@ from coliags_plugin.export.splats.files import (
     write_splats,
 )
 from coliags_plugin.fields import spherical_harmonics
+from coliags_plugin.geometry.meshes.files import write_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 
@@ -225,3 +231,34 @@ def test_unknown_formats_and_nothing_to_write_are_refused(tmp_path):
         read_splats(tmp_path / "a.glb")
     assert not list(tmp_path.iterdir())
     assert set(FORMATS) == {"ply", "spz", "glb"}
+
+
+#: Corners of a tetrahedron which no turn and no mirroring brings back onto itself. [4, 3]
+PLACES = np.array([[1, 2, 30], [5, 2, 31], [1, 9, 33], [2, 3, 45]], np.float32)
+COLORS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], np.uint8)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The tetrahedron as ``mesh.*``, and Gaussians at its corners as ``splats.*``."""
+    made = tmp_path_factory.mktemp("frames")
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    for suffix in ("ply", "obj", "glb"):
+        write_mesh(made / f"mesh.{suffix}", TriangleMesh(PLACES, triangles, COLORS))
+    cloud = replace(random_cloud(4, 0), means=PLACES)
+    for suffix in ("ply", "glb"):
+        write_splats(made / f"splats.{suffix}", cloud, suffix)
+    return made
+
+
+def in_order(points: np.ndarray) -> np.ndarray:
+    return points[np.argsort(points[:, 2])]
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "splats.ply", "splats.glb"])
+def test_trimesh(folder, name):
+    scene = trimesh.load_scene(folder / name, skip_materials=True)
+    (placed,) = scene.dump()
+    np.testing.assert_allclose(in_order(placed.vertices), PLACES, rtol=1e-6)
+    if name.startswith("mesh"):
+        np.testing.assert_array_equal(placed.visual.vertex_colors[np.argsort(placed.vertices[:, 2]), :3], COLORS)
