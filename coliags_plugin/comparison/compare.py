@@ -137,7 +137,7 @@ COLUMNS = ("psnr", "ssim", "depth_mse")
 
 @dataclass(frozen=True)
 class FinishedComparison:
-    """What a comparison came to."""
+    """Results and failures of a comparison."""
 
     folder: Path  # where its plan, runs and results are
     cells: Sequence[ComparisonCell]  # everything that was asked for
@@ -176,7 +176,7 @@ class FinishedComparison:
         return {name: path for name, path in paths.items() if path.is_dir()}
 
     def __repr__(self) -> str:
-        """How much is done, in one line."""
+        """Number of cells that are done, in one line."""
         failed = f", {len(self.failures)} failed" if self.failures else ""
         return f"{len(self.results)} of {len(self.cells)} cells done{failed}: {self.folder}"
 
@@ -216,7 +216,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
 
 
 def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:
-    """What :func:`carry_out` would do with each cell; writes nothing."""
+    """List what :func:`carry_out` would do with each cell; writes nothing."""
     cells = _plan_cells(request, folder)
     folder.read_results()
     return _states(cells, folder)
@@ -256,7 +256,7 @@ def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCe
 
 
 def make_request(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> Request:
-    """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
+    """Make a request, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
     if not variants:

@@ -57,7 +57,7 @@ class ComparisonFolder:
         return self.path / RESULTS / f"{cell.result_path}.json"
 
     def failure(self, cell: ComparisonCell) -> Path:
-        """Why a cell failed."""
+        """File with the reason why a cell failed."""
         return self.path / FAILURES / f"{cell.result_path}.json"
 
     def log(self, cell: ComparisonCell) -> Path:
@@ -87,7 +87,7 @@ class ComparisonFolder:
                 )
 
     def plan(self) -> ComparisonPlan:
-        """What was asked for so far; empty where nothing was."""
+        """Plan of all that was asked for so far; empty where nothing was."""
         return read_plan(self.path) or ComparisonPlan()
 
     def check_extends(self, request: Request) -> None:

@@ -60,7 +60,7 @@ class ComparisonCell:
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
-        """What it is called: scene, method, seed, protocol."""
+        """Name of the cell: scene, method, seed, protocol."""
         return self.scene_label, self.variant.name, self.seed, self.protocol
 
     @property
@@ -82,12 +82,12 @@ class ComparisonCell:
 
     @property
     def run_path(self) -> PurePosixPath:
-        """Of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
+        """Place of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
         return self._path(self.known_keys.training)
 
     @property
     def result_path(self) -> PurePosixPath:
-        """Of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
+        """Place of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
         return self._path(self.known_keys.result)
 
     def _path(self, key: str) -> PurePosixPath:
@@ -96,7 +96,7 @@ class ComparisonCell:
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be compared."""
+    """Methods and scenes to be compared, and options."""
 
     variants: Sequence[Variant]
     scenes: Sequence[SceneSource]

@@ -13,7 +13,7 @@ from coliags_plugin.core.settings import invalid_reported
 
 #: Names within the folder of a comparison.
 PLAN_FILE, RESULTS, RUNS, FAILURES = "plan.json", "results", "runs", "failures"
-#: Of the schema below.
+#: Version of the schema below.
 VERSION = 2
 _EXPECTED = "what `coliags compare` wrote"
 
@@ -56,7 +56,7 @@ class PlannedCell(_NamedCell):
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
-        """What it is called: scene, method, seed, protocol."""
+        """Name of the cell: scene, method, seed, protocol."""
         return self.scene, self.method, self.seed, self.protocol
 
 
@@ -73,7 +73,7 @@ class ComparisonPlan(_PlanPart):
 
 
 class FailureRecord(_NamedCell):
-    """Why a cell failed."""
+    """Reason why a cell failed."""
 
     reason: str  # one line
     attempts: int  # processes that tried

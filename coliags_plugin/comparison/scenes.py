@@ -39,7 +39,7 @@ class SceneSource:
 
     @property
     def is_there(self) -> bool:
-        """Whether the folder is."""
+        """Tell whether the folder is there."""
         return self.path.is_dir()
 
     @property

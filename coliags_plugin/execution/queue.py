@@ -65,11 +65,11 @@ class Job(ABC):
 
     @abstractmethod
     def progress(self) -> int:
-        """How much of its size is over while it runs."""
+        """Share of its size that is over while it runs."""
 
     @property
     def doing(self) -> str:
-        """What messages say of it while it runs."""
+        """Words for it in messages while it runs."""
         return self.task.title
 
     @abstractmethod

@@ -126,7 +126,7 @@ class RayExecutor(Executor):
         return float(self._ray.cluster_resources().get(name, 0.0))
 
     def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> _Fault | None:
-        """What a node lacks; None where it lacks nothing, or is gone meanwhile."""
+        """Fault of a node; None where it lacks nothing, or is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)

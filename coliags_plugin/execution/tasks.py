@@ -62,7 +62,7 @@ class Task:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What :meth:`to_json` wrote, lists as tuples."""
+        """Read what :meth:`to_json` wrote, lists as tuples."""
         values: Any = {name: tuple(each) if isinstance(each, list) else each for name, each in json.loads(text).items()}
         return cls(**values)
 
@@ -82,7 +82,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """How a worker ended."""
+    """End of a worker."""
 
     ending: Ending
     reason: str = ""  # why it failed, died or stopped; empty where it is done
@@ -122,7 +122,7 @@ def run_worker(work: Callable[[str], TaskOutcome]) -> None:
 
 
 def attempt(title: str, folder: str, work: Callable[[], None]) -> TaskOutcome:
-    """How work in a folder ends: every error becomes the reason of its failure."""
+    """Do work in a folder, and tell how it ends: every error becomes the reason of its failure."""
     try:
         log.info("%s: process %d", title, os.getpid())
         work()
@@ -155,7 +155,7 @@ _PAUSE = 0.1
 
 @dataclass(frozen=True)
 class ExecutionOptions:
-    """Where and how tasks are run."""
+    """Options of running tasks: where, and how many."""
 
     jobs: int | None = None  # tasks at a time; None: one per CPU, or per GPU
     threads: int | None = None  # CPU threads of each; None: the CPUs divided by the tasks at a time
@@ -254,11 +254,11 @@ class LocalWorker:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has."""
+        """Tell whether the process has ended."""
         return self._process.poll() is not None
 
     def outcome(self) -> TaskOutcome:
-        """How it ended; waits until it has."""
+        """Outcome of the process; waits until it has ended."""
         printed, _ = self._process.communicate()
         return TaskOutcome.read(self._process.returncode, printed)
 

@@ -66,7 +66,7 @@ class Column:
 
     @property
     def has_second_line(self) -> bool:
-        """Whether arrow or unit stand below the title."""
+        """Tell whether arrow or unit stand below the title."""
         return bool(self.arrow or unit_text(self.unit))
 
 
@@ -199,7 +199,7 @@ class Chart:
 
     @property
     def has_points(self) -> bool:
-        """Whether any point of it can be drawn."""
+        """Tell whether any point of it can be drawn."""
         return any(
             math.isfinite(x) and math.isfinite(y) and (y > 0.0 or not self.log_y)
             for line in self.series
@@ -237,7 +237,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class Template:
-    """What only the HTML page shows: a template of this package, filled with values."""
+    """Block that only the HTML page shows: a template of this package, filled with values."""
 
     file: str  # name of the file in ``reporting/assets``
     values: Mapping[str, Any] = field(default_factory=dict)  # by the names that the template uses
@@ -267,7 +267,7 @@ Block = Paragraph | Bullets | FactList | Table | Figures | Template | Folded | S
 
 @dataclass(frozen=True)
 class Page:
-    """What a command says."""
+    """Page of a command's facts, tables and figures."""
 
     title: str
     sections: Sequence[Section]  # in order; those without blocks are left out

@@ -34,7 +34,7 @@ class Spread:
 
     @property
     def ruled_by_few(self) -> bool:
-        """Whether few scenes rule the mean: it is more than twice the median."""
+        """Tell whether few scenes rule the mean: it is more than twice the median."""
         return self.mean is not None and self.median is not None and self.mean > 2.0 * self.median > 0.0
 
 
@@ -213,6 +213,6 @@ def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
 
 
 def _constant(differences: Differences) -> bool:
-    """Whether all differences are equal up to rounding, so that their standard deviation is none."""
+    """Tell whether all differences are equal up to rounding, so that their standard deviation is none."""
     size = float(np.max(np.abs(differences), initial=0.0))
     return float(np.ptp(differences)) <= 1e-12 * size

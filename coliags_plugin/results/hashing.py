@@ -16,7 +16,7 @@ from coliags_plugin.results.record import SetRecord
 
 #: Keys of a method config that do not change a trained model; the protocol has a place of its own in a result's key.
 _IGNORED = ("description", "protocol")
-#: Likewise of its data manager, what it allows to be read, and of its schedule.
+#: Keys within its data manager, of what it allows to be read, and within its schedule, likewise.
 _IGNORED_WITHIN = {"datamanager": ("outside_files",), "schedule": ("log_every", "checkpoint_every")}
 #: Code that determines training and evaluation: all packages that the engine imports but presentation, and profiles.
 _CODE = (

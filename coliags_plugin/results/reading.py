@@ -138,7 +138,7 @@ def _over_seen_pixels(name: str, result: Result) -> bool:
 
 
 def facts(result: Result) -> dict[str, str]:
-    """What was run and what it cost, in words; nothing about what was not measured."""
+    """Facts of a run and its costs, in words; nothing about what was not measured."""
     cost = result.cost
     threads = "" if cost.threads is None else f", {cost.threads} threads"
     reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}

@@ -16,18 +16,18 @@ from coliags_plugin.reporting.model import Column, Value, value_text
 from coliags_plugin.reporting.numbers import Direction
 from coliags_plugin.reporting.text_formats import DisplayTable
 
-#: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
+#: Version of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1
 #: The split's own test set.
 MAIN_SET = "test"
 #: Share of transparent pixels above which a warning is due.
 MANY_TRANSPARENT = 0.01
-#: Of metrics over the pixels that a training frame sees.
+#: Suffix of metrics over the pixels that a training frame sees.
 SEEN_SUFFIX = "_seen"
 #: Metrics of views whose poses were refined on their own, held-out images, by their names without a suffix; suffixes of
 #: those, and of those with each rendered colour multiplied by its best factor, too (docs/protocols.md).
 REFINED_METRICS, REFINED_SUFFIXES = ("psnr", "ssim"), ("_pose_refined", "_pose_color_refined")
-#: Of folders of evaluations against another scene's true depth, behind the name of the protocol.
+#: Suffix of folders of evaluations against another scene's true depth, behind the name of the protocol.
 TRUTH_SUFFIX = "-truth"
 
 Format = Literal["coliags-result"]
@@ -59,7 +59,7 @@ class SceneRecord(_Part):
 
 
 class MetricRecord(_Part):
-    """What a metric's values mean."""
+    """Unit and direction of a metric."""
 
     unit: str
     direction: Direction
@@ -108,7 +108,7 @@ class SetRecord(_Part):
 
     @property
     def transparency_warning(self) -> str:
-        """What is to be said of transparent pixels; empty where there are hardly any."""
+        """Warning of transparent pixels; empty where there are hardly any."""
         if self.transparent is None or self.transparent <= MANY_TRANSPARENT:
             return ""
         return (
@@ -122,7 +122,7 @@ class SetRecord(_Part):
 
 
 class CostRecord(_Part):
-    """What a run cost; comparable between runs on one device only. None: not measured.
+    """Costs of a run; comparable between runs on one device only. None: not measured.
 
     Times of training are of all resumptions together, without reading data and evaluation. Steps that a kill made
     necessary twice count once.
@@ -193,7 +193,7 @@ class Result(_Part):
 
     @property
     def title(self) -> str:
-        """What was evaluated and how, in one line."""
+        """Run and protocol in one line."""
         truth = self.provenance.get("truth")
         trained_on = f" (trained on {truth['trained_on']['name']})" if truth else ""
         return (

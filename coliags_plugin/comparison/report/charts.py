@@ -159,6 +159,6 @@ def _log_label(label: str, log: bool) -> str:
 
 
 def _spans(lines: Sequence[Series], ratio: float) -> bool:
-    """Whether all values are positive, and the largest is so many times the smallest."""
+    """Tell whether all values are positive, and the largest is so many times the smallest."""
     values = [value for line in lines for value in line.y if math.isfinite(value)]
     return bool(values) and min(values) > 0.0 and max(values) / min(values) >= ratio

@@ -15,7 +15,7 @@ from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import counted, duration, ranks_of
 from coliags_plugin.results.record import CostRecord
 
-#: Of the PSNR marks.
+#: Largest number of PSNR marks.
 _MARKS_SHOWN = 3
 
 
@@ -113,7 +113,7 @@ def _ranked(column: Column, cells: Sequence[TableCell]) -> list[TableCell]:
 
 
 def _notes(study: Study, shared: Sequence[str], devices: dict[str, set[str]]) -> list[str]:
-    """What the means leave out, devices, and the recorded plans of densification and pruning."""
+    """Notes: scenes that the means leave out, devices, and the recorded plans of densification and pruning."""
     notes = []
     if len(shared) < len(study.scenes):
         missing = ", ".join(scene for scene in study.scenes if scene not in shared)

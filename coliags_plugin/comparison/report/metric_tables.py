@@ -31,9 +31,9 @@ DEFAULT_COLUMNS = (
     *("psnr", "psnr_gain_fitted", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
     *("sparse_depth_median", "sparse_depth_p90"),
 )
-#: The same for other sets, whose views leave the path, so that much of what they see was never filmed.
+#: Default columns of other sets, whose views leave the path, so that much of what they see was never filmed.
 _BEYOND_THE_PATH = ("psnr", "psnr_seen", "psnr_gain_fitted_seen", *DEFAULT_COLUMNS[2:])
-#: Of the default columns, what is shown where no result has the first.
+#: Metrics shown in place of a default column that no result has.
 _INSTEAD = {"lpips": ("lpips_squeeze",)}
 #: Chooses all.
 ALL_COLUMNS = "all"
@@ -186,7 +186,7 @@ def _note(part: Part, column: Column, method: str, values: Mapping[str, BySeed],
 
 
 def _summary_notes(part: Part, columns: Sequence[Column]) -> list[str]:
-    """What is not shown and why, which scenes the means leave out, and of which methods few scenes rule the mean."""
+    """Notes: metrics without values and why, scenes that means leave out, and methods whose mean few scenes rule."""
     empty, left_out = dict[str, list[str]](), dict[tuple[str, ...], list[str]]()
     ruled = []
     for column in columns:
@@ -327,7 +327,7 @@ def _signed(value: float, decimals: int) -> TableCell:
 
 
 def statistics_text(study: Study, compared: Sequence[RivalComparison], reference: str) -> str:
-    """What the tests of one metric can say: unit, scenes, smallest p, family, stars; empty without a common scene."""
+    """Sentences on the tests of one metric: unit, scenes, smallest p, family, stars; empty without a common scene."""
     most = max((len(row.scenes) for row in compared), default=0)
     if not most:
         return ""

@@ -21,7 +21,7 @@ class PublishedBenchmark:
 
     @property
     def note(self) -> str:
-        """Where the numbers are from."""
+        """Source of the numbers, as a sentence."""
         return (
             f"published: as printed in the paper of ColIAGS for {self.title}, trained and evaluated by its authors; "
             "not ranked with ours"
@@ -103,7 +103,7 @@ def published_for(part: Part) -> PublishedBenchmark | None:
 
 
 def _all_of(scenes: list[Result], dataset: str, split: str) -> bool:
-    """Whether the scenes are different ones, all of one dataset and split."""
+    """Tell whether the scenes are different ones, all of one dataset and split."""
     recorded = [scene.provenance.get("scene") for scene in scenes]
     return (
         len({scene.scene.fingerprint for scene in scenes}) == len(scenes)

@@ -212,7 +212,7 @@ def _missing(missing: Sequence[MissingResult]) -> Section:
 
 
 def _provenance(study: Study) -> Section:
-    """What is recorded of every scene, of one run of every method, and of all runs in a table."""
+    """Records of every scene, of one run of every method, and of all runs in a table."""
     blocks: list[Block] = []
     for scene in study.scenes:
         runs = [run for run in study.runs if run.scene == scene]

@@ -96,7 +96,7 @@ def _read_file(file: Path, stamp: str, run: Path | None = None) -> StudyRun:
 
 
 def _is_comparison(folder: Path) -> bool:
-    """Whether a folder is that of a comparison, or holds its results alone."""
+    """Tell whether a folder is that of a comparison, or holds its results alone."""
     return (folder / PLAN_FILE).is_file() or (folder / RESULTS).is_dir() or any(folder.glob(_CELL))
 
 
@@ -172,7 +172,7 @@ def disambiguate_labels(runs: Sequence[StudyRun]) -> list[StudyRun]:
 
 
 def _is_one_method(runs: Sequence[StudyRun]) -> bool:
-    """Whether runs of one label are one method: one config on each scene and split, and one run per seed."""
+    """Tell whether runs of one label are one method: one config on each scene and split, and one run per seed."""
     places = [(run.scene, run.result.scene.split) for run in runs]
     configs = {(place, _config_key(run)) for place, run in zip(places, runs, strict=True)}
     seeds = {(place, run.result.seed) for place, run in zip(places, runs, strict=True)}
@@ -320,7 +320,7 @@ def _unpaired_seeds(study: Study) -> list[str]:
 
 
 def _codes(study: Study) -> list[str]:
-    """Which results come from which code, if not all are of one."""
+    """Caution that results come from different code, if they do."""
     by_code: dict[str, list[StudyRun]] = {}
     for run in study.runs:
         by_code.setdefault(code_of(run.result), []).append(run)
@@ -348,6 +348,6 @@ def code_of(result: Result) -> str:
 
 
 def scene_provenance(result: Result) -> dict[str, Any]:
-    """What is recorded of a result's data."""
+    """Record of a result's data."""
     recorded = result.provenance.get("scene")
     return {"fingerprint": result.scene.fingerprint, **(recorded if isinstance(recorded, Mapping) else {})}

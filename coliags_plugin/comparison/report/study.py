@@ -1,4 +1,4 @@
-"""What a report is made of: results of methods on scenes, and cells of a comparison without a result."""
+"""Content of a report: results of methods on scenes, and cells of a comparison without a result."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Part:
         return list(dict.fromkeys(run.scene for run in self.study.runs if self.record(run) is not None))
 
     def record(self, run: StudyRun) -> SetRecord | None:
-        """What a run has of it."""
+        """Record of this test set in a run; None where it has none."""
         return run.result.sets.get(self.set_name) if run.result.scene.split == self.split else None
 
     def runs(self, scene: str, method: str) -> list[StudyRun]:
@@ -96,7 +96,7 @@ class Part:
         return dict(values)
 
     def has(self, metric: str) -> bool:
-        """Whether any result has a value of a metric."""
+        """Tell whether any result has a value of a metric."""
         return any(self.values(metric).values())
 
     def frame_means(self, scene: str, method: str, metric: str) -> dict[str, float]:
@@ -110,7 +110,7 @@ class Part:
         return {frame: sum(values) / len(values) for frame, values in by_frame.items()}
 
     def reason(self, method: str, metric: str, scene: str | None = None) -> str:
-        """Why a metric is unavailable, as the first result without it says."""
+        """Reason why a metric is unavailable, as the first result without it says."""
         runs = [run for run in self.study.by_method.get(method, []) if scene in (None, run.scene)]
         records = [record for run in runs if (record := self.record(run)) is not None]
         if not records:
@@ -151,7 +151,7 @@ class Study:
 
     @property
     def several_splits(self) -> bool:
-        """Whether results are of different splits."""
+        """Tell whether results are of different splits."""
         return len({run.result.scene.split for run in self.runs}) > 1
 
     @property

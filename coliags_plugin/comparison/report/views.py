@@ -111,7 +111,7 @@ class _View:
 
     @property
     def in_row(self) -> bool:
-        """Whether all images are in one row: of one method, without true depth."""
+        """Tell whether all images are in one row: of one method, without true depth."""
         return len(self.runs) == 1 and self.true_depth is None
 
 
