@@ -20,7 +20,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.charts import COLORS
 from coliags_plugin.outputs.image_files import encode_jpeg
-from coliags_plugin.pipeline.contents import Contents, SegmentContents, SubmapContents
+from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
 from coliags_plugin.pipeline.stages import PAGE_FILE
 from coliags_plugin.reporting.model import EncodedImage, Template
@@ -262,14 +262,11 @@ def submap_between(contents: Contents, one: SubmapContents, other: SubmapContent
             return join.joined, how if join.joined else join.reason
     if between and not any(join.joined for join in between):
         return False, between[0].reason  # of the models that share most frames
-    places = {} if one.segment != other.segment else _segment_of(contents, one).places
-    if one.last in places and not places[one.last].joined:
-        return False, places[one.last].reason
+    for segment in contents.segments:
+        place = segment.places.get(one.last)
+        if segment.span.name == one.segment == other.segment and place is not None and not place.joined:
+            return False, place.reason
     return False, _lost_between(contents, one.last, other.first)
-
-
-def _segment_of(contents: Contents, submap: SubmapContents) -> SegmentContents:
-    return next(segment for segment in contents.segments if segment.span.name == submap.segment)
 
 
 def _lost_between(contents: Contents, last: int, first: int) -> str:
