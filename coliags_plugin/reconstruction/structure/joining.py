@@ -312,16 +312,11 @@ def _joined(
         model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
     result = adjusted(model, video)
     kept = result.images >= (1.0 - _MOST_LOST) * (len(one.frames) + len(other.frames))
-    held = kept and link_at(result.model, after).holds and _is_rigid(result, video)
+    longest = rigid_frames(result.model, video.tracks)
+    held = kept and link_at(result.model, after).holds and (longest is None or result.images <= longest)
     if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
         return None
     return replace(result, joins={**one.joins, **other.joins, after: _again(sightings, before)})
-
-
-def _is_rigid(joined: Hypothesis, video: MatchedVideo) -> bool:
-    """Whether a model has no more frames than its scene is rigid for (:func:`rigid_frames`)."""
-    longest = rigid_frames(joined.model, video.tracks)
-    return longest is None or joined.images <= longest
 
 
 def _is_worse(joined: Hypothesis, parts: Sequence[Hypothesis], video: MatchedVideo) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt32
@@ -24,11 +25,6 @@ Matches = Mapping[tuple[int, int], Pairs]
 _DUPLICATE_DISTANCE = 2.0
 #: Largest ratio of the scales of matched features.
 _MAX_SCALE_RATIO = 1.6
-
-
-def all_pairs(count: int) -> list[tuple[int, int]]:
-    """All pairs of ``count`` images."""
-    return [(first, second) for first in range(count) for second in range(first + 1, count)]
 
 
 def mutual_matches(first: Features, second: Features, max_ratio: float, max_distance: float) -> Pairs:
@@ -213,7 +209,7 @@ def alike_pairs(
     """
     count = len(features)
     if count <= settings.exhaustive_up_to:
-        return all_pairs(count)
+        return list(combinations(range(count), 2))
     largest = [_largest(one) for one in features]
 
     def alikeness(first: int, second: int) -> int:

@@ -190,7 +190,9 @@ class PointTracker:
         shift = 0.0
         if self.last is not None:
             kept, moved = self._followed(self.last, view)
-            shift = _median_length(moved - self.last.pixels[kept]) / max(view.detail.shape)
+            if len(kept):
+                lengths = np.linalg.norm(moved - self.last.pixels[kept], axis=1)
+                shift = float(np.median(lengths)) / max(view.detail.shape)
             view = view.with_points(self.last.ids[kept], moved)
             self._bridge_later(self.last, len(kept))
             view = self._bridged(view)
@@ -257,10 +259,6 @@ def _without_collisions(view: View) -> View:
     cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)
     _, first = np.unique(cells[:, 1] * 100_000 + cells[:, 0], return_index=True)
     return view.only(order[np.sort(first)])
-
-
-def _median_length(vectors: Float32[np.ndarray, "K 2"]) -> float:
-    return float(np.median(np.linalg.norm(vectors, axis=1))) if len(vectors) else 0.0
 
 
 def _there_and_back(
