@@ -13,7 +13,7 @@ FOLDER = method_folder()
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
 
 #: Methods of the quick suite; ``make test-thorough`` checks the others, which take longer or differ by few options.
-QUICK = {"coliags", "scaffold-gs", "3dgs"}
+QUICK = {"coliags", "3dgs"}
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {
     "reim-nerf": (
