@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
-from coliags_plugin.config.options import CompareOptions, ReportOptions, takes
+from coliags_plugin.config.options import AblateOptions, CompareOptions, ReportOptions, takes
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
@@ -38,8 +38,8 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
     return carry_out(make_request(methods, options), ComparisonFolder(options.output), execution)
 
 
-@takes(CompareOptions)
-def ablate(file: str | Path, options: CompareOptions) -> FinishedComparison:
+@takes(AblateOptions)
+def ablate(file: str | Path, options: AblateOptions) -> FinishedComparison:
     """Compare the variants of methods that a file names.
 
     Args:

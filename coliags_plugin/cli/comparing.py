@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 class ComparisonCommand(options.CompareOptions):
     """Command that compares."""
 
+    output: options.Output = field()
     dry_run: bool = False
     """Only print what would be done: every cell with its state."""
     json: options.AsJson = False

@@ -330,6 +330,13 @@ class CompareOptions(Options):
 
 
 @dataclass(frozen=True)
+class AblateOptions(CompareOptions):
+    """Scenes, options of the runs, and how they are carried out; as of a comparison, in a folder of its own."""
+
+    output: Output = Path("ablation")
+
+
+@dataclass(frozen=True)
 class ReportOptions(Options):
     """What a report shows.
 

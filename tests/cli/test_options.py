@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from inspect import signature
 from pathlib import Path
 
@@ -54,3 +54,10 @@ def test_options_are_given_as_an_object_or_by_name_with_texts_and_mappings():
     assert told(1, options) == (1, options, 0)
     with pytest.raises(TypeError, match="seeds"):
         told(1, "coliags", "SCENE", seeds=1)
+
+
+def test_comparisons_have_a_folder_where_none_is_named_and_their_commands_need_one():
+    defaults = [signature(function).parameters["output"].default for function in (cp.compare, cp.ablate)]
+    assert defaults == [Path("comparison"), Path("ablation")]
+    (output,) = [field for field in fields(CompareCommand) if field.name == "output"]
+    assert output.default is MISSING
