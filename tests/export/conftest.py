@@ -18,7 +18,8 @@ def run_of(wall, tmp_path_factory):
     def trained(method, *settings):
         if method not in made:
             small = SMALL if load_method(method).config.field.name == "anchors" else (SMALL[0], SMALL[2])
-            given, folder = parse_assignments([*small, *settings]), tmp_path_factory.mktemp("runs") / method
+            torch = ["renderer=torch"] if method == "2dgs" else []  # numba compiles kernels of surfels for long
+            given, folder = parse_assignments([*small, *torch, *settings]), tmp_path_factory.mktemp("runs") / method
             made[method] = cp.train(method, wall, folder, steps=2, settings=given)
         return made[method]
 

@@ -100,8 +100,8 @@ class Extras(NamedTuple):
     median: tuple[int, ...]
 
 
-#: Channels of a sweep over features, where colours, depths and normals are in the first one.
-FEATURES = Extras(depth=True, inverse_depth=True, normals=True, median=())
+#: Channels of a sweep over features, where all outputs are in the first one, whose kernels serve.
+FEATURES = Extras(depth=True, inverse_depth=True, normals=True, median=(0,))
 
 
 class Grid(NamedTuple):
