@@ -132,7 +132,7 @@ def test_a_single_anchor(made):
 # On a device every example would be compiled for seconds.
 @pytest.mark.thorough
 @pytest.mark.parametrize("made", [NUMBA, "triton"], indirect=True)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     children=st.integers(1, 20), features=st.integers(1, 50), units=st.tuples(st.integers(1, 70), st.integers(1, 70)),
     frequencies=st.integers(0, 10), yaw=st.floats(-2.0, 2.0),
