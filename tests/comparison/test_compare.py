@@ -169,6 +169,7 @@ def test_every_cell_that_begins_and_ends_is_told(bare, tmp_path, caplog):
     assert told[1].startswith("[1/2] bare coliags seed 0: failed: ")
 
 
+@pytest.mark.thorough
 def test_progress_ends_with_the_last_cell_not_with_its_last_step(wall, tmp_path, capsys):
     compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("compare")]
@@ -217,6 +218,7 @@ def test_a_failure_is_forgotten_when_the_cell_is_done(wall, tmp_path, monkeypatc
     assert not done.failures and not list((tmp_path / "new" / "failures").rglob("*.json"))
 
 
+@pytest.mark.thorough
 def test_a_full_disk_in_the_middle(wall, tmp_path, monkeypatch):
     def full(trained, protocol):
         if trained.method == "coliags":
@@ -251,6 +253,7 @@ def test_workers_that_die_are_tried_again_so_often(wall, tmp_path, times, fails)
         assert done.failures[0].attempts == 3
 
 
+@pytest.mark.thorough
 def test_a_stop_names_what_is_done(wall, tmp_path):
     class Interrupted(InlineExecutor):
         def outcome(self, task):

@@ -83,8 +83,11 @@ def test_a_sound_scene_is_not_suspected(scene):
     assert depth["nearest"] < depth["median"] < depth["farthest"] <= 100.0
 
 
+READINGS = sorted(CHANGES.keys() - {"given", "no motion"})
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
+@pytest.mark.parametrize("reading", READINGS)
 def test_poses_in_another_convention_are_called_by_it(scene, reading):
     # Each of these changes undoes itself.
     wrong = changed(scene, pose=CHANGES[reading])
@@ -377,7 +380,9 @@ def test_where_features_contradict_right_poses_points_are_followed(scene, monkey
     assert "images do not agree with the poses" in whats(changed(scene, depth=lambda depth: None))
 
 
-@pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
+@pytest.mark.parametrize(
+    "reading", [READINGS[0], *(pytest.param(each, marks=pytest.mark.thorough) for each in READINGS[1:])]
+)
 def test_followed_points_tell_poses_in_another_convention(unmatched, reading):
     assert "poses agree with the images when read as" in whats(changed(unmatched, pose=CHANGES[reading]))
 

@@ -102,7 +102,7 @@ def held_out_replaced(folder, source):
     return changed
 
 
-@pytest.mark.parametrize("split", ["every-8th", "all-train"])
+@pytest.mark.parametrize("split", ["every-8th", pytest.param("all-train", marks=pytest.mark.thorough)])
 def test_the_depth_of_training_frames_does_not_depend_on_the_images_of_test_frames(wall, estimated, tmp_path, split):
     noise = held_out_replaced(tmp_path / "noise", wall)
     outs = [estimated if split == "every-8th" else tmp_path / "whole", tmp_path / "out"]
@@ -289,7 +289,7 @@ def noisy(frames, level, seed=0):
     return [dataclasses.replace(frame, image=noise()) for frame in frames]
 
 
-@pytest.mark.parametrize("level", [2, 90])
+@pytest.mark.parametrize("level", [2, pytest.param(90, marks=pytest.mark.thorough)])
 def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, caplog, level):
     frames = wall_frames(sideways(COUNT))
     nothing = write_frames(tmp_path / "nothing", noisy(frames, level), depth=False)
