@@ -27,6 +27,7 @@ from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import software
+from coliags_plugin.engine.heap import HeapTrimmer
 from coliags_plugin.engine.loggers import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
@@ -146,7 +147,7 @@ class Trainer:
         logger.info("%s", self.strategy.plan())
         for name, module in self.model.view_modules.items():
             logger.info("module %s: %s", name, module.untrained_views)
-        saved = time.monotonic()
+        saved, heap = time.monotonic(), HeapTrimmer()
         with (
             self.costs.running(),
             deferred_stop() as interrupted,
@@ -164,6 +165,7 @@ class Trainer:
                     following.logged(row)
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
                 following.stepped(self.step)
+                heap.trim_if_grown()
                 stop = interrupted() or self.step == self.steps
                 late = time.monotonic() - saved >= save_seconds
                 if self.step % schedule.checkpoint_every == 0 or stop or late:

@@ -180,6 +180,12 @@ def test_list_and_config_and_doctor(capsys):
     assert "would use cpu" in capsys.readouterr().out
 
 
+def test_ablations_are_found_by_name(scene, tmp_path, capsys):
+    argv = ("ablate", "direction-frequencies", "--scenes", scene, "--output", tmp_path / "new", "--dry-run")
+    assert run(*argv) == 0
+    assert "coliags" in capsys.readouterr().out and not any(tmp_path.iterdir())
+
+
 @pytest.mark.thorough
 def test_phantom_trains(tmp_path):
     coarse = [part for s in ("mesh_spacing=3.0", "texture_spacing=1.0") for part in ("--set", s)]
