@@ -81,7 +81,7 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
 
 
 def coverage_settings(options: CoverageOptions) -> CoverageSettings:
-    """What counts as seen."""
+    """Settings of coverage measurement, which say what counts as seen, from options."""
     from coliags_plugin.core.settings import validated
     from coliags_plugin.surface.coverage.visibility import CoverageSettings
 

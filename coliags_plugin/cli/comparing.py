@@ -77,7 +77,7 @@ class AblateCommand(ComparisonCommand):
         """Compare the variants and print a summary."""
         from coliags_plugin.comparison.named_files import load_ablation
 
-        self.carry_out(load_ablation(str(self.file)))  # of which options make a path
+        self.carry_out(load_ablation(self.file))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -116,7 +116,7 @@ class CellJob(Job):
         return min(self._run.logged_step, self._equal[0].steps - 1)
 
     def finish(self) -> Sequence[Job]:
-        """See :class:`Job`."""
+        """Add the result to all cells that it is of."""
         result = read_result(self._runs.folder.result(self._equal[0]))
         for cell in self._equal:
             self._runs.folder.add(cell, result)
@@ -124,7 +124,7 @@ class CellJob(Job):
         return ()
 
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
-        """See :class:`Job`."""
+        """Record the failure of all cells that wait for the run."""
         for cell in self._equal:
             self._runs.failures.append(self._runs.folder.fail(cell, reason, attempts))
             self._runs.end(cell, "failed", f": {reason}")

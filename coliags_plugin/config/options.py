@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import wraps
 from inspect import getdoc, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import tyro
 
@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 
 def _flag(metavar: str | None = None, **more: Any) -> Any:
-    """What tyro is told of an option whose help says what is done without it, or which is a flag."""
+    """Return the description for tyro of a flag, or of an option whose help says what is done without it."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **more)
 
 
@@ -63,25 +63,22 @@ AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 #: Light of Gaussians for all views.
 Light = Literal["recorded", "mean", "flattened"]
 
-#: Fields of options that are paths, which may be given as texts.
-_PATHS = ("file", "video", "data", "output", "along", "mask", "mesh", "truth", "scene")
-
 
 def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Let a function of ``options`` be called with the fields of their class too, which its help shows."""
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
-        own = signature(function).parameters
-        before = list(own).index("options")
+        parameters = signature(function).parameters
+        before = list(parameters).index("options")
 
         @wraps(function)
         def call(*given: Any, **named: Any) -> R:
             if len(given) > before and isinstance(given[before], kind):
                 return function(*given, **named)
-            others = {name: named.pop(name) for name in own if name in named}
+            others = {name: named.pop(name) for name in parameters if name in named}
             return function(*given[:before], options=kind(*given[before:], **named), **others)
 
-        shown = [*own.values()]
+        shown = [*parameters.values()]
         shown[before : before + 1] = signature(kind).parameters.values()
         vars(call)["__signature__"] = signature(function).replace(parameters=shown)
         call.__doc__ = f"{getdoc(function)}\n\n{getdoc(kind)}"
@@ -91,21 +88,22 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
 
 
 class Options:
-    """Base class of options: paths may be given as texts, and settings as a mapping."""
+    """Base class of options: paths may be given as texts, settings as a mapping, and tuples as a list or one value."""
 
     def __post_init__(self) -> None:
+        types = get_type_hints(type(self))
         for name, value in vars(self).items():
-            if name in _PATHS and isinstance(value, str):
+            if types[name] in (Path, Path | None) and isinstance(value, str):
                 object.__setattr__(self, name, Path(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
-            elif name in ("scenes", "methods", "columns", "formats") and not isinstance(value, tuple):
+            elif get_origin(types[name]) is tuple and not isinstance(value, tuple):
                 object.__setattr__(self, name, (value,) if isinstance(value, (str, Path)) else tuple(value))
 
 
 @dataclass(frozen=True)
 class TrainOptions(Options):
-    """What to train on what, and how.
+    """Options of training a method on a scene.
 
     Args:
         method: Name of a method (`coliags list methods`) or path of a YAML file.
@@ -135,7 +133,7 @@ class TrainOptions(Options):
 
 @dataclass(frozen=True)
 class ImportOptions(Options):
-    """What to import.
+    """Options of importing a file of Gaussians as a run.
 
     Args:
         file: PLY (3DGS's attributes; 2DGS's, without scale_2) or SPZ, in the world frame and unit of the scene.
@@ -152,7 +150,7 @@ class ImportOptions(Options):
 
 @dataclass(frozen=True)
 class EvaluateOptions(Options):
-    """How to evaluate.
+    """Options of evaluating a run.
 
     Args:
         protocol: Protocol by name (`coliags list protocols`); default: the method config's.
@@ -169,7 +167,7 @@ class EvaluateOptions(Options):
 
 @dataclass(frozen=True)
 class RenderOptions(Options):
-    """What to render.
+    """Options of rendering a run to images and video.
 
     Args:
         output: Folder to create; default RUN/renders, in another light RUN/relit, along a path RUN/path.
@@ -196,7 +194,7 @@ class RenderOptions(Options):
 
 @dataclass(frozen=True)
 class MeshOptions(Options):
-    """How to make a mesh.
+    """Options of making a mesh of a run.
 
     Args:
         output: Folder to create; default RUN/mesh.
@@ -221,12 +219,9 @@ class MeshOptions(Options):
     overwrite: Overwrite = False
 
 
-_MEASURE = "compare each file with the run on the held-out views, for the record and the terminal."
-
-
 @dataclass(frozen=True)
 class ExportOptions(Options):
-    """What to export, and how it is baked.
+    """Options of exporting the Gaussians of a run, baked where their colours depend on the view.
 
     Args:
         output: File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json. Of several formats, each has
@@ -243,14 +238,17 @@ class ExportOptions(Options):
     output: OptionalOutput = None
     light: Light = "mean"
     seconds: float = 180.0
-    measure: Annotated[bool, _flag(help=f"Do not {_MEASURE}")] = True
+    measure: Annotated[
+        bool,
+        _flag(help="Do not compare each file with the run on the held-out views, for the record and the terminal."),
+    ] = True
     formats: Annotated[tuple[Literal["ply", "spz", "glb"], ...], tyro.conf.arg(name="format")] = ("ply",)
     overwrite: Overwrite = False
 
 
 @dataclass(frozen=True)
 class PageOptions(Options):
-    """What a page of a scene holds.
+    """Options of the page of a scene that opens offline.
 
     Args:
         output: Write the scene to this file instead, as a self-contained HTML page, which opens offline.
@@ -272,7 +270,7 @@ class PageOptions(Options):
 
 @dataclass(frozen=True)
 class CoverageOptions(Options):
-    """How to measure coverage.
+    """Options of measuring coverage.
 
     Args:
         output: Folder to create; default RUN/coverage.
@@ -289,7 +287,7 @@ class CoverageOptions(Options):
 
 @dataclass(frozen=True)
 class CompareOptions(Options):
-    """Scenes, options of the runs, and how they are carried out.
+    """Options of a comparison: its scenes, its runs, and where they are done.
 
     Args:
         scenes: Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes.
@@ -331,14 +329,14 @@ class CompareOptions(Options):
 
 @dataclass(frozen=True)
 class AblateOptions(CompareOptions):
-    """Scenes, options of the runs, and how they are carried out; as of a comparison, in a folder of its own."""
+    """Options of an ablation: those of a comparison, in a folder of its own."""
 
     output: Output = Path("ablation")
 
 
 @dataclass(frozen=True)
 class ReportOptions(Options):
-    """What a report shows.
+    """Options of a report.
 
     Args:
         output: File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md,
@@ -374,7 +372,7 @@ class ReportOptions(Options):
 
 @dataclass(frozen=True)
 class ReconstructOptions(Options):
-    """What to reconstruct, and where its stages are done.
+    """Options of a reconstruction: its source, its stages, and where they are done.
 
     Args:
         video: Video file, folder of one with its calibration, folder of images ordered by the numbers in their names,

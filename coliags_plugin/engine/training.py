@@ -27,7 +27,7 @@ IfExists = Literal["refuse", "overwrite", "resume", "continue"]
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train on what."""
+    """Method, scene and changes of a run to be trained."""
 
     method: str  # name of a method, or path of a method config
     data: Path  # the scene's folder

@@ -199,7 +199,7 @@ class PartJob(Job):
 
     @property
     def doing(self) -> str:
-        """See :class:`Job`: with the stage that its worker is at."""
+        """Title of the part, with the stage that its worker is at."""
         begun = [name for name, stage in self._states().items() if stage.state == "begun"]
         return " ".join([self.task.title, *(name.rpartition("/")[2] for name in begun)])
 
@@ -211,11 +211,11 @@ class PartJob(Job):
         return {name: record.stages.get(name, StageRecord({}, "failed")) for name in names}
 
     def finish(self) -> Sequence[Job]:
-        """See :class:`Job`."""
+        """Take up what the worker has written, and return the jobs after it."""
         return self._end()
 
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
-        """See :class:`Job`; a disk that cannot be written is that of the other parts, too."""
+        """Record the failure, and return the jobs after it; a disk that cannot be written ends all of them."""
         if ending == "unwritable":
             raise NotWritableError(f"{self.task.title}: {reason}", do="What is done is kept")
         return self._end(InputError(reason or "it failed"))

@@ -192,7 +192,7 @@ _PIXEL, _DEPTH, _SUBMAP_BYTES = 1.0, 0.45e6, 75e6
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a reconstruction takes, roughly: half to twice as much."""
+    """Time and disk that a reconstruction takes, right within a factor of two."""
 
     frames: int  # of use, at most
     seconds: float  # of one CPU core

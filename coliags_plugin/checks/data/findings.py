@@ -195,7 +195,7 @@ class Finding:
 
 
 def is_flat(depth: JsonObject) -> bool:
-    """Whether depth is the same everywhere; False where it is unknown."""
+    """Return whether depth is the same everywhere; False where it is unknown."""
     return bool(depth["farthest"] - depth["nearest"] < 1e-3 * depth["median"])
 
 
@@ -310,7 +310,7 @@ RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str, str, str]]] = {
 
 
 def findings_of(about: str, facts: JsonObject | None) -> Iterator[Finding]:
-    """What the rules of a kind find suspect in facts; nothing where there are none."""
+    """Findings by the rules about one kind of facts; none where there are no facts."""
     if facts is not None:
         yield from (Finding(what, said.format(**facts), do) for test, what, said, do in RULES[about] if test(facts))
 
