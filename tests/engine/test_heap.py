@@ -28,5 +28,5 @@ for count in (2_000, 12_000):
 def test_freed_memory_is_given_back_when_the_process_has_grown():
     done = subprocess.run([sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, timeout=120)
     of_little, of_much = map(int, done.stdout.split())
-    assert of_little == 0  # 125 MiB are free
+    assert of_little < 25  # of 125 MiB: the process has not grown enough
     assert of_much > 600  # of 750 MiB
