@@ -12,18 +12,20 @@ from pathlib import Path
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 import pytest
-import torch
 from filelock import FileLock
 
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
-
 from tests.browser import Browser, find_chromium
-from tests.scenes import write_wall
-
-torch.set_num_threads(1)  # as many processes run as there are CPUs, and the order of sums depends on it
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_collectstart():
+    """Set up torch before tests are imported; the process that only hands tests to others does without it."""
+    import torch
+
+    if not torch.cuda.is_available():
+        os.environ["TRITON_INTERPRET"] = "1"  # read when the kernels are first imported
+    torch.set_num_threads(1)  # as many processes run as there are CPUs, and the order of sums depends on it
 
 
 def pytest_collection_finish():
@@ -35,6 +37,8 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True)
 def repeatable_torch():
     """The same numbers in whatever order tests run: one torch thread (the order of sums), and a seed."""
+    import torch
+
     torch.set_num_threads(1)
     torch.manual_seed(0)
 
@@ -61,6 +65,8 @@ def compile_once(tmp_path_factory):
 @pytest.fixture(scope="session")
 def wall(shared_folder):
     """The folder of :func:`tests.scenes.wall_scene`; never changed."""
+    from tests.scenes import write_wall
+
     return shared_folder("wall", write_wall)
 
 
