@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
+from coliags_plugin.config.registry import installed
 from coliags_plugin.config.yaml_tree import read_tree
 from coliags_plugin.core.errors import InputError
 
@@ -26,7 +26,7 @@ def method_files() -> dict[str, Path]:
     root = method_folder()
     paths = [path.relative_to(root) for path in root.rglob("*.yaml")]
     files = {path.with_suffix("").as_posix(): root / path for path in paths if path.parts[0] != BENCHMARKS}
-    for entry in entry_points(group=ENTRY_POINTS):
+    for entry in installed(ENTRY_POINTS):
         if entry.name in files:
             raise InputError(
                 f"method '{entry.name}' of package {entry.value} is already there: {files[entry.name]}",
@@ -40,8 +40,8 @@ def method_files() -> dict[str, Path]:
 def method_folder() -> Path:
     """Folder of the shipped method configs: inside the wheel, or beside the package in a checkout."""
     package = Path(__file__).parents[1]
-    installed = package / "method_configs"
-    return installed if installed.is_dir() else package.parent / "method_configs"
+    in_wheel = package / "method_configs"
+    return in_wheel if in_wheel.is_dir() else package.parent / "method_configs"
 
 
 def is_path(name: str) -> bool:

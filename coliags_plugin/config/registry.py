@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from runpy import run_path
 from typing import Any, TypeGuard
@@ -102,11 +102,22 @@ class Registry:
         if self._complete:
             return
         self._complete = True
-        for entry in entry_points(group=f"coliags_plugin.{self.kind}"):
+        for entry in installed(f"coliags_plugin.{self.kind}"):
             self.register(entry.name, entry.value, source=f"entry point {entry.value}")
         for path, components in _plugin_files(os.environ.get(PLUGIN_PATH_VARIABLE, "")).items():
             for name, target in components.get(self.kind, {}).items():
                 self.register(name, target, source=path)
+
+
+@cache
+def _entry_points() -> Any:
+    """Entry points of all installed packages, whose files take some milliseconds to find and read."""
+    return entry_points()
+
+
+def installed(group: str) -> tuple[EntryPoint, ...]:
+    """Entry points of a group, of whatever was installed when the first group was asked for."""
+    return tuple(_entry_points().select(group=group))
 
 
 def _load(target: str) -> Any:

@@ -47,9 +47,9 @@ def test_listing_imports_nothing():
 def test_entry_points_are_found(monkeypatch):
     def fake(group):
         wanted = group == "coliags_plugin.things"
-        return [metadata.EntryPoint("pi", "math:pi", group)] if wanted else []
+        return (metadata.EntryPoint("pi", "math:pi", group),) if wanted else ()
 
-    monkeypatch.setattr(registry_module, "entry_points", fake)
+    monkeypatch.setattr(registry_module, "installed", fake)
     registry = Registry("things", {}, "thing")
     assert registry.get("pi") == pytest.approx(3.14159, abs=1e-4)
     assert "entry point" in registry.source("pi")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -70,20 +70,10 @@ class MappedLens(CalibratedLens):
         tangents[asked[found]] = _directions(angles[found])
         return tangents
 
-    @cached_property
+    @property
     def _limits(self) -> Array:
         """Angle up to which the map may be used, for directions at even steps round the axis. [AROUND]"""
-        away: Array = np.linspace(0.0, _WIDEST, _AWAY + 1)[1:]
-        grid = np.repeat(_CLOCK, _AWAY), np.tile(away, _AROUND)
-        sound = self._keeps_orientation(*grid).reshape(_AROUND, _AWAY)
-        first_bad = np.where(sound.all(axis=1), _AWAY, np.argmin(sound, axis=1))
-        high = away[np.minimum(first_bad, _AWAY - 1)]
-        low = np.where(first_bad > 0, away[np.maximum(first_bad, 1) - 1], 0.0)
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            sound_there = self._keeps_orientation(_CLOCK, middle)
-            low, high = np.where(sound_there, middle, low), np.where(sound_there, high, middle)
-        return np.where(first_bad == _AWAY, _WIDEST, low)
+        return _limits_of(self)
 
     @cached_property
     def _seeds(self) -> tuple[cKDTree, Array]:
@@ -160,6 +150,22 @@ class OpenCVLens(MappedLens):
             bent_x = x * radial + self.p1 * product + self.p2 * (square + 2.0 * x * x)
             bent_y = y * radial + self.p1 * (square + 2.0 * y * y) + self.p2 * product
         return np.stack([self.fx * bent_x + self.cx, self.fy * bent_y + self.cy], axis=1)
+
+
+@lru_cache(maxsize=64)
+def _limits_of(lens: MappedLens) -> Array:
+    """See :attr:`MappedLens._limits`; found once for equal lenses, as every reading of a scene makes its own."""
+    away: Array = np.linspace(0.0, _WIDEST, _AWAY + 1)[1:]
+    grid = np.repeat(_CLOCK, _AWAY), np.tile(away, _AROUND)
+    sound = lens._keeps_orientation(*grid).reshape(_AROUND, _AWAY)
+    first_bad = np.where(sound.all(axis=1), _AWAY, np.argmin(sound, axis=1))
+    high = away[np.minimum(first_bad, _AWAY - 1)]
+    low = np.where(first_bad > 0, away[np.maximum(first_bad, 1) - 1], 0.0)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        sound_there = lens._keeps_orientation(_CLOCK, middle)
+        low, high = np.where(sound_there, middle, low), np.where(sound_there, high, middle)
+    return np.where(first_bad == _AWAY, _WIDEST, low)
 
 
 def _vector(clock: Array, angle: Array) -> Array:
