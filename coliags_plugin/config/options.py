@@ -329,7 +329,7 @@ class CompareOptions(Options):
 
 @dataclass(frozen=True)
 class AblateOptions(CompareOptions):
-    """Options of an ablation: those of a comparison, in a folder of its own."""
+    """Options of an ablation: as of a comparison, with ``ablation`` as the default output folder."""
 
     output: Output = Path("ablation")
 

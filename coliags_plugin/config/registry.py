@@ -111,12 +111,12 @@ class Registry:
 
 @cache
 def _entry_points() -> Any:
-    """Entry points of all installed packages, whose files take some milliseconds to find and read."""
+    """Entry points of all installed packages; finding them reads a file of each package."""
     return entry_points()
 
 
 def installed(group: str) -> tuple[EntryPoint, ...]:
-    """Entry points of a group, of whatever was installed when the first group was asked for."""
+    """Entry points of a group. They are read once per process: packages installed after that are not seen."""
     return tuple(_entry_points().select(group=group))
 
 

@@ -70,18 +70,13 @@ class MappedLens(CalibratedLens):
         tangents[asked[found]] = _directions(angles[found])
         return tangents
 
-    @property
-    def _limits(self) -> Array:
-        """Angle up to which the map may be used, for directions at even steps round the axis. [AROUND]"""
-        return _limits_of(self)
-
     @cached_property
     def _seeds(self) -> tuple[cKDTree, Array]:
         """Pixels of a grid of usable directions, to be looked up, and those directions. [S, 2]"""
         clock = np.repeat(_CLOCK, _AWAY)
         # Sparser at wide angles, as far as each direction reaches, but not onto the fold itself.
         share = np.tile((np.arange(_AWAY) + 0.5) / _AWAY, _AROUND)
-        angles = _vector(clock, share * np.repeat(self._limits, _AWAY))
+        angles = _vector(clock, share * np.repeat(_limits(self), _AWAY))
         pixels = self._at(angles)
         finite = np.isfinite(pixels).all(axis=1)
         return cKDTree(pixels[finite]), angles[finite]
@@ -89,7 +84,7 @@ class MappedLens(CalibratedLens):
     def _reach(self, angles: Array) -> Array:
         """The limit in the direction of each vector. [N]"""
         clock = np.arctan2(angles[:, 1], angles[:, 0])
-        return np.interp(clock, _CLOCK, self._limits, period=2.0 * np.pi)
+        return np.interp(clock, _CLOCK, _limits(self), period=2.0 * np.pi)
 
     def _kept_inside(self, angles: Array) -> Array:
         length, reach = np.linalg.norm(angles, axis=1), self._reach(angles)
@@ -153,8 +148,11 @@ class OpenCVLens(MappedLens):
 
 
 @lru_cache(maxsize=64)
-def _limits_of(lens: MappedLens) -> Array:
-    """See :attr:`MappedLens._limits`; found once for equal lenses, as every reading of a scene makes its own."""
+def _limits(lens: MappedLens) -> Array:
+    """Angle up to which a lens's map may be used, radians, for directions at even steps round the axis. [AROUND]
+
+    Cached by the lens's parameters: each time a scene is read, its lenses are made anew.
+    """
     away: Array = np.linspace(0.0, _WIDEST, _AWAY + 1)[1:]
     grid = np.repeat(_CLOCK, _AWAY), np.tile(away, _AROUND)
     sound = lens._keeps_orientation(*grid).reshape(_AROUND, _AWAY)
