@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.options import AblateOptions, CompareOptions, ReportOptions, takes
+from coliags_plugin.core.files import user_path
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
@@ -93,7 +94,7 @@ def report(
 
     parts = [of] if isinstance(of, (Run, FinishedComparison, str, Path)) else of
     paths = [
-        part.path if isinstance(part, Run) else part.folder if isinstance(part, FinishedComparison) else Path(part)
+        part.path if isinstance(part, Run) else part.folder if isinstance(part, FinishedComparison) else user_path(part)
         for part in parts
     ]
     is_html = not options.formats or not {"html", "all"}.isdisjoint(options.formats)

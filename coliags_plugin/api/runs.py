@@ -17,7 +17,7 @@ from coliags_plugin.config.options import (
     RenderOptions,
     takes,
 )
-from coliags_plugin.core.files import refuse_existing
+from coliags_plugin.core.files import refuse_existing, user_path
 from coliags_plugin.engine.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -52,9 +52,9 @@ class Run:
     """
 
     def __init__(self, path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> None:
-        self.folder = RunFolder.existing(Path(path))
+        self.folder = RunFolder.existing(user_path(path))
         self.path = self.folder.path
-        self.data = None if data is None else Path(data)
+        self.data = None if data is None else user_path(data)
         self.device = device
         self._identity = identity = self.folder.identity()
         self.method, self.scene_name, self.seed = identity.method, identity.scene_name, identity.seed

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.assignments import assignments, parse_assignments
 from coliags_plugin.config.options import CoverageOptions, ReconstructOptions, takes
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import refuse_existing
+from coliags_plugin.core.files import refuse_existing, user_path
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
@@ -33,7 +33,7 @@ def load_scene(data: str | Path, data_format: str | None = None, settings: Mappi
     from coliags_plugin.engine.progress import progress_callback
 
     with progress_callback(after=READING_IS_LONG) as progress:
-        return open_scene(Path(data), data_format, assignments(settings), progress)
+        return open_scene(user_path(data), data_format, assignments(settings), progress)
 
 
 def make_phantom(output: str | Path, /, *, overwrite: bool = False, **settings: Any) -> Path:
@@ -55,8 +55,8 @@ def make_phantom(output: str | Path, /, *, overwrite: bool = False, **settings: 
     from coliags_plugin.phantom.settings import phantom_settings
 
     with progress_callback() as progress:
-        generate(phantom_settings(settings), Path(output), overwrite=overwrite, progress=progress)
-    return Path(output)
+        generate(phantom_settings(settings), folder := user_path(output), overwrite=overwrite, progress=progress)
+    return folder
 
 
 @takes(CoverageOptions)
@@ -76,7 +76,7 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
         )
     chosen = coverage_settings(options)
     refuse_existing(options.output, options.overwrite)
-    recording, wall = open_recording(Path(data)), read_mesh(options.mesh)
+    recording, wall = open_recording(user_path(data)), read_mesh(options.mesh)
     return measure_scene(recording, wall, options.output, chosen, options.overwrite)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, get_args, get_type_hints
@@ -55,6 +56,8 @@ Command = (
     | Annotated[DoctorCommand, tyro.conf.subcommand("doctor")]
 )
 
+#: A word, or the value after ``--option=``, that begins with ``~``. Settings are expanded where they are used.
+_HOME = re.compile(r"((?:--[\w-]+=)?)(~[^=]*)")
 #: Exit status for arguments that cannot be parsed.
 _USAGE_ERROR = 2
 DESCRIPTION = (
@@ -71,8 +74,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     if argv is None:
         separate_stderr()
-    words = sys.argv[1:] if argv is None else argv
-    if list(words) == ["--version"]:
+    # The shell leaves a ~ that is quoted or comes after "=", as in --data=~/scene.
+    given = sys.argv[1:] if argv is None else argv
+    words = [f[1] + os.path.expanduser(f[2]) if (f := _HOME.fullmatch(word)) else word for word in given]
+    if words == ["--version"]:
         print(f"coliags {__version__}")
         sys.exit(0)
     try:

@@ -172,7 +172,7 @@ class WeightsCommand:
         from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
 
         nets = DEFAULT_NETS if self.net is None else tuple(SOURCES) if self.net == "all" else (self.net,)
-        folder = None if self.folder is None else self.folder.expanduser().resolve()
+        folder = None if self.folder is None else self.folder.resolve()
         written = install(nets, folder, self.from_folder)
         for net in nets:
             backbone, heads = find_weights(net, folder)

@@ -20,6 +20,7 @@ from coliags_plugin.config.method_config import method_name
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number, did_you_mean
+from coliags_plugin.core.files import user_path
 from coliags_plugin.datamanagers.scene_settings import Split
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.execution.queue import Job, JobQueue, make_executor
@@ -91,12 +92,12 @@ class CellJob(Job):
     def __init__(self, equal: Sequence[ComparisonCell], runs: CellRuns) -> None:
         self._equal, self._runs, cell = equal, runs, equal[0]
         self.size = sum(cell.steps for cell in equal)
-        self._run = runs.folder.run(cell)
+        self._run, method = runs.folder.run(cell), cell.variant.method
         self.task = CellTask(
             title=cell.title,
             key=cell.known_keys.result,
             name=cell.variant.name,
-            method=str(Path(cell.variant.method).resolve()) if is_path(cell.variant.method) else cell.variant.method,
+            method=str(user_path(method).resolve()) if is_path(method) else method,
             overrides=cell.overrides,
             scene=cell.scene.name,
             data=str(cell.scene.path),

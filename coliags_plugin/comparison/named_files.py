@@ -15,6 +15,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.method_files import BENCHMARKS, is_path, method_folder
 from coliags_plugin.config.yaml_tree import dump_inline, errors_with_origins, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.phantom.settings import PhantomSettings
 
@@ -37,7 +38,7 @@ def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> t
     files = shipped(folder)
     if not is_path(name) and name not in files:
         raise InputError(f"no {noun} '{name}'", f"one of {', '.join(files)}, or a YAML file", did_you_mean(name, files))
-    path = Path(name) if is_path(name) else files[name]
+    path = user_path(name) if is_path(name) else files[name]
     tree = read_tree(path)
     try:
         return path, content.model_validate(tree.plain())

@@ -15,6 +15,7 @@ from coliags_plugin.comparison.named_files import Benchmark, load_benchmark, shi
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
@@ -94,7 +95,7 @@ def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
     if name in files or is_path(name):
         return load_benchmark(name), None
     first, _, scene = name.rpartition("/")
-    if (first in files or is_path(first)) and scene and not Path(name).is_dir():
+    if (first in files or is_path(first)) and scene and not user_path(name).is_dir():
         return load_benchmark(first), scene
     return None, None
 
@@ -109,7 +110,7 @@ def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[Scene
     return [
         SceneSource(
             name,
-            _first_there([(data / folder).resolve() for folder in entry.folders(name)]),
+            _first_there([(data / user_path(folder)).resolve() for folder in entry.folders(name)]),
             benchmark.overrides(name),
             entry.format or benchmark.settings.format,
             entry.phantom,
@@ -124,7 +125,7 @@ def _first_there(paths: Sequence[Path]) -> Path:
 
 
 def _folder(name: str) -> SceneSource:
-    path = Path(name)
+    path = user_path(name)
     if not path.is_dir():
         files = shipped()
         raise InputError(

@@ -34,6 +34,7 @@ from coliags_plugin.config.yaml_tree import (
     read_tree,
 )
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
@@ -174,7 +175,7 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
 
 def _find(method: str, folder: Path) -> Path:
     if is_path(method):
-        path = folder / method
+        path = folder / user_path(method)
         if not path.is_file():
             raise InputError(f"no file {path}", "a method config", "See `coliags list methods`")
         return path

@@ -14,6 +14,7 @@ import tyro
 
 from coliags_plugin.config.assignments import assignments
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 
 R = TypeVar("R")
 
@@ -93,8 +94,8 @@ class Options:
     def __post_init__(self) -> None:
         types = get_type_hints(type(self))
         for name, value in vars(self).items():
-            if types[name] in (Path, Path | None) and isinstance(value, str):
-                object.__setattr__(self, name, Path(value))
+            if types[name] in (Path, Path | None) and value is not None:
+                object.__setattr__(self, name, user_path(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
             elif get_origin(types[name]) is tuple and not isinstance(value, tuple):

@@ -37,6 +37,11 @@ _OWN: set[str] = set()
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
+def user_path(path: str | Path) -> Path:
+    """The path with a leading ``~`` or ``~user`` replaced by the home folder; as it is where there is no such user."""
+    return Path(os.path.expanduser(path))
+
+
 def refuse_overlap(output: Path, source: Path) -> None:
     """Refuse an output folder that is, contains or is inside the input."""
     made, read = output.resolve(), source.resolve()

@@ -15,6 +15,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import decode_image
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
@@ -393,7 +394,7 @@ def _find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
 
 def _params(folder: Path, params_file: str | None) -> Path | None:
     if params_file is not None:
-        return reading.required_file(folder / params_file, "EndoGSLAM's params.npz", "Correct params_file")
+        return reading.required_file(folder / user_path(params_file), "EndoGSLAM's params.npz", "Correct params_file")
     here = folder.resolve()
     beside = here.parent.with_name(here.parent.name + OPTIMIZED) / here.name if here.parent.name else here
     return next((path / PARAMS for path in (folder, beside) if (path / PARAMS).is_file()), None)

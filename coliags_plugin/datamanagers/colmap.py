@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.atlas import model_unit, read_atlas
 from coliags_plugin.datamanagers.reading import files as reading
@@ -224,7 +225,7 @@ class ColmapDataManager(RecordedDataManager):
         if not path.is_dir():
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
         model = read_model(self._model_folder(path))
-        paths = _image_paths(path / settings.images_folder, model, settings.outside_files)
+        paths = _image_paths(path / user_path(settings.images_folder), model, settings.outside_files)
         masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
         lenses = {

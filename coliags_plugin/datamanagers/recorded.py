@@ -18,6 +18,7 @@ from jaxtyping import Bool
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
@@ -208,7 +209,7 @@ class RecordedDataManager(DataManager):
         has_depth = any(shot.depth is not None for shot in recording.shots)
         own, source = recording.own_points, recording.points_source
         if settings.initial_points == "file":
-            source = path / settings.points_file
+            source = path / user_path(settings.points_file)
             own = partial(load_points, source)
         elif has_depth and (settings.initial_points == "depth" or own is None):
             points = fuse_depth(train, settings.points_count, generator, progress)

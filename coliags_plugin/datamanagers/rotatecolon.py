@@ -18,6 +18,7 @@ from pydantic import Field
 
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
@@ -147,7 +148,7 @@ class RotateColonDataManager(RecordedDataManager):
         parts = [self._views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)]
         test = path / TEST
         if test.is_file():
-            images = path / self.settings.test_folder
+            images = path / user_path(self.settings.test_folder)
             if not images.is_dir():
                 raise InputError(
                     f"{path} has {TEST} but no folder {self.settings.test_folder}",

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.masked import zero_outside
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.metrics.image import require_image
@@ -51,7 +52,7 @@ class LPIPS(Metric[LPIPSSettings]):
 
     def __init__(self, settings: LPIPSSettings) -> None:
         super().__init__(settings)
-        if settings.weights is not None and not Path(settings.weights).expanduser().is_dir():
+        if settings.weights is not None and not user_path(settings.weights).is_dir():
             raise InputError(f"lpips: weights = '{settings.weights}' is not a folder", "a folder with LPIPS weights")
 
     def __call__(self, comparison: Comparison) -> float:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
 
 WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
@@ -89,7 +90,7 @@ def searched_folders(folder: str | Path | None = None) -> Iterator[Path]:
     """Folders in which weights are searched for, in order; heads also in an installed ``lpips`` package."""
     for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
         if named:
-            yield Path(named).expanduser()
+            yield user_path(named)
     yield default_folder()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import videos_in
@@ -358,7 +359,7 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
     elif camera.model.lower().endswith(SUFFIX):
         if camera.params is not None:
             raise InputError(f"--params, and --camera {camera.model}", "one of them", "Drop --params")
-        calibration = read_calibration(Path(camera.model))
+        calibration = read_calibration(user_path(camera.model))
     else:
         calibration = None
     if calibration is None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
+from coliags_plugin import Run, report, train
+from coliags_plugin.comparison.scenes import find_scenes
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.export.splats.files import write_splats
-from tests.commands import run
+from tests.commands import refused, run
 from tests.export.splats.clouds import random_cloud
 from tests.scenes import SMALL, write_wall
 
@@ -48,6 +52,25 @@ def test_of_an_imported_run(tmp_path, scene):
     assert run("import", tmp_path / "Jane Doe/cloud.ply", "--data", scene, "--output", out) == 0
     assert json.loads((out / "provenance.json").read_text())["imported"]["file"] == "cloud.ply"
     assert not telling(out, str(tmp_path))
+
+
+def test_home_folder(tmp_path, scene, monkeypatch, capsys):
+    """``~`` in words of the command line, the Python API, settings, method configs and benchmark files."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    home = "~/Jane Doe"
+    shutil.copy(write_wall(tmp_path / "pointed", depth=False) / "points3D.ply", tmp_path / "Jane Doe/points.ply")
+    (tmp_path / "base.yaml").write_text("base: scaffold-gs\n")
+    (tmp_path / "own.yaml").write_text("base: ~/base.yaml\n")
+    points = ("initial_points=file", "points_file=~/Jane Doe/points.ply")
+    assert run("data", "check", f"{home}/scene", "--html=~/page.html", "--set", points[0], "--set", points[1]) in (0, 1)
+    assert (tmp_path / "page.html").is_file() and "points.ply" in capsys.readouterr().out
+    trained = train("~/own.yaml", f"{home}/scene", output="~/run", steps=1, renderer="torch", settings=SMALL)
+    assert trained.path == tmp_path / "run" == Run("~/run").path and (tmp_path / "run/config.yaml").is_file()
+    with pytest.raises(InputError, match=str(tmp_path / "run")):
+        report("~/run")  # was not evaluated
+    (tmp_path / "bench.yaml").write_text("description: One scene\nscenes:\n  wall: {folder: ~/Jane Doe/scene}\n")
+    assert [str(source.path) for source in find_scenes(["~/bench.yaml"])] == [str(scene)]
+    refused(capsys, "data", "check", "~nobody-of-this-name/scene")
 
 
 def test_of_checks(tmp_path, scene, capsys):
