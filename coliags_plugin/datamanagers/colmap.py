@@ -112,28 +112,28 @@ def read_model(folder: Path) -> SparseModel:
             "Give the model's folder with --set datamanager.model=FOLDER",
         )
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
-    trajectory = colmap_poses.read(folder)
+    registered = colmap_poses.ordered_images(files[1])
     cameras, points = colmap_poses.read_cameras(files[0]), colmap_poses.read_points(files[2])
     rows = {point.number: row for row, point in enumerate(points)}
-    by_name = {image.name: image for image in colmap_poses.read_images(files[1])}
     images = []
-    for name in trajectory.names or ():
-        image = by_name[name]
+    for image in registered:
         if missing := [number for number in image.points.tolist() if number not in rows]:
             raise InputError(
-                f"{files[2]} has {len(rows)} points, but not {missing[0]}, which {name} observes",
+                f"{files[2]} has {len(rows)} points, but not {missing[0]}, which {image.name} observes",
                 "all points of the model",
                 f"{files[2].name} is cut short or of another model: copy it again",
             )
         if image.camera not in cameras:
-            raise InputError(f"{files[0]} has no camera {image.camera}, which {name} is of", "all cameras of the model")
+            raise InputError(
+                f"{files[0]} has no camera {image.camera}, which {image.name} is of", "all cameras of the model"
+            )
         images.append(replace(image, points=np.array([rows[number] for number in image.points.tolist()], np.int64)))
     used = sorted({image.camera for image in images})
     return SparseModel(
         folder,
         files,
         images,
-        trajectory.camera_to_world,
+        colmap_poses.camera_to_world(images),
         {number: _lens(cameras[number], files[0]) for number in used},
         np.array([point.position for point in points], np.float64).reshape(-1, 3),
         np.array([point.color for point in points], np.uint8).reshape(-1, 3),

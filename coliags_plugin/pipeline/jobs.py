@@ -148,7 +148,7 @@ def _camera_of(scene: Path) -> CameraSettings | None:
     suffix = model_suffix(folder, ("images", "cameras"))
     if suffix is None:
         return None
-    number = read_images(folder / f"images{suffix}", observations=False)[0].camera
+    number = read_images(folder / f"images{suffix}")[0].camera
     camera = read_cameras(folder / f"cameras{suffix}")[number]
     return CameraSettings(model=camera.model, params=tuple(map(float, camera.params)), refine=False)
 

@@ -7,6 +7,8 @@ the camera models.
 
 from __future__ import annotations
 
+import logging
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,7 +31,11 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, 
 if TYPE_CHECKING:
     import pycolmap
 
+log = logging.getLogger(__name__)
+
 _Record = TypeVar("_Record")
+#: COLMAP's comment on the number of images.
+_STATED_COUNT = re.compile(r"Number of images: (\d+)")
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 
 
@@ -82,24 +88,31 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     return {camera.number: camera for camera in cameras}
 
 
-def read_images(path: Path, observations: bool = True) -> list[ColmapImage]:
-    """Read ``images.bin`` or ``images.txt``.
-
-    Without ``observations`` those of a text file, nearly all of its length, are not parsed, and there are none.
-    """
+def read_images(path: Path) -> list[ColmapImage]:
+    """Read ``images.bin`` or ``images.txt``."""
     if path.suffix == ".bin":
         return _binary_records(path, _binary_image)
-    images, rows = [], text_lines(path, EXPECTED)
+    images, rows, stated = [], text_lines(path, EXPECTED), None
     for number, line in rows:
         if not line.strip() or line.lstrip().startswith("#"):
+            stated = stated or _STATED_COUNT.search(line)
             continue
         image = _parsed(path, number, line, _text_image, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all finite")
-        second, observed = next(rows, (number, ""))
-        parsed = _parsed(
-            path, second, observed if observations else "", _text_observations, "X Y POINT3D_ID of each point"
-        )
+        parsed = _parsed(path, *next(rows, (number, "")), _text_observations, "X Y POINT3D_ID of each point")
         images.append(ColmapImage(f"{path}, line {number}", *image, *parsed))
+    if stated and int(stated[1]) > len(images):
+        log.warning("%s holds %d images, but its header says %s: is it cut short?", path, len(images), stated[1])
     return images
+
+
+def ordered_images(path: Path) -> list[ColmapImage]:
+    """Images as of :func:`read_images`, at least one, in natural order of their names, 2 before 10."""
+    images = read_images(path)
+    if not images:
+        raise InputError(f"{path} holds no poses", "at least one registered image")
+    names = [image.name for image in images]
+    refuse_repeated(names, str(path))
+    return [images[index] for index in natural_order(names)]
 
 
 def read_points(path: Path) -> list[ColmapPoint]:
@@ -203,6 +216,7 @@ def _text_camera(line: str) -> ColmapCamera:
 
 def _text_image(line: str) -> tuple[tuple[float, ...], tuple[float, ...], int, str]:
     words = line.split(maxsplit=9)
+    int(words[0])
     pose = tuple(float(word) for word in words[1:8])
     if not np.all(np.isfinite(pose)):
         raise ValueError("not finite")
@@ -256,22 +270,22 @@ def read(path: Path) -> Trajectory:
             "a folder with images.bin and cameras.bin, or images.txt and cameras.txt",
             "Give the folder of the sparse model itself, often sparse/0",
         )
-    images = read_images(path / f"images{suffix}", observations=False)
-    if not images:
-        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered image")
-    refuse_repeated([image.name for image in images], str(path / f"images{suffix}"))
-    images = [images[index] for index in natural_order([image.name for image in images])]
-    quats_wxyz = np.array([image.quat_wxyz for image in images])
-    rotations = rotations_from_wxyz(quats_wxyz, lambda index: images[index].source, unit=True)
-    world_to_camera = rigid(rotations, np.array([image.translation for image in images]))
+    images = ordered_images(path / f"images{suffix}")
     intrinsics, remark = _common(read_pinholes(path / f"cameras{suffix}"), {image.camera for image in images})
     return Trajectory(
-        inverse(world_to_camera),
+        camera_to_world(images),
         names=tuple(image.name for image in images),
         intrinsics=intrinsics,
         stored_as=f"world-to-camera translations and quaternions, w first, {'binary' if suffix == '.bin' else 'text'}",
         remarks=(remark,) if remark else (),
     )
+
+
+def camera_to_world(images: Sequence[ColmapImage]) -> Float[np.ndarray, "N 4 4"]:
+    """Poses of images. [N, 4, 4]"""
+    quats_wxyz = np.array([image.quat_wxyz for image in images])
+    rotations = rotations_from_wxyz(quats_wxyz, lambda index: images[index].source, unit=True)
+    return inverse(rigid(rotations, np.array([image.translation for image in images])))
 
 
 def write(path: Path, trajectory: Trajectory) -> None:

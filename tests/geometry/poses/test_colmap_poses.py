@@ -69,6 +69,16 @@ def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_pa
     assert (read.intrinsics.fx, read.intrinsics.fy) == (70.0, 70.0)
 
 
+def test_a_count_in_the_header_that_is_not_that_of_the_images_is_told(tmp_path, caplog):
+    colmap.write_text(tmp_path / "model", winding(4, names=NAMES, intrinsics=PINHOLE))
+    colmap.read(tmp_path / "model")
+    assert not caplog.messages
+    lines = (tmp_path / "model" / "images.txt").read_text().splitlines()
+    (tmp_path / "model" / "images.txt").write_text("\n".join(lines[:-2]))
+    assert len(colmap.read(tmp_path / "model")) == 3
+    assert "holds 3 images, but its header says 4: is it cut short?" in caplog.text
+
+
 def write_text(folder, images, cameras):
     (folder / "images.txt").write_text(images)
     (folder / "cameras.txt").write_text(cameras)
@@ -106,6 +116,13 @@ CAMERA = "1 PINHOLE 64 48 70 71 32 24\n"
             for cameras in ("1 PINHOLE 64 48 70\n", "1 PINHOLE 64\n", "x\n", "1 PINHOLE 64 48 0 71 32 24\n")
         ),
         (ONE + ONE.replace("1", "2", 1), CAMERA, r"'a.png' is repeated"),
+        (
+            ONE.rstrip() + "\n2 1 0 0 0 5 6 7 1 b.png\n",
+            CAMERA,
+            r"line 2: '2 1 0 .*second lists its points .*must exist",
+        ),
+        (ONE + "2 1 0 0 0 5 6 7 1 b.png\n3 1 0 0 0 5 6 7 1 c d e.png\n", CAMERA, "line 4: '3 1 0 .*must exist"),
+        ("1 1 0 0 0 5 6 7 1 a.png\n\n10.5 1 0 0 0 5 6 7 1\n", CAMERA, "line 3: '10.5 .*Expected IMAGE_ID"),
     ],
 )
 def test_models_that_are_none(tmp_path, images, cameras, message):
