@@ -27,7 +27,7 @@ from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
 from tests.engine.test_progress import Shown
 from tests.faults import content
-from tests.scenes import SMALL, write_wall
+from tests.scenes import SMALL, wall_scene, write_frames, write_wall
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = parse_assignments(SMALL)
@@ -54,6 +54,31 @@ def test_train_is_the_command(scene, trained, tmp_path):
     states = [handle.load().model.state_dict() for handle in (trained, cp.load_run(tmp_path / "run"))]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "warnings"),
+    [
+        (lambda frame: frame, []),
+        (lambda frame: replace(frame, depth=frame.depth / 3.0), ["depth and poses are in different units"]),
+        (lambda frame: replace(frame, depth=30.0 / frame.depth), ["frames do not agree on the surface"]),
+        (
+            lambda frame: replace(frame, camera=replace(frame.camera, camera_to_world=frame.camera.world_to_camera)),
+            ["poses agree with depth when read as: world-to-camera"],
+        ),
+        (lambda frame: replace(frame, image=torch.full_like(frame.image, 90)), ["images repeat"]),
+        (lambda frame: replace(frame, depth=torch.full_like(frame.depth, 20.0)), ["depth is the same everywhere"]),
+    ],
+    ids=["sound", "scaled-depth", "inverse-depth", "inverse-poses", "repeats", "flat-depth"],
+)
+def test_training_warns_of_suspect_data(tmp_path, caplog, change, warnings):
+    scene = wall_scene()
+    ordered = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
+    data = write_frames(tmp_path / "scene", [change(frame) for frame in ordered])
+    cp.train("scaffold-gs", data, tmp_path / "run", steps=1, renderer="torch", settings=SETTINGS)
+    suspect = [record.getMessage() for record in caplog.records if record.getMessage().startswith("suspect: ")]
+    assert [message.partition(" (")[0].removeprefix("suspect: ") for message in suspect] == warnings
+    assert all(record.levelname == "WARNING" for record in caplog.records if record.getMessage() in suspect)
 
 
 @pytest.mark.parametrize("how", [{"overwrite": True}, {"resume": True}])

@@ -14,6 +14,7 @@ from coliags_plugin.engine.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from coliags_plugin.contracts import Follower  # with torch
+    from coliags_plugin.core.scenes import Scene
 
 log = logging.getLogger(__name__)
 
@@ -21,6 +22,8 @@ log = logging.getLogger(__name__)
 @takes(TrainOptions)
 def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     """Train a method on a scene.
+
+    Images, poses and depth that contradict each other, as far as that is quickly seen, are warned of.
 
     Args:
         options: See below; settings by key path, for instance ``{"field.voxel_size": 1.0}``.
@@ -51,6 +54,8 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     folder = _run_folder(options)
     if_exists: IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
     with open_training(request, folder, on, if_exists) as trainer:
+        if not options.resume:
+            _warn_of_suspect_data(trainer.scene)
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
         config = trainer.method.config.model_dump()
         followers: list[Follower] = [logger(folder.path, title, config, trainer.step) for logger in chosen_loggers]
@@ -62,6 +67,16 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
             followers.append(live)
         trainer.train(followers=followers)
     return Run(folder.path, data=options.data, device=options.device)
+
+
+def _warn_of_suspect_data(scene: Scene) -> None:
+    """Warn of what the quick checks of ``coliags data check`` find, in the lengths of the dataset."""
+    from coliags_plugin.checks.data.check import check_scene
+    from coliags_plugin.engine.data_formats import recorded_scale
+
+    stored = scene.scaled(1.0 / recorded_scale(scene.provenance))
+    for finding in check_scene(stored, match_images=False).findings:
+        log.warning("%s", finding)
 
 
 def _run_folder(options: TrainOptions) -> RunFolder:

@@ -163,7 +163,7 @@ def check_data(context: StageContext) -> StageOutcome:
     write_html(check_page(check), context.folder / "check.html")
     write_json(context.folder / "check.json", check.as_json())
     made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
-    warnings = [f"suspect: {finding.what} ({finding.evidence}). {finding.do}" for finding in check.findings]
+    warnings = [str(finding) for finding in check.findings]
     return StageOutcome(verdict(check), made, warnings, {"frames": len(scene.video)})
 
 

@@ -71,9 +71,12 @@ class SceneCheck:
 
 
 def check_scene(
-    scene: Scene, progress: Progress | None = None, at_stored_size: Callable[[], Scene] | None = None
+    scene: Scene,
+    progress: Progress | None = None,
+    at_stored_size: Callable[[], Scene] | None = None,
+    match_images: bool = True,
 ) -> SceneCheck:
-    """Run all checks on a scene.
+    """Run all checks on a scene; without matching of images they take about a second for any number of frames.
 
     ``at_stored_size`` loads the same scene with images of the stored size, in which points are matched if there is no
     depth, or hardly any that can be trusted; None: those of ``scene``. They are matched by features. Where these fail,
@@ -93,7 +96,7 @@ def check_scene(
         pairs = [*known]
         for name in with_progress(list(CHANGES), "compare frames", progress):
             agreements[name] = agreement(with_depth, name)
-    else:
+    elif match_images:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
         pairs = video_pairs(video, farther=3)
         full = video if at_stored_size is None else at_stored_size().video

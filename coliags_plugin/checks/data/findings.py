@@ -193,6 +193,10 @@ class Finding:
     evidence: str  # the numbers behind it
     do: str  # what the user can do about it
 
+    def __str__(self) -> str:
+        """The finding as a warning."""
+        return f"suspect: {self.what} ({self.evidence}). {self.do}"
+
 
 def is_flat(depth: JsonObject) -> bool:
     """Return whether depth is the same everywhere; False where it is unknown."""
