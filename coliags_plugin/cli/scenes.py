@@ -126,7 +126,7 @@ class DepthCommand:
     output: options.Output
     """Folder to create, in nerfstudio's layout."""
     prior: options.OptionalPath = None
-    """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
+    """Folder of depth maps by image name (16-bit .png, .tiff, .npy or .exr), any unit, to fit instead of brightness."""
     near: _OptionalLength = None
     """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
     far: _OptionalLength = None

@@ -16,14 +16,15 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
+from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.atlas import model_unit, read_atlas
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import depth_format
+from coliags_plugin.datamanagers.reading.images import DepthFormat, InverseDepth, depth_format
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
-from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit
 from coliags_plugin.geometry.lenses.models import Array, PinholeLens
 from coliags_plugin.geometry.lenses.tabulated import MappedLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
@@ -168,6 +169,8 @@ def _lens(camera: colmap_poses.ColmapCamera, file: Path) -> ColmapLens:
 
 
 _DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif")
+#: Beside the model: scale and offset of each image's inverse depth, as the reference code of 3DGS stores it.
+_DEPTH_PARAMS = "depth_params.json"
 
 
 class ColmapSettings(SceneSettings):
@@ -197,10 +200,11 @@ class ColmapSettings(SceneSettings):
     min_track_length: int = Field(
         3, ge=2, description="Least track length of points that give sparse depth; all points are initial points."
     )
-    depth_unit: float = Field(
-        1.0,
+    depth_unit: float | None = Field(
+        None,
         gt=0.0,
-        description="Millimetres per stored unit of the files in depths/; units of the model where that is unknown.",
+        description="Millimetres per stored unit of the files in depths/; units of the model where that is unknown. "
+        "None: 1, but asked for where the unit is unknown.",
     )
 
 
@@ -227,7 +231,7 @@ class ColmapDataManager(RecordedDataManager):
         model = read_model(self._model_folder(path))
         paths = _image_paths(path / user_path(settings.images_folder), model, settings.outside_files)
         masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
-        depths = _depths(path / "depths", model)
+        depths, params = _depths(path / "depths", model)
         lenses = {
             number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
             for number, lens in model.cameras.items()
@@ -240,6 +244,7 @@ class ColmapDataManager(RecordedDataManager):
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
         seen = find_seen_masks(path / "truth", len(paths), complete=not others)
+        forms = self._depth_formats(path, depths, params, model, unit)
         shots, used, misplaced = [], 0, 0
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
@@ -255,7 +260,7 @@ class ColmapDataManager(RecordedDataManager):
                     rectification,
                     camera_to_world,
                     depth,
-                    None if depth is None else depth_format(depth, settings.depth_unit / FACTORS[unit]),
+                    forms[index],
                     masks[index],
                     sparse_depth=sparse,
                 )
@@ -285,7 +290,7 @@ class ColmapDataManager(RecordedDataManager):
             kind=f"COLMAP model {model.folder}, {len(model.positions)} points, cameras {', '.join(kinds)}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, [*paths, *masks, *depths], model.files),
+            fingerprint=fingerprint(path, [*paths, *masks, *depths], [*model.files, params]),
             own_points=own_points if len(model.positions) else None,
             points_source=model.files[-1],
             seen={"video": seen},
@@ -311,6 +316,29 @@ class ColmapDataManager(RecordedDataManager):
                 others,
             )
         return found[0]
+
+    def _depth_formats(
+        self, path: Path, depths: Sequence[Path | None], params: Path | None, model: SparseModel, unit: Unit
+    ) -> list[DepthFormat | None]:
+        """Formats of the depth files: inverse depth with ``params``, else depth in the unit that is said."""
+        depth_unit = self.settings.depth_unit
+        if params is not None:
+            if depth_unit is not None:
+                raise InputError(
+                    f"the option depth_unit = {depth_unit:g}, but {params}, by which depths/ holds inverse depth",
+                    "one of the two",
+                    "Leave the option out, or move the file away",
+                )
+            return [*_inverse_depths(params, model, self.settings.scale)]
+        if depth_unit is None and unit == "unknown" and any(depths):
+            raise InputError(
+                f"{path} has depths/, but the model's unit of length and the value of a step of depth are not given",
+                f"the option depth_unit: units of the model per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
+                "For instance --set datamanager.depth_unit=0.001 for millimetres in a model in metres; or move depths/ "
+                "away if it is relative",
+            )
+        size = (depth_unit or 1.0) / FACTORS[unit]
+        return [None if depth is None else depth_format(depth, size) for depth in depths]
 
     def _sparse_depth(
         self,
@@ -362,9 +390,33 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
     return paths
 
 
-def _depths(folder: Path, model: SparseModel) -> list[Path | None]:
-    """Depth files of all images, or of none."""
+def _depths(folder: Path, model: SparseModel) -> tuple[list[Path | None], Path | None]:
+    """Depth files of all images, or of none, and the file that says that they hold inverse depth, if any."""
+    params = model.folder / _DEPTH_PARAMS
+    is_inverse = params.is_file()
     if not folder.is_dir():
-        return [None] * len(model.images)
-    found = {image.name: sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images}
-    return reading.for_all(found, folder, f"a file NAME{', NAME'.join(_DEPTH_SUFFIXES)}", or_none=False)
+        if is_inverse:
+            log.warning("%s is not used, as there is no %s", params, folder)
+        return [None] * len(model.images), None
+    suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
+    found = {image.name: sidecar_file(folder, image.name, suffixes) for image in model.images}
+    files = reading.for_all(found, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
+    return files, params if is_inverse else None
+
+
+def _inverse_depths(file: Path, model: SparseModel, size: float) -> list[InverseDepth]:
+    """Formats of depth of all images by a ``depth_params.json``; ``size``: scene units per unit of the model."""
+    expected = "scale and offset of every image of the model, by its name without suffix"
+    content = read_json(file, expected, "Make the file again, or move it away")
+    forms = []
+    for image in model.images:
+        key = image.name.rpartition(".")[0] or image.name
+        entry = content.get(key) if isinstance(content, dict) else None
+        if not isinstance(entry, dict):
+            raise InputError(f"{file} has no {key}", expected, "Make the file again, for this model")
+        scale, offset = (read_number(entry, what, f"{file}, {key}", "a finite number") for what in ("scale", "offset"))
+        forms.append(InverseDepth(size, scale=scale, offset=offset))
+    if unscaled := [image.name for image, form in zip(model.images, forms, strict=True) if form.scale <= 0.0]:
+        named = reading.first_few(unscaled)
+        log.warning("%s: %d images have no depth, as their scale is not above 0: %s", file, len(unscaled), named)
+    return forms

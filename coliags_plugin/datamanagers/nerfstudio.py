@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import posixpath
 from collections.abc import Callable, Mapping, Sequence
@@ -33,9 +34,13 @@ from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
+log = logging.getLogger(__name__)
+
 FILE = "transforms.json"
 #: Key of the list of frames that estimated depth was made from.
 ESTIMATED_FROM = "depth_estimated_from"
+#: World units per stored depth unit where nothing says it: millimetres in a world of metres.
+_DEPTH_STEP = 1e-3
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 PixelCenters = Literal["half", "integer"]
@@ -128,11 +133,24 @@ class Transforms:
         listed = self.content.get(ESTIMATED_FROM)
         return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed)}
 
-    def depth_unit(self) -> float | None:
-        """World units before applied_scale per stored depth unit; None if not given."""
-        if "depth_unit_scale_factor" not in self.content:
-            return None
-        return read_number(self.content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
+    def depths(self, given: float | None) -> tuple[list[Path | None], float | None]:
+        """Depth files of all frames or of none, and world units before applied_scale per stored unit; None: not said.
+
+        The keys of instant-ngp are read where no frame has nerfstudio's. ``given``: an option that replaces the unit.
+        """
+        content, named = self.content, {key for frame in self.frames for key, value in frame.items() if value}
+        files = self.files("depth_file_path", for_every=True)
+        if not any(files) and "depth_path" in named and content.get("enable_depth_loading", True):
+            # As instant-ngp has it, there is no depth without a scale.
+            step = read_number({"integer_depth_scale": 0, **content}, "integer_depth_scale", self.path)
+            if (step := given or step) > 0.0:
+                return self.files("depth_path", for_every=True), step
+        if not any(files) and (others := sorted(key for key in named if "depth" in key)):
+            expected = "depth_file_path, or depth_path with integer_depth_scale and without enable_depth_loading false"
+            log.warning("%s: no depth is read from %s of its frames, only from %s", self.path, others[0], expected)
+        if given is None and "depth_unit_scale_factor" in content:
+            given = read_number(content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
+        return files, given
 
     def _indices(self, key: str, listed: Any) -> list[int]:
         index_of = {posixpath.normpath(name): index for index, name in enumerate(self.names)}
@@ -215,7 +233,7 @@ class NerfstudioSettings(SceneSettings):
         None,
         gt=0.0,
         description="World units before applied_scale per stored depth unit. None: the file's value of this name, or a "
-        "millimetre; of a world of unknown unit, one of its units.",
+        "millimetre; of a world of unknown unit, 0.001 of its units.",
     )
     pixel_centers: PixelCenters = Field(
         "half",
@@ -247,7 +265,8 @@ class NerfstudioDataManager(RecordedDataManager):
         trajectory = nerfstudio_poses.read(file)
         transforms = Transforms(file, trajectory.names_or_numbers(), settings.outside_files)
         images, masks = transforms.images(), transforms.files("mask_path", for_every=False)
-        depths, confidences = (transforms.files(f"{what}_file_path", True) for what in ("depth", "confidence"))
+        depths, depth_step = transforms.depths(settings.depth_unit_scale_factor)
+        confidences = transforms.files("confidence_file_path", for_every=True)
         if any(confidences) and not any(depths):
             raise InputError(
                 f"{file}: the frames have a confidence_file_path, but no depth_file_path",
@@ -259,7 +278,7 @@ class NerfstudioDataManager(RecordedDataManager):
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
         unit = self.stated_unit(path)
-        depth_unit = self._depth_unit(transforms, unit)
+        depth_unit = self._depth_unit(depth_step, unit, file if any(depths) else None)
         rectification_of = rectifications(
             {lens: lens for lens in lenses}, file, self.working_size, settings.focal_scale
         )
@@ -311,12 +330,21 @@ class NerfstudioDataManager(RecordedDataManager):
             seen={"video": seen},
         )
 
-    def _depth_unit(self, transforms: Transforms, unit: Unit) -> float:
-        """World units per stored depth unit."""
-        for factor in (self.settings.depth_unit_scale_factor, transforms.depth_unit()):
-            if factor is not None:
-                return factor * self.settings.scale
-        return 1.0 / FACTORS[unit]
+    def _depth_unit(self, step: float | None, unit: Unit, file: Path | None) -> float:
+        """World units per stored depth unit, which is ``step`` before ``scale`` if anything says so.
+
+        The ``file``, if it names depth, is warned of where the value is only the format's default.
+        """
+        if step is None and unit != "unknown":
+            return 1.0 / FACTORS[unit]
+        if step is None and file is not None:
+            log.warning(
+                "%s has no depth_unit_scale_factor: depth is read as %g units a step, the format's default. If that is "
+                "wrong: --set datamanager.depth_unit_scale_factor=UNITS, or --set datamanager.unit=mm of a world in mm",
+                file,
+                _DEPTH_STEP,
+            )
+        return (step or _DEPTH_STEP) * self.settings.scale
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""

@@ -19,7 +19,7 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import DepthSteps, size_of
+from coliags_plugin.datamanagers.reading.images import depth_format, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
@@ -109,7 +109,7 @@ class RGBDDataManager(RecordedDataManager):
         settings = self.settings
         images = _find_images(path)
         is_metric = settings.depth == "metric"
-        depths = _files(path, DEPTH_FOLDERS, reading.DEPTH_SUFFIXES)[1] if is_metric else []
+        depths = _find_depths(path) if is_metric else []
         file = _find_trajectory(path, settings.trajectory)
         trajectory = tum.read(file)
         pair = self._paired_by_time if self._is_by_time(images) else self._paired_by_order
@@ -117,7 +117,6 @@ class RGBDDataManager(RecordedDataManager):
         used = [image for image, _, _ in rows]
         camera_file, lens, stated_scale = _find_camera(path, used[0])
         scale = self._depth_scale(stated_scale, camera_file) if depths else None
-        form = None if scale is None else DepthSteps(1.0 / scale)
         rectification = self.rectification_of(lens, camera_file)
         seen = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
         masks = _files_of_images(path, MASK_FOLDERS, used, "mask")
@@ -135,7 +134,7 @@ class RGBDDataManager(RecordedDataManager):
                 rectification,
                 trajectory.camera_to_world[pose],
                 depth,
-                form,
+                None if depth is None or scale is None else depth_format(depth, 1.0 / scale),
                 mask=mask,
                 confidence=confidence,
             )
@@ -316,6 +315,15 @@ def _find_images(folder: Path) -> list[Path]:
     if not images:
         raise InputError(f"{image_folder} holds {reading.inventory(image_folder)}", "PNG or JPEG images")
     return images
+
+
+def _find_depths(folder: Path) -> list[Path]:
+    """The depth files, unordered: images, or arrays where there are none."""
+    depth_folder, depths = _files(folder, DEPTH_FOLDERS, reading.DEPTH_SUFFIXES)
+    depths = depths or _files(folder, DEPTH_FOLDERS, reading.ARRAY_SUFFIXES)[1]
+    if depth_folder is not None and not depths:
+        reading.warn_of_other_kinds(sorted(depth_folder.iterdir()), reading.DEPTH_SUFFIXES | reading.ARRAY_SUFFIXES)
+    return depths
 
 
 def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> list[Path | None]:

@@ -61,8 +61,11 @@ class ExrDepth(DepthFormat):
 _ALONE = Lock()
 
 
-def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
-    """Read a channel of an EXR file by its full name, from any part."""
+_CHANNEL = "Choose the one that holds depth with --set datamanager.depth_channel=NAME"
+
+
+def read_exr_channel(path: Path, channel: str, do: str = _CHANNEL) -> Float32[np.ndarray, "H W"]:
+    """Read a channel of an EXR file by its full name, from any part; what to ``do`` without it is for the error."""
     import OpenEXR
 
     required_file(path, "an OpenEXR file")
@@ -87,7 +90,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
         raise InputError(
             f"{path} has the channels {', '.join(sorted(channels))}",
             f"a channel {channel}",
-            "Choose the one that holds depth with --set datamanager.depth_channel=NAME",
+            do,
         )
     return np.asarray(channels[channel]).astype(np.float32)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 
 from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.recognition import find_format
@@ -202,6 +204,59 @@ def test_depth_files(mine):
     (mine / "depths/4.npy").unlink()
     with pytest.raises(InputError, match=r"depths: 4 of 5 frames have a file NAME\.png, .*; 4\.png has none"):
         load(mine)
+
+
+@pytest.fixture
+def inverse(mine):
+    """Depth as the reference code of 3DGS stores it, and its parameters by image."""
+    (mine / "depths").mkdir()
+    said = {
+        f"{i}": {"scale": 0.2 / (1.0 + 0.25 * i), "offset": (-1) ** i * 1e-3, "med_scale": 0.1} for i in range(COUNT)
+    }
+    for index, pose in enumerate(poses(COUNT)):
+        inverse_depth, (scale, offset, _) = 1.0 / taken(camera(), pose)[0], said[f"{index}"].values()
+        steps = np.rint(65536.0 * (inverse_depth - offset) / scale).astype(np.uint16)
+        steps[0, 0] = 0  # as far as the offset says; unknown where that is negative
+        cv2.imwrite(str(mine / f"depths/{index}.png"), steps)
+    write_json(mine / "sparse/0/depth_params.json", said | {"med_scale": 0.1})
+    return mine, said
+
+
+def test_inverse_depth_with_its_parameters(inverse, caplog):
+    folder, said = inverse
+    scenes = {1.0: load(folder), 2.0: load(folder, scale=2.0), 1000.0: load(folder, unit="m")}
+    for factor, scene in scenes.items():
+        for frame in scene.video:
+            expected = taken(camera(), poses(COUNT)[frame.index])[0]
+            expected[0, 0] = np.nan if frame.index % 2 else 1000.0
+            np.testing.assert_allclose(frame.depth.numpy(), factor * expected, rtol=1e-3)
+    assert not caplog.records
+    said["3"]["scale"] = -1.0
+    write_json(folder / "sparse/0/depth_params.json", said)
+    unknown = [bool(frame.depth.isnan().all()) for frame in load(folder).video]
+    assert unknown == [False, False, False, True, False] and "1 images have no depth" in caplog.text
+    shutil.rmtree(folder / "depths")
+    assert load(folder).video[0].depth is None and "depth_params.json is not used" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (lambda said: "{", {}, r"depth_params\.json is not JSON"),
+        (lambda said: json.dumps([said]), {}, r"depth_params\.json has no 0\. Expected scale and offset"),
+        (lambda said: json.dumps(said | {"3": None}), {}, r"depth_params\.json has no 3\. .*for this model"),
+        (lambda said: json.dumps(said | {"3": {"scale": 1.0}}), {}, r"depth_params\.json, 3: offset is None"),
+        (lambda said: json.dumps(said | {"3": {"scale": "1"}}), {}, r"depth_params\.json, 3: scale is '1'"),
+        (json.dumps, {"depth_unit": 1.0}, r"depth_unit = 1, but .*depth_params\.json.*one of the two"),
+        (lambda said: None, {}, r"has depths/, but .*not given.*datamanager\.depth_unit=0\.001"),
+    ],
+)
+def test_what_depth_files_hold_is_said_wholly_or_asked_for(inverse, change, options, message):
+    (folder, said), file = inverse, inverse[0] / "sparse/0/depth_params.json"
+    text = change(said)
+    file.unlink() if text is None else file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        load(folder, **options)
 
 
 # Points and sparse depth

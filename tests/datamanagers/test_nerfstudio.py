@@ -148,6 +148,44 @@ def test_the_unit_of_depth_is_the_options_or_the_files_or_a_millimetre(copied):
         torch.testing.assert_close(load(folder, unit=unit).train[1].depth, 100.0 * depth, equal_nan=True)
 
 
+NGP, UNREAD, DEFAULT = {"integer_depth_scale": 0.02}, "no depth is read from depth_path", "0.001 units a step"
+
+
+@pytest.mark.parametrize(
+    ("key", "said", "options", "factor", "warning"),
+    [
+        ("depth_file_path", {}, {"unit": "unknown"}, 0.1, DEFAULT),
+        ("depth_file_path", {}, {"unit": "unknown", "scale": 3.0}, 0.3, DEFAULT),
+        ("depth_file_path", {"depth_unit_scale_factor": 0.02}, {"unit": "unknown", "scale": 3.0}, 6.0, ""),
+        ("depth_path", NGP, {"unit": "unknown"}, 2.0, ""),
+        (
+            "depth_path",
+            NGP | {"scale": 0.33, "offset": [1, 2, 3], "enable_depth_loading": True},
+            {"scale": 3.0},
+            6.0,
+            "",
+        ),
+        ("depth_path", {}, {"depth_unit_scale_factor": 0.05}, 5.0, ""),
+        ("depth_path", NGP | {"enable_depth_loading": False}, {}, None, UNREAD),
+        ("depth_path", {"enable_depth_loading": True}, {}, None, UNREAD),
+        ("depth_path", {"integer_depth_scale": -1.0}, {}, None, UNREAD),
+        ("sensor_depth_path", NGP, {}, None, "no depth is read from sensor_depth_path"),
+    ],
+)
+def test_depth_files_of_other_writers(walls, copied, caplog, key, said, options, factor, warning):
+    def rename(_, frame):
+        frame[key] = frame.pop("depth_file_path")
+
+    folder, expected = copied("nerfstudio"), load(walls("nerfstudio")).train[1].depth
+    change_frames(FILE, rename)(folder)
+    change_json(FILE, **{"depth_unit_scale_factor": None, **said})(folder)
+    read = load(folder, initial_points="none", **options).train[1].depth
+    assert warning in caplog.text and bool(warning) == bool(caplog.records)
+    assert (read is None) == (factor is None)
+    if factor is not None:
+        torch.testing.assert_close(read, factor * expected, equal_nan=True)
+
+
 def test_masks_of_some_frames(mine):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[5:20, 3:9] = 0

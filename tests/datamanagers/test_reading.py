@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import named_file, short_names
+from coliags_plugin.datamanagers.reading.files import named_file, numbered, short_names
 from coliags_plugin.datamanagers.reading.images import depth_format, read_mask, resize_nearest, resize_rgb
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 
@@ -71,14 +73,14 @@ def test_sizes_fit_the_papers_and_nothing_is_enlarged():
 # Depth
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy"])
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".tif", ".npy"])
 def test_depth_files_hold_numbers_proportional_to_depth(tmp_path, suffix):
     steps, path = np.array([[0.0, 1.0, 300.0], [25.0, 7.0, 65535.0]]), tmp_path / f"0{suffix}"
     unknown = steps == 0.0
-    if suffix == ".npy":
+    if suffix in (".npy", ".tif"):
         steps = np.vstack([steps, [[-1.0, np.nan, np.inf]]]).astype(np.float32)
         unknown = np.vstack([unknown, [[True] * 3]])
-        np.save(path, steps)
+        np.save(path, steps) if suffix == ".npy" else cv2.imwrite(str(path), steps)
     else:
         cv2.imwrite(str(path), steps.astype(np.uint16))
     form = depth_format(path, 0.02)
@@ -97,6 +99,21 @@ def test_depth_arrays_of_another_kind(tmp_path, array, message):
     np.save(tmp_path / "0.npy", array)
     with pytest.raises(InputError, match=message):
         depth_format(tmp_path / "0.npy", 1.0).read(tmp_path / "0.npy")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".EXR"])
+def test_depth_files_that_are_not_read_are_refused_by_kind(suffix):
+    with pytest.raises(InputError, match=rf"0\{suffix}: depth in \{suffix}\. Expected .*\.npy\. Convert"):
+        depth_format(Path(f"0{suffix}"), 1.0)
+
+
+def test_numbered_files_of_no_known_kind_are_said(tmp_path, caplog):
+    for name in ("0_depth.jpg", "1_depth.jpg", "notes.txt"):
+        (tmp_path / name).touch()
+    assert not numbered(tmp_path, "depth", frozenset({".png"})) and "0_depth.jpg, 1_depth.jpg are not" in caplog.text
+    (tmp_path / "0_depth.png").touch()
+    caplog.clear()
+    assert len(numbered(tmp_path, "depth", frozenset({".png"}))) == 1 and not caplog.records
 
 
 # Names of files

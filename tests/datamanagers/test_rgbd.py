@@ -8,6 +8,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -165,6 +166,22 @@ def test_scales_of_depth(mine):
     with pytest.raises(InputError, match=r"depth_scale = 500, but the option depth_scale is 5000"):
         load(mine, depth_scale=5000.0)
     assert load(mine, depth_scale=SCALE).provenance["depth_scale"] == SCALE
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tif", ".jpg"])
+def test_kinds_of_depth_files(mine, caplog, suffix):
+    before = load(mine).train[0].depth
+    for path in (mine / "depth").iterdir():
+        steps = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32)
+        path.unlink()
+        target = path.with_suffix(suffix)
+        np.save(target, steps) if suffix == ".npy" else cv2.imwrite(str(target), steps)
+    read = load(mine, initial_points="none").train[0].depth
+    if suffix == ".jpg":  # Gaussian Pancakes' relative depth
+        assert read is None and "are not read, only files of the kinds .npy, .png, .tif" in caplog.text
+    else:
+        torch.testing.assert_close(read, before, equal_nan=True)
+        assert not caplog.records
 
 
 def test_a_trajectory_may_be_named(mine):

@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
 DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
+ARRAY_SUFFIXES = frozenset({".npy"})
 
 
 def require_folder(folder: Path, expected: str) -> None:
@@ -57,15 +58,26 @@ def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Pat
     """Files ``<number>_<what>`` by number, padded or not, or ``<number>`` if ``what`` is empty; none without folder."""
     files: dict[int, Path] = {}
     pattern = rf"(\d+)_{what}" if what else r"(\d+)"
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = re.fullmatch(pattern, path.stem)
-        if match is None or path.suffix.lower() not in suffixes:
+    there = sorted(folder.iterdir()) if folder.is_dir() else ()
+    matches = [(path, match) for path in there if (match := re.fullmatch(pattern, path.stem))]
+    for path, match in matches:
+        if path.suffix.lower() not in suffixes:
             continue
         index = int(match.group(1))
         if index in files:
             raise InputError(f"{files[index]} and {path.name} have the same number", "one file per frame", "Remove one")
         files[index] = path
+    if not files:
+        warn_of_other_kinds([path for path, _ in matches], suffixes)
     return files
+
+
+def warn_of_other_kinds(files: Sequence[Path], suffixes: Iterable[str]) -> None:
+    """Log a warning that names files which are not read, if any, as they have none of the suffixes."""
+    if files:
+        kinds = ", ".join(sorted(suffixes))
+        names = first_few([path.name for path in files])
+        log.warning("%s: %s are not read, only files of the kinds %s", files[0].parent, names, kinds)
 
 
 def numbered_images(folder: Path, what: str, expected: str, example: str) -> dict[int, Path]:

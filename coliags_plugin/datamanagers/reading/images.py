@@ -14,12 +14,16 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, kind_of
 
 
-def read_gray(path: Path, bits: int, expected: str, channels_repeat: bool = False) -> Shaped[np.ndarray, "H W"]:
+def read_gray(
+    path: Path, bits: int, expected: str, channels_repeat: bool = False, floats: bool = False
+) -> Shaped[np.ndarray, "H W"]:
     """Read a one-channel image of 8 or 16 bits, as stored; ``expected`` is the kind of file, for errors.
 
-    ``channels_repeat`` tells whether it may have three equal channels instead.
+    ``channels_repeat`` tells whether it may have three equal channels instead, ``floats`` whether real numbers.
     """
     image = decode_image(path)
+    if floats and image.ndim == 2 and image.dtype.kind == "f":
+        return image
     if channels_repeat and image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.dtype(f"uint{bits}"):
         if not (image == image[..., :1]).all():
             raise InputError(f"{path} is a colour image", expected, "Convert it")
@@ -29,7 +33,7 @@ def read_gray(path: Path, bits: int, expected: str, channels_repeat: bool = Fals
         raise InputError(
             f"{path} is {kind_of(image)}",
             expected,
-            "Use the original file: depth converted to 8 bits has lost 0.4 mm" if lost else "Convert it",
+            "Use the original file: 8 bits are too few steps of depth" if lost else "Convert it",
         )
     return image
 
@@ -114,11 +118,30 @@ class DepthSteps(DepthFormat):
 C3VD_DEPTH = DepthSteps(100.0 / 65535.0, 16, 65535)
 
 
+@dataclass(frozen=True)
+class InverseDepth(DepthSteps):
+    """16-bit inverse depth of 3DGS: z-depth is size / (scale * value / 65536 + offset), unknown where not positive."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`; float32, 0 where unknown."""
+        stored = super().read(path)
+        inverse = self.scale * stored.astype(np.float64) / 65536.0 + self.offset
+        # The sky, thousands of times as far as the rest, is at no distance.
+        known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
+        return np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0).astype(np.float32)
+
+
 class DepthArray(DepthSteps):
-    """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown."""
+    """An ``.npy`` array [H, W] or [H, W, 1], or an image of real numbers; 0, negative and not finite mean unknown."""
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
+        if path.suffix.lower() != ".npy":
+            kind = f"a one-channel {self.bits}-bit depth image, or one of real numbers"
+            return read_gray(path, self.bits, kind, floats=True)
         expected = "an .npy array [H, W] of real numbers"
         array = read_array(path, expected)
         if array.ndim == 3 and array.shape[2] == 1:
@@ -130,5 +153,7 @@ class DepthArray(DepthSteps):
 
 
 def depth_format(path: Path, size: float) -> DepthFormat:
-    """Depth format by file suffix: ``.npy``, else 16-bit images; ``size`` in scene units per stored unit."""
-    return DepthArray(size) if path.suffix.lower() == ".npy" else DepthSteps(size, 16)
+    """Format of an array or image, by suffix: steps, or real numbers; ``size`` in scene units per stored unit."""
+    if path.suffix.lower() in (".npz", ".exr"):
+        raise InputError(f"{path}: depth in {path.suffix}", "16-bit PNG or TIFF, TIFF of floats, or .npy", "Convert it")
+    return DepthArray(size)

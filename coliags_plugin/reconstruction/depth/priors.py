@@ -81,7 +81,7 @@ def light_terms(image: UInt8[np.ndarray, "H W 3"], usable: Mask, pose: Pose) -> 
     return np.stack([np.ones_like(red), red, green, red * red, red * green, green * green, cosine], axis=-1)
 
 
-_SUFFIXES = (".png", ".npy", ".exr")
+_SUFFIXES = (".png", ".npy", ".tiff", ".tif", ".exr")
 #: How far the aspect ratio of a map may be from the frame's: rounding to whole pixels, but no cropping.
 _ASPECT = 0.02
 #: Fewest known pixels that scale and shift are fitted to.
@@ -150,7 +150,7 @@ class FilePrior:
     def _read(self, frame: Frame) -> Float32[np.ndarray, "h w"]:
         path = self.files[frame.name]
         if path.suffix.lower() == ".exr":
-            stored = read_exr_channel(path, "V")
+            stored = read_exr_channel(path, "V", "Rename it, or convert the maps to .npy")
         else:
             form = depth_format(path, 1.0)
             stored = form.z_depth(form.read(path))
