@@ -80,12 +80,19 @@ def read_splat_ply(path: Path) -> SplatCloud:
     higher = np.array([columns[f"f_rest_{index}"] for index in range(len(rest))], np.float32)
     higher = higher.reshape(3, per_channel, len(columns["x"])).transpose(2, 1, 0)
     scales = _SCALES if "scale_2" in columns else _SCALES[:2]
+    opacity, log_scales = columns["opacity"], _stacked(columns, scales)
+    if ((opacity >= 0.0) & (opacity <= 1.0)).all() and (log_scales > 0.0).all():
+        log.warning(
+            "%s: opacities of %.3g to %.3g and scales of %.3g to %.3g look like results of sigmoid and exponential; "
+            "they are read as logits and logarithms, as 3DGS writes them. If that draws fog, export the file anew",
+            *(path, opacity.min(), opacity.max(), log_scales.min(), log_scales.max()),
+        )
     with np.errstate(over="ignore"):
         return SplatCloud(
             means=_stacked(columns, ("x", "y", "z")),
             quats_wxyz=_stacked(columns, _ROTATIONS),
-            scales=np.exp(_stacked(columns, scales)),
-            opacities=sigmoid(columns["opacity"].astype(np.float32)),
+            scales=np.exp(log_scales),
+            opacities=sigmoid(opacity.astype(np.float32)),
             harmonics=np.concatenate([_stacked(columns, _BASES)[:, None], higher], axis=1),
         )
 

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.ply import write_ply
+from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.export.splats import files
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.splats.files import (
@@ -183,6 +183,18 @@ def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog
     write_splat_ply(tmp_path / "bad.ply", cloud)
     with pytest.raises(InputError, match="none of which is usable"):
         read_splats(tmp_path / "bad.ply")
+
+
+@pytest.mark.parametrize("activated", [True, False])
+def test_opacities_and_scales_that_were_activated_are_told(tmp_path, caplog, activated):
+    cloud = random_cloud(20, degree=0)
+    write_splat_ply(tmp_path / "cloud.ply", cloud)
+    if activated:
+        columns = read_vertices(tmp_path / "cloud.ply")
+        columns |= {"opacity": cloud.opacities, **{f"scale_{axis}": cloud.scales[:, axis] for axis in range(3)}}
+        write_ply(tmp_path / "cloud.ply", columns)
+    read_splats(tmp_path / "cloud.ply")
+    assert ("results of sigmoid and exponential" in caplog.text) == activated
 
 
 @pytest.mark.parametrize(
