@@ -207,7 +207,7 @@ def _image_names(folder: Path, count: int) -> tuple[str, ...]:
 
     if not folder.is_dir():
         raise InputError(f"--images {folder}", "a folder of images")
-    names = [path.name for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    names = [path.name for path in folder.glob("[!.]*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
     if len(names) != count:
         raise InputError(
             f"{folder} holds {len(names)} images for {count} poses",

@@ -24,6 +24,10 @@ class DataManager(ABC, Generic[SettingsT]):
         """Evidence in the folder that it has this format; None without. Reads no pixels."""
         return None
 
+    @classmethod
+    def refuse_nearly(cls, path: Path) -> None:
+        """Raise InputError about a folder that has nearly this format, and which no other recognises: what is wrong."""
+
     def at_stored_size(self) -> DataManager:
         """The data manager, with the same options, that reads images at their stored size, each when it is used.
 

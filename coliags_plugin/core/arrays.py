@@ -12,6 +12,7 @@ from threading import Lock
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import unreadable
 
 #: NumPy reads headers as Python literals, and CPython 3.11 fails now and then ("AST constructor recursion depth
 #: mismatch") where two threads do so at once.
@@ -53,7 +54,7 @@ def read_arrays(
             wanted = archive.files if optional is None else {*needed, *optional}
             arrays = {name: archive[name] for name in archive.files if name in wanted}
     except _DAMAGED as error:
-        raise InputError(f"cannot read {path}: {error}", expected) from error
+        raise unreadable(path, f"cannot read {path}: {error}", expected) from error
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray):  # an entry of the archive that is no array
             raise InputError(f"{path} holds '{name}', which is no array", expected)
@@ -71,4 +72,4 @@ def read_array(path: Path, expected: str) -> np.ndarray:
             mapped = np.load(path, mmap_mode="r", allow_pickle=False)
         return np.array(mapped)
     except _DAMAGED as error:
-        raise InputError(f"cannot read {path}: {error}", expected, "Write it again") from error
+        raise unreadable(path, f"cannot read {path}: {error}", expected, "Write it again") from error

@@ -15,6 +15,7 @@ from coliags_plugin.core import bounds
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.text_files import unreadable
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 #: Bytes of a chunk of a PNG besides its data: length, type and checksum.
@@ -39,7 +40,8 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
             with suppress(cv2.error):  # of more than 2^30 pixels, for instance
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
         if image is None:
-            raise InputError(
+            raise unreadable(
+                path,
                 f"{path} ({len(data)} bytes) cannot be decoded",
                 "a complete image",
                 "It is damaged or cut short: fetch it again",

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.text_files import unreadable
 
 
 def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
@@ -99,7 +100,6 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a PLY file") from error
     except Exception as error:  # trimesh raises whatever it meets
         size = path.stat().st_size
-        raise InputError(
-            f"{path} ({size} bytes) cannot be read as PLY: {error}", "a complete PLY file", "Fetch it again"
-        ) from error
+        seen = f"{path} ({size} bytes) cannot be read as PLY: {error}"
+        raise unreadable(path, seen, "a complete PLY file", "Fetch it again") from error
     return found

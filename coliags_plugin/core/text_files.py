@@ -2,19 +2,47 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 
+#: Bytes of a file that tell its encoding, and what is in its place.
+_START_BYTES = 512
+
+
+def encoding_of(start: bytes) -> str:
+    """The encoding of a text that begins with these bytes: UTF-16 by its byte order mark, else UTF-8."""
+    return "utf-16" if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+
+
+def stand_in(path: Path) -> str:
+    """Words for what a file holds in the place of its content, and what to do about it; none if it holds that."""
+    start = _start(path).removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    if start.startswith(b"version https://git-lfs"):
+        return "it is a pointer of Git LFS, in the place of the file, which `git lfs pull` fetches"
+    if start.startswith((b"<!doctype html", b"<html")):
+        return "it is a web page (HTML), in the place of the file: download the file itself"
+    return ""
+
+
+def unreadable(path: Path, seen: str, expected: str, do: str = "") -> InputError:
+    """The error about a file that its reader does not understand: ``seen``, unless it is something in its place."""
+    try:
+        found = stand_in(path)
+    except OSError:
+        found = ""
+    return InputError(f"cannot read {path}: {found}" if found else seen, expected, "" if found else do)
+
 
 def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
-    """The content of a file in UTF-8, with or without a byte order mark, of at most so many bytes; else ValueError."""
+    """The content of a file of at most so many bytes, UTF-8, or UTF-16 with a byte order mark; else ValueError."""
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
-    return path.read_text(encoding="utf-8-sig")
+    return path.read_text(encoding=_encoding(path))
 
 
 def read_text(path: Path, expected: str) -> str:
@@ -26,12 +54,24 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
-    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large."""
+    """The lines of a text file, as :func:`whole_text`, with their numbers, from 1, one by one: files may be large."""
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with path.open(encoding=_encoding(path)) as file:
             yield from enumerate(file, start=1)
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {error}", expected) from error
+
+
+def _encoding(path: Path) -> str:
+    """The encoding of a text file; ValueError if it holds something in the place of its content."""
+    if found := stand_in(path):
+        raise ValueError(found)
+    return encoding_of(_start(path))
+
+
+def _start(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_START_BYTES)
 
 
 def without_places(text: str, places: Iterable[Path]) -> str:

@@ -92,13 +92,13 @@ class SparseModel:
     track_lengths: Int[np.ndarray, "P"]
 
 
-def find_models(scene: Path) -> list[Path]:
-    """Model folders in the first parent folder that has any: ``sparse/0``, ``sparse/1``, ``sparse``, ..."""
+def find_models(scene: Path, parts: tuple[str, ...] = _PARTS) -> list[Path]:
+    """Folders of models, by their parts, in the first parent that has any: ``sparse/0``, ``sparse/1``, ``sparse``."""
     for name in _MODEL_FOLDERS:
         parent = scene / name
         numbered = [] if name == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
         candidates = [*sorted(numbered, key=lambda path: int(path.name)), parent]
-        if found := [path for path in candidates if colmap_poses.model_suffix(path, _PARTS) is not None]:
+        if found := [path for path in candidates if colmap_poses.model_suffix(path, parts) is not None]:
             return found
     return []
 
@@ -108,7 +108,7 @@ def read_model(folder: Path) -> SparseModel:
     suffix = colmap_poses.model_suffix(folder, _PARTS)
     if suffix is None:
         raise InputError(
-            f"{folder} holds no COLMAP model",
+            f"{folder} holds no COLMAP model" + (f", but {reading.inventory(folder)}" if folder.is_dir() else ""),
             "a folder with cameras, images and points3D, all .bin or all .txt",
             "Give the model's folder with --set datamanager.model=FOLDER",
         )
@@ -222,6 +222,13 @@ class ColmapDataManager(RecordedDataManager):
         # A nerfstudio scene may contain its COLMAP model, but its poses are in transforms.json.
         found = [] if (path / "transforms.json").is_file() else find_models(path)
         return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
+
+    @classmethod
+    def refuse_nearly(cls, path: Path) -> None:
+        """See :class:`DataManager`: a model without one of its parts."""
+        for part in _PARTS:
+            for folder in find_models(path, tuple(other for other in _PARTS if other != part)):
+                read_model(folder)
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""

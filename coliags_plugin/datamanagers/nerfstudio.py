@@ -258,6 +258,16 @@ class NerfstudioDataManager(RecordedDataManager):
             return None
         return FILE
 
+    @classmethod
+    def refuse_nearly(cls, path: Path) -> None:
+        """See :class:`DataManager`: Blender's layout."""
+        if parts := [part for part in ("train", "val", "test") if (path / f"transforms_{part}.json").is_file()]:
+            raise InputError(
+                f"{path} is of the layout of Blender's NeRF scenes: {', '.join(f'transforms_{p}.json' for p in parts)}",
+                "all frames in one transforms.json",
+                "Join the files' frames; train_filenames and test_filenames there list the file_path of each part",
+            )
+
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings, file = self.settings, path / FILE

@@ -37,6 +37,8 @@ def find_format(path: Path) -> str:
     if not found and (videos := videos_in(path)):
         raise _no_scene(path, f"{path} holds the video {videos[0].name}, and no scene")
     if not found:
+        for name in formats():
+            registry.datamanagers.get(name).refuse_nearly(path)
         raise InputError(
             f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
             "a scene's own folder",

@@ -104,6 +104,13 @@ class RGBDDataManager(RecordedDataManager):
             return None
         return f"the TUM trajectory {trajectory.name} beside {images}/"
 
+    @classmethod
+    def refuse_nearly(cls, path: Path) -> None:
+        """See :class:`DataManager`: images beside a text that is no TUM trajectory, by name."""
+        if any((path / name).is_dir() for name in IMAGE_FOLDERS):
+            for file in _trajectories(path)[:1]:
+                tum.read(file)
+
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
@@ -152,12 +159,12 @@ class RGBDDataManager(RecordedDataManager):
             "depth_is_estimated": any(confidences),
             **rectification.facts(),
             "pose_convention": {
-                "order": "TUM: camera-to-world, quaternion with w last",
+                "order": f"TUM: {trajectory.stored_as}",
                 "poses": len(trajectory),
                 "summary": trajectory.summary(printed_unit(self.stated_unit(path))),
             },
         }
-        meshes = list(path.glob("*.obj"))
+        meshes = list(path.glob("[!.]*.obj"))
         points = next((file for file in (path / POINTS_FILE, *meshes[: len(meshes) == 1]) if file.is_file()), None)
         large = (*used, *(depth for _, depth, _ in rows), *masks, *confidences)
         return Recording(
@@ -379,7 +386,9 @@ def _read_mesh_points(path: Path) -> PointCloud:
 
 
 def _trajectories(folder: Path) -> list[Path]:
-    return sorted({path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file()})
+    return sorted(
+        {path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file() and path.name[0] != "."}
+    )
 
 
 def _read_json(path: Path, image: Path) -> _Camera:

@@ -6,19 +6,25 @@ import os
 
 import pytest
 
+from coliags_plugin.core.arrays import read_array, read_arrays
 from coliags_plugin.core.bounds import JSON_BYTES
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.text_files import read_text, text_lines, whole_text
+from coliags_plugin.export.splats.files import read_splats
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.poses.formats import format_of
 
 
-@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
-def test_text_and_json_with_and_without_a_byte_order_mark(tmp_path, mark):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_and_json_with_and_without_a_byte_order_mark(tmp_path, encoding):
     file = tmp_path / "a"
-    file.write_bytes(mark + "à\nb\n".encode())
+    file.write_bytes("à\nb\n".encode(encoding))
     assert whole_text(file) == read_text(file, "x") == "à\nb\n"
     assert list(text_lines(file, "x")) == [(1, "à\n"), (2, "b\n")]
-    file.write_bytes(mark + b'{"a": [1, 2.5]}')
+    file.write_bytes('{"a": [1, 2.5]}'.encode(encoding))
     assert read_json(file, "x") == {"a": [1, 2.5]}
 
 
@@ -37,7 +43,7 @@ def test_sizes_up_to_the_largest_are_read(tmp_path):
         read_json(file, "x")
 
 
-@pytest.mark.parametrize("content", [None, "loop", b"\xff\xfe"])
+@pytest.mark.parametrize("content", [None, "loop", b"\xff\xfe\x00", b"\xfe"])
 @pytest.mark.parametrize("read", [read_text, lambda *args: list(text_lines(*args)), read_json])
 def test_what_is_not_text_is_a_message(tmp_path, read, content):
     if content == "loop":
@@ -55,6 +61,45 @@ def test_what_is_not_json_is_a_message(tmp_path, content):
     with pytest.raises(InputError, match=r"a\.json is not JSON") as caught:
         read_json(tmp_path / "a.json", "a test", "Repair it")
     assert (caught.value.expected, caught.value.do) == ("a test", "Repair it")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{\n  "a": [1,\n  2,],\n}', r"in line 3, column \d: '2,\],'.*nor a comma behind the last value"),
+        ('{\n  "a": 1 // one\n}', r"in line 2, column 10: '\"a\": 1 // one'.*neither comments"),
+        ("<!DOCTYPE html>\n<html>", "cannot read .*a: it is a web page"),
+    ],
+)
+def test_where_json_ends_is_told(tmp_path, content, message):
+    (tmp_path / "a").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_json(tmp_path / "a", "x")
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("a.png", decode_image),
+        ("a.ply", read_vertices),
+        ("a.npz", lambda path: read_arrays(path, "x")),
+        ("a.npy", lambda path: read_array(path, "x")),
+        ("a.json", lambda path: read_json(path, "x")),
+        ("a.obj", read_mesh),
+        ("a.glb", read_mesh),
+        ("a.spz", read_splats),
+        ("a.txt", format_of),
+        ("a.txt", lambda path: list(text_lines(path, "x"))),
+    ],
+)
+def test_what_is_in_the_place_of_a_file_is_told(tmp_path, name, read):
+    path = tmp_path / name
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(InputError, match=rf"{name}: it is a pointer of Git LFS.*`git lfs pull`"):
+        read(path)
+    path.write_text("\n<html><head>")
+    with pytest.raises(InputError, match=rf"{name}: it is a web page"):
+        read(path)
 
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])

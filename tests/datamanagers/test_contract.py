@@ -389,6 +389,34 @@ def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, 
     assert all(equal(*pair) for pair in zip(frames, expected, strict=True))
 
 
+def in_a_folder(folder: Path) -> None:
+    """Move images into a sub-folder, as the names in the model say it on Windows."""
+    (folder / "images" / "sub").mkdir()
+    for path in files(folder, "images/*.png"):
+        path.rename(path.parent / "sub" / path.name)
+    edit("sparse/0/images.txt", r"(\d+\.png)", r"sub\\\1")(folder)
+
+
+#: Damages that make names in a file those of Windows, by kind.
+WINDOWS = {
+    "nerfstudio": edit("transforms.json", r"(images|depth)/", r"\1\\\\"),
+    "reim-nerf": lambda folder: [
+        edit(path.name, r"(images|distmaps)/", r"\1\\\\")(folder)
+        for path in files(folder, "transforms_*.json")
+        if "images/" in path.read_text()
+    ],
+    "colmap-text": in_a_folder,
+}
+
+
+@pytest.mark.parametrize("name", WINDOWS)
+def test_names_of_windows(copied, walls, name):
+    folder = copied(name)
+    WINDOWS[name](folder)
+    frames, expected = (in_order(load(place, name), name) for place in (folder, walls(name)))
+    assert all(equal(*pair) and pair[0].name == pair[1].name for pair in zip(frames, expected, strict=True))
+
+
 def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, walls):
     folder = copied("rgbd")
     remove("rgb/*.png", 3)(folder)

@@ -37,6 +37,31 @@ def test_nothing_and_two_things_are_refused(wall, tmp_path, monkeypatch):
         find_format(wall)
 
 
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"rgb/1.png": "", "poses.txt": "0 1 0 0 0 0 0 0 1\n"}, r"poses\.txt, line 1: '0 1 0 .*8 finite numbers"),
+        ({"images/1.png": "", "traj.txt": "# by hand\n0,5 1\n"}, r"traj\.txt, line 2: '0,5 1'.*decimal points"),
+        ({"rgb/1.png": "", "poses.txt": "<html>"}, r"poses\.txt: it is a web page"),
+        (
+            {"transforms_train.json": "{}", "transforms_test.json": "{}"},
+            r"Blender's NeRF scenes: transforms_train\.json, transforms_test\.json\. Expected .*one transforms\.json",
+        ),
+        (
+            {f"sparse/0/{name}": "" for name in ("cameras.bin", "images.bin", "points3D.ply")},
+            r"0 holds no COLMAP model, but cameras\.bin, images\.bin, points3D\.ply\. Expected .*points3D, all \.bin",
+        ),
+        ({f"sparse/{name}": "" for name in ("cameras.bin", "images.txt", "points3D.bin")}, r"but .*all \.bin or all"),
+    ],
+)
+def test_what_nearly_has_a_format_is_told_what_is_wrong(tmp_path, files, message):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message):
+        find_format(tmp_path)
+
+
 def test_auto_passes_on_what_was_set(wall):
     auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
     manager = data_manager(auto, wall)

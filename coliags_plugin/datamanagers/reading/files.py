@@ -131,6 +131,8 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
     ``outside`` tells whether it may lie outside of the folder. Links within the folder may always lead anywhere.
     """
     path = folder / name
+    if "\\" in name and not os.path.lexists(path):  # a name of Windows
+        path = folder / name.replace("\\", "/")
     within = Path(posixpath.normpath(folder.absolute()))
     if not outside and not Path(posixpath.normpath(path.absolute())).is_relative_to(within):
         raise InputError(
@@ -154,7 +156,7 @@ def short_names(paths: Sequence[str]) -> list[str]:
     Common parent folders are removed and the remaining ones joined by a dash; suffixes are dropped if names stay
     unique.
     """
-    whole = [PurePosixPath(posixpath.normpath(path)) for path in paths]
+    whole = [PurePosixPath(posixpath.normpath(path.replace("\\", "/"))) for path in paths]
     common = len(PurePosixPath(os.path.commonpath([path.parent for path in whole])).parts)
     inner = [PurePosixPath(*path.parts[common:]) for path in whole]
     for short in ([str(path.with_suffix("")) for path in inner], [str(path) for path in inner]):

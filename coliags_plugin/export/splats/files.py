@@ -16,6 +16,7 @@ import numpy as np
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.ply import read_vertices, write_ply
+from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.export.splats.cloud import SplatCloud, sigmoid
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
 
@@ -168,7 +169,7 @@ def read_splat_spz(path: Path) -> SplatCloud:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "an SPZ file") from error
     except Exception as error:  # gsply and the decompressors beneath raise whatever they like
-        raise InputError(f"{path} cannot be read as SPZ: {error}", "an SPZ file of version 1 to 4") from error
+        raise unreadable(path, f"{path} cannot be read as SPZ: {error}", "an SPZ file of version 1 to 4") from error
     first = np.asarray(data.sh0)[:, None]
     higher = [] if data.shN is None else [np.asarray(data.shN)]
     return _half_turn(

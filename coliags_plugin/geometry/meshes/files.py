@@ -19,6 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, read_triangles, write_ply
+from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 
 #: Suffixes of the formats.
@@ -96,7 +97,9 @@ def _read_glb(path: Path) -> TriangleMesh:
         vertices, triangles = np.asarray(read.vertices, np.float32), np.asarray(read.faces, np.int64)
         colors = np.asarray(read.visual.vertex_colors)[:, :3] if read.visual.kind == "vertex" else None
     except Exception as error:  # trimesh raises whatever it meets
-        raise InputError(f"{path} cannot be read as GLB: {error}", "a complete GLB file", "Fetch it again") from error
+        raise unreadable(
+            path, f"{path} cannot be read as GLB: {error}", "a complete GLB file", "Fetch it again"
+        ) from error
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
     return TriangleMesh(vertices, triangles, None if colors is None else _encoded(colors / 255.0))
@@ -199,7 +202,7 @@ def _numbers(path: Path, rows: list[str]) -> np.ndarray:
     try:
         values = np.array([row.split(maxsplit=_MOST_NUMBERS) for row in rows], np.float64).reshape(len(rows), -1)
     except ValueError as error:
-        raise InputError(f"{path} has vertices that are not rows of numbers", "an OBJ file") from error
+        raise unreadable(path, f"{path} has vertices that are not rows of numbers", "an OBJ file") from error
     if len(rows) and values.shape[1] < 3:
         raise InputError(f"{path} has vertices of {values.shape[1]} numbers", "x, y, z")
     return values if len(rows) else np.zeros((0, 3))

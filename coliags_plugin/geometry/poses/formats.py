@@ -13,7 +13,7 @@ import numpy as np
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing
-from coliags_plugin.core.text_files import text_lines
+from coliags_plugin.core.text_files import encoding_of, text_lines, unreadable
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
@@ -62,10 +62,12 @@ def format_of(path: Path, name: str | None = None) -> Format:
         held = sorted(entry.name for entry in path.iterdir())
         shown = f"{', '.join(held[:3])}{f' and {len(held) - 3} more' if len(held) > 3 else ''}" if held else "nothing"
         raise InputError(f"{path} holds {shown}", "the folder of a COLMAP model, or a pose file inside a folder")
-    count = count_first_numbers(path)
-    raise InputError(
+    line, count = _first_row(path)
+    raise unreadable(
+        path,
         f"{path} has no known pose format: its first line holds "
-        + (f"{count} numbers" if count is not None else "no row of numbers"),
+        + (f"{count} numbers" if count is not None else "no row of numbers with decimal points")
+        + (f": '{shortened(line)}'" if line else ""),
         "16 numbers per line (c3vd), 8 (tum), a params.npz (endogslam) or a transforms.json (nerfstudio)",
     )
 
@@ -87,6 +89,9 @@ def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: b
 
 #: What readers of poses expect.
 EXPECTED = "a text file of poses"
+#: A number with a decimal comma, and the beginning of any number.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
+_LIKE_NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf)\b", re.IGNORECASE)
 #: Bytes of a file read to recognise it.
 _HEAD_BYTES = 65_536
 
@@ -94,14 +99,15 @@ _HEAD_BYTES = 65_536
 def read_numbers(
     path: Path, count: int, expected: str, do: str, *, comments: bool = False
 ) -> list[tuple[int, list[float]]]:
-    """Read rows of so many finite numbers, separated by commas or blanks, each with its line number.
+    """Read rows of so many finite numbers, separated by commas, semicolons or blanks, each with its line number.
 
-    ``expected`` and ``do`` are for the error about an invalid line. Lines that begin with ``#`` may be comments.
+    ``expected`` and ``do`` are for the error about an invalid line. Where there may be ``comments``, lines that begin
+    with ``#`` or ``%`` are, and lines without numbers before the first row, which name the columns.
     """
     rows: list[tuple[int, list[float]]] = []
     for number, line in text_lines(path, EXPECTED):
         words = _words(line)
-        if not words or (comments and words[0].startswith("#")):
+        if not words or (comments and (_is_comment(words) or (not rows and _are_names(words)))):
             continue
         try:
             values = [float(word) for word in words]
@@ -116,16 +122,27 @@ def read_numbers(
 
 
 def count_first_numbers(path: Path) -> int | None:
-    """Count of numbers in the first line of a text file that is not a comment; None if it holds anything else."""
-    for line in head(path).decode("utf-8-sig", errors="replace").splitlines():
+    """Count of numbers in the first line of a text file behind comments and names; None if it holds anything else."""
+    return _first_row(path)[1]
+
+
+def _first_row(path: Path) -> tuple[str, int | None]:
+    """The first line of a text file behind comments and names, and its count of numbers, None if others are there."""
+    for line in head_text(path).splitlines():
         words = _words(line)
-        if not words or words[0].startswith("#"):
+        if not words or _is_comment(words) or _are_names(words):
             continue
         try:
-            return len([float(word) for word in words])
+            return line, len([float(word) for word in words])
         except ValueError:
-            return None
-    return None
+            return line, None
+    return "", None
+
+
+def head_text(path: Path) -> str:
+    """The first characters of a text file, in any encoding that is read."""
+    start = head(path)
+    return start.decode(encoding_of(start), errors="replace")
 
 
 def head(path: Path) -> bytes:
@@ -153,4 +170,16 @@ def shortened(line: str) -> str:
 
 
 def _words(line: str) -> list[str]:
-    return [word for word in re.split(r"[,\s]+", line) if word]
+    words = line.replace(";", " ").split()
+    if len(words) > 1 and any(_DECIMAL_COMMA.fullmatch(word) for word in words):
+        return words
+    return [word for word in re.split(r"[,;\s]+", line) if word]
+
+
+def _is_comment(words: list[str]) -> bool:
+    return words[0].startswith(("#", "%"))
+
+
+def _are_names(words: list[str]) -> bool:
+    """Whether words are names of columns: no number is among them, nor anything that is meant as such."""
+    return not any(_LIKE_NUMBER.match(word) for word in words)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
+from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses import c3vd, nerfstudio, tum
 from coliags_plugin.geometry.poses.c3vd import read_poses
-from coliags_plugin.geometry.poses.rigid import rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.geometry.poses.trajectory import natural_order
+from coliags_plugin.geometry.poses.formats import format_of
+from coliags_plugin.geometry.poses.rigid import rigid, rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
+from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order
 from tests.datamanagers.wall_scenes import poses
 from tests.geometry.poses.winding import as_text, some_transform, winding
 
@@ -69,6 +73,99 @@ def test_tum_is_camera_to_world_with_w_last(tmp_path):
     np.testing.assert_allclose(read.rotations[0], QUARTER, atol=1e-15)
     np.testing.assert_array_equal(read.centers[0], [1, 2, 3])
     assert read.timestamps.tolist() == [3.5]
+
+
+NAMES = "timestamp tx ty tz qx qy qz qw"
+W_FIRST = NAMES.replace("qx qy qz qw", "qw qx qy qz")
+
+
+@pytest.mark.parametrize("comment", ["% made by hand\n", f"{NAMES}\n", ""])
+@pytest.mark.parametrize("separator", [" ", ",", ", ", ";", "\t", "; "])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_tum_in_every_spelling(tmp_path, comment, separator, encoding):
+    trajectory, path = winding(4, timestamps=np.arange(4) / 3), tmp_path / "poses.txt"
+    tum.write(path, trajectory)
+    rows = "".join(line for line in path.read_text().splitlines(keepends=True)[1:])
+    path.write_bytes((comment.replace(" ", separator) + rows.replace(" ", separator)).encode(encoding))
+    assert format_of(path).name == "tum"
+    read = tum.read(path)
+    np.testing.assert_allclose(read.camera_to_world, trajectory.camera_to_world, atol=1e-12)
+    np.testing.assert_array_equal(read.timestamps, trajectory.timestamps)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0 0.5 1 2 3 0 0 0 1", "line 2: '0 0.5 1 2 3 0 0 0 1'. Expected 8 finite numbers"),
+        ("0,5 1,0 2,0 3,0 0,0 0,0 0,0 1,0", "line 2: '0,5 1,0 .*with decimal points"),
+        ("0,5;1,0;2,0;3,0;0,0;0,0;0,0;1,0", "line 2: '0,5;1,0;.*with decimal points"),
+    ],
+)
+def test_tum_almost(tmp_path, line, message):
+    (tmp_path / "poses.txt").write_text(f"# a comment\n{line}\n")
+    with pytest.raises(InputError, match=message):
+        tum.read(tmp_path / "poses.txt")
+    with pytest.raises(InputError, match=re.escape(f"'{line}'")):
+        format_of(tmp_path / "poses.txt")
+
+
+def stored_w_first(path, trajectory, names=""):
+    """A TUM file whose quaternions have w first."""
+    tum.write(path, trajectory)
+    rows = np.loadtxt(path)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+    path.write_text(f"{names}\n{as_text(rows)}")
+    return path
+
+
+def smooth(seed: int, forward: bool, count: int = 40) -> Trajectory:
+    """Cameras that turn about all axes from a random pose on, and drift, or fly along their own z axis."""
+    rng, times = np.random.default_rng(seed), np.linspace(0.0, 1.0, count)
+    turns = Rotation.random(random_state=seed) * Rotation.from_rotvec(
+        CubicSpline(np.linspace(0, 1, 4), rng.normal(size=(4, 3)))(times)
+    )
+    steps = turns.as_matrix()[:, :, 2] if forward else CubicSpline(np.linspace(0, 1, 4), rng.normal(size=(4, 3)))(times)
+    return Trajectory(rigid(turns.as_matrix(), np.cumsum(steps, axis=0)))
+
+
+@pytest.mark.parametrize(
+    "names",
+    [f"# {W_FIRST}", W_FIRST.replace(" ", ","), "#timestamp [ns], p_x, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"],
+)
+def test_names_of_columns_may_put_w_first(tmp_path, caplog, names):
+    trajectory = winding(5)
+    read = tum.read(stored_w_first(tmp_path / "poses.txt", trajectory, names))
+    np.testing.assert_allclose(read.camera_to_world, trajectory.camera_to_world, atol=1e-12)
+    assert "w first" in read.stored_as and not caplog.messages
+
+
+@pytest.mark.parametrize(
+    "trajectory",
+    [
+        Trajectory(np.linalg.inv(winding(6).camera_to_world[0]) @ winding(6).camera_to_world),
+        Trajectory(rigid(np.tile(np.eye(3), (4, 1, 1)), np.outer(np.arange(4.0), (1, 2, 3)))),
+        *(smooth(seed, forward=True) for seed in (0, 1)),
+    ],
+)
+def test_w_first_is_suspected_where_it_explains_the_path(tmp_path, caplog, trajectory):
+    path = stored_w_first(tmp_path / "poses.txt", trajectory)
+    tum.read(path)
+    assert "look as if w came first" in caplog.text and f"'# {W_FIRST}'" in caplog.text
+    caplog.clear()
+    stored_w_first(path, trajectory, f"# {W_FIRST}")
+    np.testing.assert_allclose(tum.read(path).camera_to_world, trajectory.camera_to_world, atol=1e-12)
+    assert not caplog.messages
+
+
+@given(seed=st.integers(0, 2**31), forward=st.booleans(), count=st.sampled_from([1, 2, 3, 12, 60]))
+@settings(max_examples=60, deadline=None)
+def test_w_last_is_not_suspected(tmp_path_factory, seed, forward, count):
+    path = tmp_path_factory.mktemp("tum") / "poses.txt"
+    straight = Trajectory(rigid(np.tile(np.eye(3), (count, 1, 1)), np.arange(3.0 * count).reshape(count, 3)))
+    for trajectory in (smooth(seed, forward, count), winding(count, seed), straight):
+        tum.write(path, trajectory)
+        with mock.patch.object(tum.log, "warning") as warning:
+            tum.read(path)
+        assert not warning.called
 
 
 def test_c3vd_is_written_column_by_column(tmp_path):
