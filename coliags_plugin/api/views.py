@@ -38,6 +38,7 @@ class RenderedView:
         true_rgb: Recorded colours; None for a free camera, and under another lamp. [H, W, 3]
         true_depth: True z-depth, mm; NaN where unknown or not to be looked at. None where there is none. [H, W]
         unit: Of depths.
+        error_limit: Depth error of the last colour, in this unit.
     """
 
     name: str
@@ -49,6 +50,7 @@ class RenderedView:
     true_rgb: UInt8[np.ndarray, "H W 3"] | None = field(default=None, repr=False)
     true_depth: Float32[np.ndarray, "H W"] | None = field(default=None, repr=False)
     unit: str = "mm"
+    error_limit: float = DEPTH_ERROR_LIMIT_MM
 
     def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
@@ -61,7 +63,7 @@ class RenderedView:
             shown[f"true depth, {scale}"] = colorize_depth(self.true_depth, limits)
         shown[f"depth, {scale}"] = colorize_depth(self.depth, limits)
         if self.true_depth is not None:
-            known, limit = np.isfinite(self.true_depth), DEPTH_ERROR_LIMIT_MM
+            known, limit = np.isfinite(self.true_depth), self.error_limit
             errors = colorize_depth_error(self.depth, self.true_depth, known, limit)
             shown[f"depth error, 0 to {limit:g} {self.unit}"] = errors
         return shown
@@ -98,6 +100,7 @@ def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence
         true_rgb=None if frame is None or trained.lamp is not None else as_array(frame.image),
         true_depth=None if frame is None else _true_depth(frame),
         unit=trained.scene.length_unit,
+        error_limit=rendering.error_limit_of(trained),
     )
 
 

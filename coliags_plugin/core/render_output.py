@@ -28,6 +28,8 @@ OUTPUTS = (
 
 #: Alpha below which a pixel shows more background than tissue, so that its depth means little.
 OPAQUE_ALPHA = 0.5
+#: Views of a smaller mean alpha show nothing.
+BLANK_ALPHA = 1e-3
 
 #: Outputs that only surfels have.
 SURFEL_OUTPUTS = frozenset({"distortion"})

@@ -65,9 +65,9 @@ def training_scale(scene: Scene) -> float:
 
 
 def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
-    """A scene to train on, with a near plane; its provenance and the log tell the factor on its lengths."""
+    """A scene to train or render on, with a near plane; its provenance and the log tell the factor on its lengths."""
     if scale != 1.0:
-        log.info("the unit of length of scene '%s' is unknown: trained at %.4g times its size", scene.name, scale)
+        log.info("the unit of length of scene '%s' is unknown: used at %.4g times its size", scene.name, scale)
     provenance = {**scene.provenance, SCALE_KEY: scale}
     return replace(scene.scaled(scale).with_near_plane(near_plane), provenance=provenance)
 

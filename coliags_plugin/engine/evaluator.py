@@ -20,11 +20,11 @@ from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_ps
 from coliags_plugin.engine.devices import device_name, software
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.rendering import error_limit_of
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth, match_truth
 from coliags_plugin.outputs.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
     colorize_depth_error,
@@ -82,7 +82,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 comparison = scorer.protocol.compare(output, placed)
                 refined = scorer.refined(trained.model, placed) if refine_poses else ()
                 evaluated[set_name].add(placed, comparison, output.alpha, *refined)
-                _write_images(scratch, set_name, frame, comparison)
+                _write_images(scratch, set_name, frame, comparison, error_limit_of(trained))
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
                 done += 1
@@ -112,7 +112,7 @@ def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:
         raise InputError(f"scene '{scene.name}' has no test frames", "a split that holds some out")
 
 
-def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
+def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison, error_limit: float) -> None:
     name = f"{set_name}/{frame.name}"
     write_png(folder / "renders" / f"{name}.png", eight_bit(comparison.rgb))
     write_png(folder / "truth" / f"{name}.png", frame.image)
@@ -121,7 +121,7 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
+    errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, error_limit)
     write_png(folder / "errors" / f"{name}.png", errors)
 
 

@@ -58,14 +58,14 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
     if along is not None:
         path = list(along.cameras(trained.scene.train[0].camera, options.fps))
-    limits = sampled_depth_limits(trained, chosen or path, depth)
+    limits, error_limit = sampled_depth_limits(trained, chosen or path, depth), error_limit_of(trained)
     with (
         atomic_folder(output, options.overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * options.video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
-            _write_frame(folder, frame, view, depth, limits, trained.relit)
+            _write_frame(folder, frame, view, depth, limits, error_limit, trained.relit)
             if options.depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
@@ -73,7 +73,7 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
         if (folder / "depth_error").exists():  # some frame has true depth
-            write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
+            write_png(folder / "depth_error_scale.png", color_bar((0.0, error_limit), unit, "error"))
         if chosen and not trained.relit:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
         for light in (trained.lamp, trained.held):
@@ -90,6 +90,11 @@ def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], d
     sample = views[:: max(1, len(views) // 4)][:4]
     rendered = (render_view(trained, view, ("rgb", "alpha", depth)) for view in sample)
     return depth_limits([as_array(output[depth]) for output in rendered], trained.scene.length_unit)
+
+
+def error_limit_of(trained: TrainedRun) -> float:
+    """Depth error of the last colour, scene units: 2 mm at the size at which the run was trained."""
+    return DEPTH_ERROR_LIMIT_MM / trained.model.scale
 
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:
@@ -131,7 +136,13 @@ def _as_rgb(channel: Tensor) -> Tensor:
 
 
 def _write_frame(
-    folder: Path, frame: Frame, output: RenderOutput, depth_name: str, limits: tuple[float, float], relit: bool
+    folder: Path,
+    frame: Frame,
+    output: RenderOutput,
+    depth_name: str,
+    limits: tuple[float, float],
+    error_limit: float,
+    relit: bool,
 ) -> None:
     name = f"{frame.name}.png"
     depth = output[depth_name]
@@ -142,7 +153,7 @@ def _write_frame(
         errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
         write_png(folder / "rgb_error" / name, errors)
     if (true := frame.true_depth) is not None:
-        errors = colorize_depth_error(depth.cpu(), true, valid, DEPTH_ERROR_LIMIT_MM)
+        errors = colorize_depth_error(depth.cpu(), true, valid, error_limit)
         write_png(folder / "depth_error" / name, errors)
 
 

@@ -16,7 +16,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
+from coliags_plugin.core.render_output import BLANK_ALPHA, OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.pose_refinement import color_factors, refined_camera
@@ -118,12 +118,13 @@ class EvaluatedSet:
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
         self._profiles = ErrorProfiles(unit)
-        self._pixels = self._transparent = 0
+        self._pixels = self._transparent = self._blank = 0
 
     def add(self, frame: Frame, comparison: Comparison, alpha: Float[Tensor, "H W"], *refined: Comparison) -> None:
         """Score a frame under its protocol and take it up, with its rendered alpha, and views from a refined pose."""
         self._pixels += int(frame.valid.sum())
         self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
+        self._blank += shows_nothing(alpha, frame)
         self._add_scores(frame.name, self._scorer.score(comparison))
         if frame.seen is not None:
             self._add_scores(frame.name, self._scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
@@ -166,7 +167,13 @@ class EvaluatedSet:
             truth_sha256=self._truth.hexdigest(),
             profiles=self._profiles.records(),
             transparent=self._transparent / self._pixels if self._pixels else None,
+            blank=self._blank,
         )
+
+
+def shows_nothing(alpha: Float[Tensor, "H W"], frame: Frame) -> bool:
+    """Whether hardly anything was drawn within the mask of a frame, which is not empty."""
+    return bool(frame.valid.any() and alpha[frame.valid].mean() < BLANK_ALPHA)
 
 
 def _hash(target: ArraysHash, frame: str, **parts: Tensor | None) -> None:

@@ -20,7 +20,7 @@ from coliags_plugin.core.errors import DeviceMemoryError, InterruptedRunError, N
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.masked import masked_mean
-from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
+from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.core.transfers import sent
 from coliags_plugin.engine import checkpoints
@@ -38,8 +38,6 @@ from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
 
-#: Views of a smaller mean alpha are blank.
-BLANK_ALPHA = 1e-3
 #: Blank views in a row after which a run stops.
 MAX_BLANK_VIEWS = 10
 #: What takes less memory on a device.

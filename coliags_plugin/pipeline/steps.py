@@ -235,7 +235,8 @@ def evaluate(context: StageContext) -> StageOutcome:
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
     made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
-    return StageOutcome(f"held-out frames: {shown}", made, figures=figures | _training_psnr(trained))
+    warnings = [f"held-out frames: {part.transparency_warning}" for part in result.sets.values() if part.blank]
+    return StageOutcome(f"held-out frames: {shown}", made, warnings, figures=figures | _training_psnr(trained))
 
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:

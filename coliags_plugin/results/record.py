@@ -96,6 +96,7 @@ class SetRecord(_Part):
     truth_sha256: str  # hash of those that they were compared with
     profiles: dict[str, ProfileRecord] = {}  # by property: distance, angle; empty without true depth
     transparent: float | None = None  # share of the pixels within the masks with alpha below 0.5; None: not measured
+    blank: int = 0  # number of views that show nothing: their mean alpha within the masks is below 0.001
 
     @model_validator(mode="after")
     def _one_value_per_frame(self) -> Self:
@@ -108,7 +109,12 @@ class SetRecord(_Part):
 
     @property
     def transparency_warning(self) -> str:
-        """Warning of transparent pixels; empty where there are hardly any."""
+        """Warning of views that show nothing, or else of transparent pixels; empty where there are hardly any."""
+        if self.blank:
+            return (
+                f"{self.blank} of {len(self.frames)} views show nothing, their mean alpha is below 0.001: what was "
+                "reconstructed may be in another world or unit than their poses, nearer than near_plane, or not in view"
+            )
         if self.transparent is None or self.transparent <= MANY_TRANSPARENT:
             return ""
         return (

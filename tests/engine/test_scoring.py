@@ -9,8 +9,10 @@ import torch
 
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.metrics.image import PSNR
 from coliags_plugin.metrics.protocols import PaperProtocol
 
@@ -32,6 +34,25 @@ def test_a_metric_that_cannot_be_had_has_a_reason(found, reason, monkeypatch):
     monkeypatch.setattr(PSNR, "__call__", mock.Mock(side_effect=[found]))
     scores = Scorer("paper", only=("psnr", "ssim")).score(comparison())
     assert scores.reasons == {"psnr": reason} and set(scores.values) == {"ssim"}
+
+
+def test_views_that_show_nothing_within_their_masks_are_counted():
+    left, nothing, everything = torch.zeros(16, 16, dtype=torch.bool), torch.zeros(16, 16), torch.ones(16, 16)
+    left[:, :8] = True
+    views = [
+        (None, nothing),
+        (left, (~left).float()),
+        (left, left.float()),
+        (~left & left, nothing),
+        (None, everything),
+    ]
+    evaluated = EvaluatedSet("mm", Scorer("paper", only=("psnr",)))
+    for index, (mask, alpha) in enumerate(views):
+        camera = Camera(16.0, 16.0, 8.0, 8.0, 16, 16, torch.eye(4))
+        image = torch.zeros(16, 16, 3, dtype=torch.uint8)
+        evaluated.add(Frame(f"{index}", index, image, camera, mask=mask), comparison(), alpha)
+    record = evaluated.record()
+    assert record.blank == 2 and record.transparency_warning.startswith("2 of 5 views show nothing")
 
 
 @pytest.mark.parametrize(

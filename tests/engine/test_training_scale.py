@@ -20,8 +20,9 @@ from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.training import TrainingRequest, open_training
-from coliags_plugin.export.baking.exporting import export_run
-from coliags_plugin.export.splats.files import read_splats
+from coliags_plugin.export.baking import exporting
+from coliags_plugin.export.baking.exporting import export_run, import_run
+from coliags_plugin.export.splats.files import read_splats, write_splat_ply
 from coliags_plugin.outputs.image_files import read_depth_tiff
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
@@ -115,7 +116,7 @@ def test_evaluations_are_in_its_own_unit(runs, factor):
         np.testing.assert_allclose(numbers, learned_mm["field"][name], rtol=1e-4, atol=1e-6)
 
 
-def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
+def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, small, tmp_path, monkeypatch):
     meshes = [fuse_run(run, MeshSettings(min_views=1, min_alpha=0.5, voxel_pixels=1.0)).mesh for run in runs]
     bounds = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in meshes]
     np.testing.assert_allclose(factor * bounds[0], bounds[1], atol=1.0)
@@ -129,3 +130,14 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, tmp_path):
     export, export_mm = (record["cost"]["test"] for record in records)
     assert export["export"]["psnr"] == pytest.approx(export_mm["export"]["psnr"], abs=0.05)
     assert factor**2 * export["export"]["depth_mse"] == pytest.approx(export_mm["export"]["depth_mse"], rel=0.02)
+    # Imported at any length, as much of it lies beyond the near plane.
+    for length in (1.0, 1e-3):
+        file, folder, scene = tmp_path / "small.ply", RunFolder(tmp_path / f"imported {length}"), small.scaled(length)
+        write_splat_ply(file, clouds[0].scaled(length))
+        for module in (exporting, trained_module):
+            monkeypatch.setattr(module, "load_scene", lambda config, _, s=scene: s.with_near_plane(config.near_plane))
+        import_run(file, tmp_path, folder, CPU, "c3vd")
+        again = load_trained(folder.path, CPU)
+        assert again.model.scale == pytest.approx(factor / length)
+        psnr = read_result(evaluate(again, "paper") / RESULT_FILE).mean("psnr")
+        assert psnr == pytest.approx(export["psnr_recorded"], abs=0.01)

@@ -15,14 +15,14 @@ from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_folder, refuse_existing, write_json
-from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.engine.data_formats import load_method_for, load_scene
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.scoring import Scorer, shows_nothing
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.baking.baking import bake
@@ -259,10 +259,13 @@ def import_run(
     method = load_method_for(data, _METHODS[cloud.scales.shape[1]], data_format=data_format)
     config = method.config
     scene = load_scene(config, data)
-    _warn_of_another_frame(scene, cloud, file)
+    # As in training: the near plane and other constants are lengths in mm.
+    scale = training_scale(scene)
+    scene, cloud = at_scale(scene, scale, config.near_plane), cloud.scaled(scale)
     field = config.field.target(config.field.settings, len(cloud))
     load_cloud(field, cloud)
     trainer = Trainer(method, scene, str(data.resolve()), output, 0, device, field)
+    _warn_of_another_frame(trainer, cloud, file)
     provenance = trainer.provenance()
     del provenance["plan"]
     provenance["imported"] = {"file": file.name, "gaussians": len(cloud), "sh_degree": cloud.degree}
@@ -272,19 +275,25 @@ def import_run(
         trainer.save()
 
 
-def _warn_of_another_frame(scene: Scene, cloud: SplatCloud, file: Path) -> None:
-    """Say so where the training cameras have hardly any Gaussian in their images."""
+@torch.no_grad()
+def _warn_of_another_frame(trainer: Trainer, cloud: SplatCloud, file: Path) -> None:
+    """Say so where the training cameras have hardly any Gaussian in their images, or some views show nothing."""
+    scene, model = trainer.scene, trainer.model
     means = torch.from_numpy(cloud.means).double()
     seen = torch.zeros(len(means), dtype=torch.bool)
     for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
         seen |= frame.camera.to(dtype=torch.float64).sees(means)[1]
     share = float(seen.float().mean())
     if share < _FEW:
-        log.warning(
-            "%s: %.2g %% of the Gaussians lie in the view of a training camera; is it in the world frame and unit (%s) "
-            "of scene '%s'?",
-            file,
-            100.0 * share,
-            scene.length_unit,
-            scene.name,
+        seen_of_it = f"{100.0 * share:.2g} % of the Gaussians lie in the view of a training camera"
+    else:
+        views = [frame for frames in scene.test_sets.values() for frame in frames] or scene.train
+        placed = [frame.to(trainer.device) for frame in views[:: max(1, len(views) // _CAMERAS)]]
+        blank = sum(
+            shows_nothing(model.render(each.camera, view=each.view(trained=False)).alpha, each) for each in placed
         )
+        if not blank:
+            return
+        seen_of_it = f"{blank} of {len(placed)} views of it show nothing, nothing nearer than near_plane is drawn"
+    question = "is it in the world frame and unit (%s) of scene '%s'?"
+    log.warning(f"%s: %s; {question}", file, seen_of_it, scene.length_unit, scene.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -257,9 +258,17 @@ def test_imports_that_cannot_be(wall, tmp_path, capsys):
     assert (output / "mine.txt").read_text() == "mine"
 
 
-def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog):
-    cloud = random_cloud(20)
-    write_splat_ply(tmp_path / "far.ply", replace(cloud, means=cloud.means - np.float32(5000)))
+@pytest.mark.parametrize(
+    ("change", "seen"),
+    [
+        (lambda cloud: {"means": cloud.means - np.float32(5000)}, "0 % of the Gaussians lie in the view of a"),
+        (lambda cloud: {"means": cloud.means / 1000, "scales": cloud.scales / 1000}, "(of the Gaussians|show nothing)"),
+        (lambda cloud: {"opacities": np.full_like(cloud.opacities, 1e-6)}, "2 of 2 views of it show nothing"),
+    ],
+)
+def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, seen):
+    cloud = random_cloud(200)
+    write_splat_ply(tmp_path / "far.ply", replace(cloud, **change(cloud)))
     with caplog.at_level(logging.WARNING):
         cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
-    assert "world frame and unit" in caplog.text
+    assert re.search(f"{seen}.*world frame and unit", caplog.text)
