@@ -7,15 +7,19 @@ import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.text_files import unreadable
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 #: Bytes of a chunk of a PNG besides its data: length, type and checksum.
@@ -40,11 +44,12 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
             with suppress(cv2.error):  # of more than 2^30 pixels, for instance
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
         if image is None:
+            heif = data[4:8] == b"ftyp" and "It is HEIF (.heic, .avif): convert it to PNG"
             raise unreadable(
                 path,
                 f"{path} ({len(data)} bytes) cannot be decoded",
                 "a complete image",
-                "It is damaged or cut short: fetch it again",
+                heif or "It is damaged or cut short: fetch it again",
             )
     return np.asarray(image)
 
@@ -55,6 +60,42 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise InputError(f"{path} is {kind_of(image)}", "an 8-bit RGB image", "Convert it")
     return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_8_bit(path: Path) -> UInt8[np.ndarray, "H W C"]:
+    """Read an image as 8-bit RGB or RGBA: grey is repeated, 16 bits are scaled by their full range."""
+    import cv2
+
+    image = decode_image(path)
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    codes = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+    code = codes.get(1 if image.ndim == 2 else image.shape[2])
+    if image.dtype != np.uint8 or code is None:
+        raise InputError(f"{path} is {kind_of(image)}", "an image of 8 or 16 bits, grey or RGB", "Convert it")
+    return np.asarray(cv2.cvtColor(image, code))
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether an image file has an alpha channel, or a colour that stands for transparency, by its header."""
+    import PIL.Image
+
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        return False
+    with suppress(Exception), warnings.catch_warnings():  # the decoder says what is wrong with a damaged file
+        warnings.simplefilter("ignore")
+        with PIL.Image.open(path) as header:
+            return bool(header.has_transparency_data)
+    return False
+
+
+def read_alpha(path: Path) -> Bool[np.ndarray, "H W"] | None:
+    """The mask in an image's alpha channel: False below 128 of 255; None where no pixel is."""
+    image = decode_image(path) if has_alpha(path) else np.zeros(0)
+    if image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
+        return None
+    shown = np.asarray(image[..., 3] > np.iinfo(image.dtype).max // 2)
+    return None if shown.all() else shown
 
 
 def kind_of(image: np.ndarray) -> str:
@@ -70,7 +111,7 @@ def sizes_text(sizes: Iterable[tuple[int, int]]) -> str:
 
 
 def _check_size(path: Path, data: bytes) -> None:
-    """Raise InputError if the image's header states more pixels than :mod:`coliags_plugin.core.bounds` allows."""
+    """Raise InputError if the header states more images than one, or pixels than :mod:`coliags_plugin.core.bounds`."""
     import PIL.Image
 
     try:
@@ -78,6 +119,7 @@ def _check_size(path: Path, data: bytes) -> None:
             warnings.simplefilter("ignore")  # the decoder says what is wrong with a damaged file
             with PIL.Image.open(io.BytesIO(data)) as header:
                 width, height = header.size
+                count = _images_in(header)
     except PIL.Image.DecompressionBombError as error:
         raise InputError(f"{path}: {error}", f"an image of at most {bounds.IMAGE_PIXELS:,} pixels") from error
     except Exception:  # of a kind that Pillow does not know, or damaged: the decoder sees that
@@ -88,6 +130,18 @@ def _check_size(path: Path, data: bytes) -> None:
             f"at most {bounds.IMAGE_PIXELS:,} pixels, and {bounds.IMAGE_SIDE} a side",
             "It is damaged, or not a frame of a video",
         )
+    if count > 1:
+        raise InputError(f"{path} holds {count} images", "one image in a file", "Write each to a file of its own")
+
+
+def _images_in(file: PIL.Image.Image) -> int:
+    """Number of images in an open file, as in TIFF; without previews, which are smaller or in a camera's MPO."""
+    size, count = file.size, getattr(file, "n_frames", 1)
+    if count > 1 and file.format != "MPO":
+        with suppress(Exception):  # damaged
+            file.seek(1)
+            return count if file.size == size else 1
+    return 1
 
 
 def _is_whole_png(data: bytes) -> bool:
@@ -105,11 +159,11 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int] = ()) -> bytes:
-    """Encode RGB or one channel as the bytes of a file of a format, with OpenCV's options: keys and values in turn."""
+    """Encode RGB, RGBA or one channel as the bytes of a file, with OpenCV's options: keys and values in turn."""
     import cv2
 
     kind = f"{pixels.dtype} {list(pixels.shape)}"
-    bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    bgr = pixels[..., [2, 1, 0, 3] if pixels.shape[2] == 4 else slice(None, None, -1)] if pixels.ndim == 3 else pixels
     try:
         encoded, data = cv2.imencode(suffix, np.ascontiguousarray(bgr), list(options))
     except cv2.error as error:
@@ -120,7 +174,7 @@ def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write RGB or one channel atomically in the format of the file's suffix; its folder is made."""
+    """Write RGB, RGBA or one channel atomically in the format of the file's suffix; its folder is made."""
     atomic_write(path, encode_image(pixels, path.suffix))
 
 

@@ -142,15 +142,6 @@ def read_model(folder: Path) -> SparseModel:
     )
 
 
-def sidecar_file(folder: Path, name: str, suffixes: Sequence[str]) -> Path | None:
-    """The mask or depth file of an image: ``name.jpg.png``, as COLMAP names it, or ``name.png``; None if missing."""
-    for suffix in suffixes:
-        for path in (folder / f"{name}{suffix}", (folder / name).with_suffix(suffix)):
-            if path.is_file():
-                return path
-    return None
-
-
 def _lens(camera: colmap_poses.ColmapCamera, file: Path) -> ColmapLens:
     lens = ColmapLens(width=camera.width, height=camera.height, model=camera.model, params=camera.params)
     if camera.model in _PANORAMIC:
@@ -215,6 +206,7 @@ class ColmapDataManager(RecordedDataManager):
 
     settings: ColmapSettings
     name = "colmap"
+    masks_at = "masks/NAME.png"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -237,7 +229,7 @@ class ColmapDataManager(RecordedDataManager):
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
         model = read_model(self._model_folder(path))
         paths = _image_paths(path / user_path(settings.images_folder), model, settings.outside_files)
-        masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
+        masks = _masks(path, model)
         depths, params = _depths(path / "depths", model)
         lenses = {
             number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
@@ -397,6 +389,19 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
     return paths
 
 
+def _masks(scene: Path, model: SparseModel) -> list[Path | None]:
+    """Mask files of any of the images."""
+    folder = next((scene / name for name in ("masks", "mask") if (scene / name).is_dir()), scene / "masks")
+    masks = [*reading.sidecar_files(folder, [image.name for image in model.images], reading.MASK_SUFFIXES).values()]
+    if folder.is_dir() and any(folder.iterdir()) and not any(masks):
+        raise InputError(
+            f"{folder} holds {reading.inventory(folder)}, and no mask of any image of {model.folder}",
+            f"masks named like the images, {model.images[0].name}.png for instance",
+            "Rename them, or move the folder away",
+        )
+    return masks
+
+
 def _depths(folder: Path, model: SparseModel) -> tuple[list[Path | None], Path | None]:
     """Depth files of all images, or of none, and the file that says that they hold inverse depth, if any."""
     params = model.folder / _DEPTH_PARAMS
@@ -406,7 +411,7 @@ def _depths(folder: Path, model: SparseModel) -> tuple[list[Path | None], Path |
             log.warning("%s is not used, as there is no %s", params, folder)
         return [None] * len(model.images), None
     suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
-    found = {image.name: sidecar_file(folder, image.name, suffixes) for image in model.images}
+    found = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
     files = reading.for_all(found, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
     return files, params if is_inverse else None
 

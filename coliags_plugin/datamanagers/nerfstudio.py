@@ -97,6 +97,13 @@ class Transforms:
             found[name] = path and reading.required_file(path, f"the file of {key} of frame {name} in {self.path}")
         return reading.for_all(found, self.path, f"a {key}") if for_every else list(found.values())
 
+    def masks(self) -> list[Path | None]:
+        """The masks of any of the frames; warns of other keys that may mean masks."""
+        others = {key for frame in self.frames for key in frame} - {"mask_path"} | set(self.content)
+        if ignored := sorted(key for key in others if "mask" in key.lower()):
+            log.warning("%s: masks are the mask_path of a frame; ignored: %s", self.path, ", ".join(ignored))
+        return self.files("mask_path", for_every=False)
+
     def points_file(self) -> Path | None:
         """The file of ``ply_file_path``; None if there is none."""
         name = self.content.get("ply_file_path")
@@ -249,6 +256,7 @@ class NerfstudioDataManager(RecordedDataManager):
 
     settings: NerfstudioSettings
     name = "nerfstudio"
+    masks_at = "mask_path of each frame"
     unit = "unknown"
 
     @classmethod
@@ -274,7 +282,7 @@ class NerfstudioDataManager(RecordedDataManager):
         reading.required_file(file, "a folder with a transforms.json", "Check the path")
         trajectory = nerfstudio_poses.read(file)
         transforms = Transforms(file, trajectory.names_or_numbers(), settings.outside_files)
-        images, masks = transforms.images(), transforms.files("mask_path", for_every=False)
+        images, masks = transforms.images(), transforms.masks()
         depths, depth_step = transforms.depths(settings.depth_unit_scale_factor)
         confidences = transforms.files("confidence_file_path", for_every=True)
         if any(confidences) and not any(depths):

@@ -9,7 +9,7 @@ from pathlib import Path
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import candidates
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, TIFF_SUFFIXES, inventory
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, inventory
 from coliags_plugin.geometry.lenses.vicalib import calibration_files
 from coliags_plugin.geometry.poses.trajectory import natural_order
 
@@ -17,8 +17,6 @@ log = logging.getLogger(__name__)
 
 #: Suffixes of video files, in lower case.
 _VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
-#: Of images that may be the frames of one, in lower case.
-_FRAME_SUFFIXES = IMAGE_SUFFIXES | TIFF_SUFFIXES | {".bmp"}
 
 
 def formats() -> list[str]:
@@ -55,9 +53,8 @@ def find_format(path: Path) -> str:
 
 def videos_in(folder: Path) -> list[Path]:
     """The videos of a recording's folder in natural order; none where images are there and no calibration file."""
-    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
-    if any(path.suffix.lower() in _FRAME_SUFFIXES for path in files) and not calibration_files(folder):
+    videos = files_in(folder, _VIDEO_SUFFIXES)
+    if files_in(folder, FRAME_SUFFIXES) and not calibration_files(folder):
         return []
     return [videos[index] for index in natural_order([path.name for path in videos])]
 

@@ -19,12 +19,12 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.images import sizes_text
+from coliags_plugin.core.images import has_alpha, sizes_text
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import parallel_map
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, StoredFrame, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import (
@@ -58,6 +58,8 @@ class RecordedDataManager(DataManager):
     fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
     #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
+    #: Where the format has masks, for messages.
+    masks_at: ClassVar[str] = "no files of masks for frames"
     #: Unit of length of the dataset's files, where a scene states none.
     unit: ClassVar[Unit] = "mm"
 
@@ -163,6 +165,22 @@ class RecordedDataManager(DataManager):
             change = "--set datamanager.width=W --set datamanager.height=H sets another size"
             log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
+        self._tell_masks(recording.shots, path)
+
+    def _tell_masks(self, shots: Sequence[Shot], path: Path) -> None:
+        """Log how many frames have masks, as files or alpha channels; warn where some have none, and of unused ones."""
+        masks = [shot.mask for shot in shots if shot.mask is not None]
+        if masks:
+            level = logging.INFO if len(masks) == len(shots) else logging.WARNING
+            log.log(level, "%s: %d of %d frames have a mask", path, len(masks), len(shots))
+        if alpha := sum(has_alpha(shot.image) for shot in shots):
+            said = "%s: %d of %d images have an alpha channel: pixels of alpha below 128 are masked"
+            log.info(said, path, alpha, len(shots))
+        used = {part for mask in masks for part in (mask, *mask.parents)}
+        for file in path.iterdir():
+            is_image = file.is_dir() or file.suffix.lower() in FRAME_SUFFIXES
+            if file.stem.lower() in ("mask", "masks") and is_image and file not in used:
+                log.warning("%s is not used: format %s reads %s", file, self.name, self.masks_at)
 
     def _valid_seen_masks(
         self, recording: Recording, train: Sequence[int], test: Sequence[int], path: Path

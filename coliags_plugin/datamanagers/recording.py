@@ -17,10 +17,10 @@ from torch import Tensor
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.images import read_alpha, read_rgb
 from coliags_plugin.core.scenes import Frame, PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.files import numbered
-from coliags_plugin.datamanagers.reading.images import DepthFormat, read_gray, read_mask
+from coliags_plugin.datamanagers.reading.images import DepthFormat, all_of, read_gray, read_mask
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 
@@ -37,10 +37,15 @@ class Shot:
     camera_to_world: Float[np.ndarray, "4 4"]  # rigid, OpenCV axes, scene units
     depth: Path | None = None
     depth_format: DepthFormat | None = None
-    mask: Path | None = None  # black pixels are ignored
+    mask: Path | None = None  # black pixels are ignored, besides those that the image's alpha channel hides
     seen: Path | None = None  # not black where training frames see the same surface; set where a scene is loaded
     sparse_depth: SparseDepth | None = None  # at single points of the working image
     confidence: Path | None = None  # 8-bit grey, of the depth file's size: how far depth can be trusted, 255 = 1
+
+    def shown(self) -> Bool[np.ndarray, "H W"] | None:
+        """Pixels of the stored image that its alpha channel does not hide; None where it hides none."""
+        shown = read_alpha(self.image)
+        return None if shown is None else self.rectification.checked(self.image, shown)
 
 
 def make_shots(
@@ -252,11 +257,12 @@ def _image(frame: StoredFrame) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _mask(frame: StoredFrame) -> Bool[np.ndarray, "H W"] | None:
-    shot, valid = frame._shot, frame._shot.rectification.valid
-    if shot.mask is None:
-        return valid
-    own = shot.rectification.sampled(shot.mask, read_mask(shot.mask))
-    return own if valid is None else own & valid
+    shot, rectification = frame._shot, frame._shot.rectification
+    given = None if shot.mask is None else rectification.sampled(shot.mask, read_mask(shot.mask))
+    shown = shot.shown()
+    if shown is not None:  # working pixels that mix in the colour of a hidden one are hidden, too
+        shown = rectification.image(shown.astype(np.uint8) * 255) == 255
+    return all_of(rectification.valid, given, shown)
 
 
 def _depth(frame: StoredFrame) -> Shaped[np.ndarray, "H W"] | None:

@@ -113,9 +113,10 @@ class Rectification:
         """A stored image, unchanged, after a check of its size."""
         height, width = image.shape[:2]
         if (width, height) != (self.lens.width, self.lens.height):
+            is_turned = (height, width) == (self.lens.width, self.lens.height)
             raise InputError(
                 f"{path} is {width} x {height}, but {self.described_by} says {self.lens.width} x {self.lens.height}",
-                "images of one size, that of their intrinsics",
+                "images of one size, that of their intrinsics" + "; EXIF's orientation is not applied" * is_turned,
                 "Write that image again, or correct the size in that file",
             )
         return image

@@ -170,7 +170,7 @@ class ReimNerfDataManager(RecordedDataManager):
             },
         }
         return Recording(
-            kind="REIM-NeRF layout",
+            kind=f"REIM-NeRF layout, {'no mask' if mask is None else f'all masked by {MASK_FILE}'}",
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, large, (*files.values(), mask)),

@@ -90,6 +90,7 @@ class RGBDDataManager(RecordedDataManager):
 
     settings: RGBDSettings
     name = "rgbd"
+    masks_at = "mask/NAME.png or masks/NAME.png"
     unit = "unknown"
     #: Whether this format's camera is that of a calibration file.
     is_calibrated: ClassVar[bool] = False
@@ -304,17 +305,17 @@ class EndoMapperDataManager(RGBDDataManager):
 
 
 def _files(folder: Path, names: tuple[str, ...], suffixes: frozenset[str]) -> tuple[Path | None, list[Path]]:
-    """The only folder of one of these names, and its files, unordered; None and none without such a folder."""
+    """The only folder of one of these names, and its files; None and none without such a folder."""
     folders = [folder / name for name in names if (folder / name).is_dir()]
     if len(folders) > 1:
         listed = " and ".join(f"{path.name}/" for path in folders)
         raise InputError(f"{folder} holds {listed}", "only one of them", "Move the other away")
-    files = [path for found in folders for path in found.iterdir() if path.suffix.lower() in suffixes]
+    files = [path for found in folders for path in reading.files_in(found, suffixes)]
     return next(iter(folders), None), files
 
 
 def _find_images(folder: Path) -> list[Path]:
-    """The colour images, unordered; there must be one folder of them."""
+    """The colour images; there must be one folder of them."""
     reading.require_folder(folder, EXPECTED)
     image_folder, images = _files(folder, IMAGE_FOLDERS, reading.IMAGE_SUFFIXES)
     if image_folder is None:
@@ -338,9 +339,10 @@ def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path
 
     The folder must have one for every image; ``what`` they are is for the error.
     """
-    file_folder, files = _files(folder, names, reading.IMAGE_SUFFIXES)
-    by_stem = {path.stem: path for path in files}
-    found = {image.name: by_stem.get(image.stem) for image in images}
+    file_folder, _ = _files(folder, names, reading.FRAME_SUFFIXES)
+    found = dict.fromkeys([image.name for image in images])
+    if file_folder is not None:
+        found = reading.sidecar_files(file_folder, [*found], reading.MASK_SUFFIXES)
     return reading.for_all(found, file_folder, f"a {what}", or_none=file_folder is None)
 
 

@@ -11,12 +11,12 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, link_or_copy, make_folder, refuse_overlap, write_json
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES
 from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.pipeline.contents import SubmapContents, common_frames, read_contents
 from coliags_plugin.pipeline.context import Submap
-from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES
 
 #: Name of the record of an export, and version of its schema.
 MANIFEST, _FORMAT = "manifest.json", 1
@@ -113,4 +113,4 @@ def _copy(files: Sequence[tuple[Path, str]], folder: Path, copy: Callable[[Path,
     for parent in {(folder / place).parent for _, place in files}:
         make_folder(parent)
     for file, place in files:
-        (copy if file.suffix in IMAGE_SUFFIXES else shutil.copyfile)(file, folder / place)
+        (copy if file.suffix.lower() in FRAME_SUFFIXES else shutil.copyfile)(file, folder / place)

@@ -18,13 +18,14 @@ from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.images import write_image
+from coliags_plugin.core.images import has_alpha, read_8_bit, write_image
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES
 from coliags_plugin.datamanagers.recognition import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
 from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field
 from coliags_plugin.pipeline.settings import FrameSettings
-from coliags_plugin.reconstruction.structure.image_files import IMAGE_SUFFIXES, file_names, list_images, read_image
+from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, read_image
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, camera_of_lens
 
 if TYPE_CHECKING:
@@ -108,10 +109,20 @@ class FrameSource:
             yield name, self.span.shown(image)
 
     def _of_images(self) -> Iterator[tuple[Path, str, UInt8[np.ndarray, "H W 3"]]]:
-        images = list_images(self.path)
-        named = list(zip(file_names([path.stem for path in images], ""), images, strict=True))
+        named = [*self._images.items()]
         for name, path in named[self.span.first :][: self.span.count(len(named))]:
             yield path, name, read_image(path)
+
+    @cached_property
+    def _images(self) -> dict[str, Path]:
+        """Image files of a folder by name."""
+        images = list_images(self.path)
+        return dict(zip(file_names([path.stem for path in images], ""), images, strict=True))
+
+    def with_alpha(self, name: str, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W C"]:
+        """A frame with the alpha channel of its image file, if it has one."""
+        path = None if self.videos else self._images[name]
+        return image if path is None or not has_alpha(path) else np.dstack([image, read_8_bit(path)[..., 3:]])
 
     def _of_videos(self) -> Iterator[tuple[Path, str, UInt8[np.ndarray, "H W 3"]]]:
         """Files, names and frames. Where a file ends too early, and another one follows, black ones."""
@@ -217,7 +228,7 @@ def frame_source(path: Path, span: Span = Span()) -> FrameSource:
         return FrameSource(path, span)
     if not path.exists():
         raise InputError(f"no {path}", "a video file, or a folder of images", "Check the path")
-    if path.suffix.lower() in IMAGE_SUFFIXES:
+    if path.suffix.lower() in FRAME_SUFFIXES:
         raise InputError(f"{path} is a single image", "a video file, or a folder of images", "Give its folder")
     _opened(path).release()
     return FrameSource(path, span, (path,))

@@ -15,6 +15,7 @@ from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.settings import read_validated
+from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.pipeline.frame_selection import (
     RESTING,
     THINNED,
@@ -27,7 +28,6 @@ from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FEWEST, FrameSettings
 from coliags_plugin.pipeline.stages import MADE
 from coliags_plugin.pipeline.survey import Survey
-from coliags_plugin.reconstruction.structure.image_files import read_mask
 
 #: Names within the folder.
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
@@ -80,7 +80,7 @@ def write_frames(
     By a survey of these frames, whose mask is used unless one is given. Replaces the folder; returns a summary of one
     line.
     """
-    given = None if mask is None else read_mask(mask)
+    given = None if mask is None else read_mask(mask, colored=True)
     sharpnesses, size, total = survey.sharpness.tolist(), survey.size, len(survey)
     if given is not None and given.shape != size:
         raise InputError(
@@ -101,7 +101,7 @@ def write_frames(
                 continue
             last = gray
             kept.append((index, name))
-            write_image(scratch / IMAGES / f"{name}.png", image)
+            write_image(scratch / IMAGES / f"{name}.png", source.with_alpha(name, image))
         blurred &= {index for index, _ in kept}
         reasons = [f"{len(blurred)} blurred, of use for poses alone"] if blurred else []
         why = ", ".join([*reasons, *(f"{n} {reason}" for reason, n in sorted(Counter(dropped.values()).items()))])

@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 #: Name of the file in the reconstruction's folder.
 SURVEY_FILE = "survey.npz"
 _ARRAYS = ("sharpness", "followed", "motion", "checksums")
+#: Brightness of all pixels below which frames show nothing, of 255: that of 12 bits in 16.
+_DARK = 16
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
 _FEWEST_STILL = 10
 #: Most frames of a video: a day at 60 a second.
@@ -119,6 +121,12 @@ class FrameSurvey:
         if self._sum is None:
             raise InputError(f"no frames in {self.path}", "a video")
         darkest, brightest = self._extremes
+        if (top := int(brightest.max())) < _DARK:
+            raise InputError(
+                f"no pixel of the {len(self.sharpnesses)} frames of {self.path} is brighter than {top} of 255",
+                "images that use the range of their 8 or 16 bits",
+                "Multiply them by 16 if they are of 12 bits in 16",
+            )
         inside, count = lens_mask(brightest.max(axis=2)), len(self.sharpnesses)
         mask = np.ones(self.size, bool) if inside is None else inside
         if count >= _FEWEST_STILL:

@@ -181,15 +181,36 @@ def test_a_rig_of_two_cameras(tmp_path):
         np.testing.assert_allclose(np.linalg.inv(pose)[:3], expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("pattern", ["{}.png.png", "{}.png"])
-def test_masks_in_both_ways_of_naming_them(mine, pattern):
-    (mine / "masks").mkdir()
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "masks/{}.png.png",
+        "masks/{}.png",
+        "mask/{}.png",
+        "masks/{}.PNG",
+        "masks/{}.png.JPG",
+        "masks/{}.jpg",
+        "mask/{}.tif",
+    ],
+)
+def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    mask[:10, :20] = 0
-    cv2.imwrite(str(mine / "masks" / pattern.format(1)), mask)
+    mask[:8, :16] = 0
+    (mine / pattern).parent.mkdir()
+    cv2.imwrite(str(mine / pattern.format(1)), mask)
+    (mine / pattern.format("1").replace("/", "/._")).touch()  # macOS's
     scene = load(mine)
+    assert f"1 of {COUNT} frames have a mask" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
     assert scene.train[1].mask is None and scene.provenance["masks"] == 1
+
+
+@pytest.mark.parametrize("name", ["1_mask.png", "frames/1.png", "1.png.txt"])
+def test_masks_of_no_image_are_refused(mine, name):
+    (mine / "masks" / name).parent.mkdir(parents=True)
+    (mine / "masks" / name).touch()
+    with pytest.raises(InputError, match=r"masks holds .*no mask of any image.*0\.png\.png"):
+        load(mine)
 
 
 def test_depth_files(mine):

@@ -206,6 +206,67 @@ def test_a_wide_view_is_masked_where_the_lens_shows_nothing(walls, name):
         assert whole.mask is None or whole.mask.sum() > frame.mask.sum()
 
 
+def paint_alpha(pattern: str, alpha: np.ndarray) -> Spoil:
+    """Give all images an alpha channel, and a glaring colour where it is 0."""
+
+    def paint(pixels: np.ndarray) -> np.ndarray:
+        return np.dstack([np.where(alpha[..., None] == 0, np.uint8([255, 0, 255]), pixels[..., :3]), alpha])
+
+    return lambda folder: [repaint(pattern, place, paint)(folder) for place in range(len(files(folder, pattern)))]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_alpha_is_a_mask_and_said_once(copied, caplog, name):
+    caplog.set_level(logging.INFO)
+    folder, kind = copied(name), KINDS[name]
+    before = load(folder, name).train[0]
+    assert "an alpha channel" not in caplog.text
+    height, width = cv2.imread(str(files(folder, kind.images)[0])).shape[:2]
+    alpha = np.full((height, width), 255, np.uint8)
+    paint_alpha(kind.images, alpha)(folder)
+    opaque = load(folder, name).train[0]
+    assert equal(before, opaque) and (opaque.mask is None) == (before.mask is None)
+    alpha[:, : width // 4], alpha[:, width // 4 : width // 2], alpha[:, width // 2 :] = 0, 127, 128
+    paint_alpha(kind.images, alpha)(folder)
+    caplog.clear()
+    frame = load(folder, name).train[0]
+    assert sum("alpha below 128" in record.getMessage() for record in caplog.records) == 1
+    middle = frame.mask.shape[1] // 2
+    if not kind.is_undistorted:  # else the middle of the working image may be beside that of the stored one
+        expected = before.valid & torch.from_numpy(alpha >= 128)
+        assert torch.equal(frame.mask, expected)
+    assert not frame.mask[:, : middle - 4].any() and frame.mask.any()
+    assert torch.equal(frame.mask[:, middle + 4 :], before.valid[:, middle + 4 :])
+    assert frame.depth is None or torch.isnan(frame.depth[~frame.mask]).all()
+
+
+@pytest.mark.parametrize("size", [(20, 16), (80, 64), (33, 29)])
+@pytest.mark.parametrize("name", ["nerfstudio", "c3vd-raw"])
+def test_no_working_pixel_mixes_in_the_colour_of_a_hidden_one(copied, name, size):
+    folder, pattern = copied(name), KINDS[name].images
+    shape = cv2.imread(str(files(folder, pattern)[0])).shape
+    hidden = np.random.default_rng(0).uniform(size=shape[:2]) < 0.02
+    alpha = np.where(hidden, np.uint8(0), np.uint8(255))
+    for place in range(len(files(folder, pattern))):
+        repaint(pattern, place, lambda pixels: np.full(shape, (0, 200, 0), np.uint8))(folder)
+    paint_alpha(pattern, alpha)(folder)
+    frame = load(folder, name, width=size[0], height=size[1]).train[0]
+    off = (frame.image[frame.mask].int() - torch.tensor([0, 200, 0])).abs()
+    assert 0.05 < frame.mask.float().mean() < 1.0 and off.max() <= 1  # of rounding
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_masks_that_are_not_used_are_named(copied, caplog, name):
+    folder = copied(name)
+    place = folder / ("masks.png" if name == "endomapper" or name.startswith("rgbd") else "Masks")
+    if place.suffix:  # masks/ is what these read
+        cv2.imwrite(str(place), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    else:
+        place.mkdir()
+    load(folder, name)
+    assert f"{place} is not used: format {KINDS[name].format} reads" in caplog.text
+
+
 # Seen masks
 
 

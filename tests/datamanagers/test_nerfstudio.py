@@ -186,6 +186,18 @@ def test_depth_files_of_other_writers(walls, copied, caplog, key, said, options,
         torch.testing.assert_close(read, factor * expected, equal_nan=True)
 
 
+@pytest.mark.parametrize("change", [{"mask_path": "m.png"}, {"masks": "masks/"}])
+@pytest.mark.parametrize("of_frames", [False, True])
+def test_masks_under_another_key_are_named(mine, caplog, change, of_frames):
+    if of_frames:
+        change = {f"{key}_1": value for key, value in change.items()}
+        change_frames(FILE, lambda index, entry: entry.update(change if index == 3 else {}))(mine)
+    else:
+        change_json(FILE, **change)(mine)
+    load(mine)
+    assert f"masks are the mask_path of a frame; ignored: {next(iter(change))}" in caplog.text
+
+
 def test_masks_of_some_frames(mine):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[5:20, 3:9] = 0

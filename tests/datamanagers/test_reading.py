@@ -6,12 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.images import read_8_bit, read_alpha, read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import named_file, numbered, short_names
@@ -25,13 +26,123 @@ from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
     ("reader", "pixels", "message"),
     [
         (read_rgb, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
-        (read_mask, np.zeros((4, 4), np.uint16), "1 channel of uint16.*8-bit mask"),
+        (read_mask, np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "colour image.*8 or 16 bits: one channel"),
+        (read_mask, np.arange(16, dtype=np.uint8).reshape(4, 4), "values reach from 0 to 15 of 255"),
     ],
 )
 def test_the_wrong_kind_of_image(tmp_path, reader, pixels, message):
     cv2.imwrite(str(tmp_path / "x.png"), pixels)
     with pytest.raises(InputError, match=message):
         reader(tmp_path / "x.png")
+
+
+#: Left of the middle hidden, transparency in the middle 127 and 128 of 255.
+ALPHA = np.array([[0, 0, 127, 128, 255, 255]] * 4, np.uint8)
+COLORS = np.full((4, 6, 3), (200, 100, 10), np.uint8)
+GREY = COLORS[..., 1]
+
+
+def with_alpha(*channels: np.ndarray, dtype=np.uint8) -> np.ndarray:
+    return np.dstack([*channels, ALPHA]).astype(dtype) * (257 if dtype == np.uint16 else 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "options", "binary"),
+    [
+        ("rgba.png", with_alpha(COLORS), {}, False),
+        ("rgba.webp", with_alpha(COLORS), {"lossless": True, "exact": True}, False),
+        ("rgba.tif", with_alpha(COLORS), {}, False),
+        ("la.png", with_alpha(GREY), {}, False),
+        ("palette.png", np.uint8(ALPHA < 128), {"transparency": 1}, False),
+        ("key.png", np.where(ALPHA[..., None] < 128, np.uint8(0), COLORS), {"transparency": (0, 0, 0)}, False),
+        ("16.png", with_alpha(COLORS[..., ::-1], dtype=np.uint16), None, False),
+        ("16.tif", with_alpha(COLORS[..., ::-1], dtype=np.uint16), None, False),
+        ("opaque.png", np.dstack([COLORS, ALPHA | 128]), {}, True),
+        ("rgb.png", COLORS, {}, True),
+        ("grey.png", GREY, {}, True),
+        ("rgb.jpg", COLORS, {}, True),
+    ],
+)
+def test_alpha_below_half_is_a_mask(tmp_path, name, pixels, options, binary):
+    path = tmp_path / name
+    if options is None:
+        cv2.imwrite(str(path), pixels)
+    else:
+        image = PIL.Image.fromarray(pixels)
+        if name == "palette.png":
+            image = PIL.Image.fromarray(pixels).convert("P")
+            image.putpalette([200, 100, 10, 255, 0, 255])
+        image.save(path, **options)
+    mask = read_alpha(path)
+    assert mask is None if binary else (mask == (ALPHA >= 128)).all()
+    color = (100, 100, 100) if "la" in name or "grey" in name else (200, 100, 10)
+    read = read_8_bit(path)
+    np.testing.assert_allclose(read[:, 4:, :3], np.broadcast_to(color, (4, 2, 3)), atol=1)
+    assert read.dtype == np.uint8
+
+
+WHITE = np.repeat(np.uint8([0, 255]), 32)[None].repeat(48, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "stored"),
+    [
+        ("a.png", WHITE),
+        ("a.png", WHITE // 255),  # 0 and 1
+        ("a.png", WHITE // 64),  # 0 and 3
+        ("a.png", np.dstack([WHITE] * 3)),
+        ("a.png", np.dstack([WHITE] * 4)),  # the same by colour and by transparency
+        ("a.png", np.dstack([np.full_like(WHITE, 255)] * 3 + [WHITE])),
+        ("a.png", WHITE.astype(np.uint16) * 257),
+        ("a.png", WHITE.astype(np.uint16)),  # 8 bits in 16
+        ("a.png", WHITE.astype(np.uint16) // 255),
+        ("a.tif", WHITE),
+        ("a.bmp", WHITE),
+        ("a.jpg", WHITE),
+        ("a.png", cv2.GaussianBlur(WHITE, (0, 0), 2.0)),
+        ("a.png", cv2.GaussianBlur(WHITE.astype(np.uint16) * 257, (0, 0), 2.0)),
+    ],
+)
+@pytest.mark.parametrize("quality", [40, 95])
+def test_a_mask_is_what_is_at_least_half_white(tmp_path, name, stored, quality):
+    cv2.imwrite(str(tmp_path / name), stored, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    np.testing.assert_array_equal(read_mask(tmp_path / name), WHITE > 0)
+
+
+def test_masks_of_one_value_of_one_bit_and_of_a_colour(tmp_path):
+    for value in (0, 1, 255):
+        cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 4), value, np.uint8))
+        assert (read_mask(tmp_path / "a.png") == (value > 0)).all()
+    PIL.Image.fromarray(WHITE > 0).save(tmp_path / "bit.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "bit.png"), WHITE > 0)
+    cv2.imwrite(str(tmp_path / "red.png"), np.dstack([WHITE * 0, WHITE * 0, WHITE // 2]))
+    np.testing.assert_array_equal(read_mask(tmp_path / "red.png", colored=True), WHITE > 0)
+    with pytest.raises(InputError, match=r"red\.png is a colour image"):
+        read_mask(tmp_path / "red.png")
+
+
+def test_what_holds_several_images_or_another_format_is_refused_by_name(tmp_path):
+    one, small = (PIL.Image.fromarray(COLORS[: 4 // n]) for n in (1, 2))
+    for name, others, count in (("a.tif", [one] * 3, 4), ("a.png", [PIL.Image.fromarray(COLORS // 2)], 2)):
+        one.save(tmp_path / name, save_all=True, append_images=others)
+        with pytest.raises(InputError, match=f"{name} holds {count} images. Expected one image in a file"):
+            read_rgb(tmp_path / name)
+    one.save(tmp_path / "preview.tif", save_all=True, append_images=[small])
+    np.testing.assert_array_equal(read_rgb(tmp_path / "preview.tif"), COLORS)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    with pytest.raises(InputError, match=r"a\.heic .* is HEIF \(\.heic, \.avif\): convert it"):
+        read_rgb(tmp_path / "a.heic")
+    with pytest.raises(InputError, match=r"float32\. Expected an image of 8 or 16 bits"):
+        cv2.imwrite(str(tmp_path / "f.tif"), COLORS.astype(np.float32))
+        read_8_bit(tmp_path / "f.tif")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+def test_the_orientation_in_exif_is_ignored_by_all_readers(tmp_path, suffix):
+    exif = PIL.Image.Exif()
+    exif[0x112] = 6
+    PIL.Image.fromarray(COLORS).save(tmp_path / f"a{suffix}", exif=exif)
+    assert read_rgb(tmp_path / f"a{suffix}").shape == read_8_bit(tmp_path / f"a{suffix}").shape == (4, 6, 3)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".jpg"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_rgb, write_mask
+from coliags_plugin.core.images import read_alpha, read_rgb, write_image, write_mask
 from coliags_plugin.pipeline.frame_selection import motion, reduced
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.frames import read_blurred, read_lens_mask, write_frames
@@ -68,6 +68,24 @@ def test_the_mask_is_found_or_given(tmp_path):
     with pytest.raises(InputError, match=r"small.png is 160 x 50, the frames 160 x 120"):
         write(source, tmp_path / "no", FrameSettings(), tmp_path / "small.png")
     assert not (tmp_path / "no").exists()
+
+
+def test_frames_keep_the_alpha_channel_of_their_images(tmp_path):
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[:, :30] = 0
+    source = frame_source(write_images(tmp_path / "film", [np.dstack([frame, alpha]) for frame in FILM]))
+    write(source, tmp_path / "out", FrameSettings())
+    for index in range(len(FILM)):
+        path = tmp_path / f"out/images/{index}.png"
+        np.testing.assert_array_equal(read_rgb(path), FILM[index])
+        np.testing.assert_array_equal(read_alpha(path), alpha > 0)
+
+
+def test_images_of_12_bits_in_16_are_refused(tmp_path):
+    for index, frame in enumerate(FILM[:4]):
+        write_image(tmp_path / f"{index}.png", frame.astype(np.uint16) * 16)
+    with pytest.raises(InputError, match=r"no pixel of the 4 frames of .* is brighter than 14 of 255.*by 16"):
+        survey_video(frame_source(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,11 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.morphology import eroded
+from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.frame_sources import opened_recording
-from coliags_plugin.reconstruction.structure.image_files import read_mask
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, Start, starting_cameras
 from tests import commands
 from tests.layouts.endomapper import calibration_text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.images import read_rgb, write_image
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
@@ -23,7 +24,7 @@ from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
+from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, mask_of, masks_for
 from coliags_plugin.reconstruction.structure.sfm import (
     Reconstruction,
     distances_beside,
@@ -305,6 +306,49 @@ def test_folders_without_images_are_refused(tmp_path):
 # Images, masks and settings
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".bmp"])
+@pytest.mark.parametrize("kind", ["grey", "16 bits", "alpha"])
+def test_images_are_written_as_readers_take_them(atlas, found, tmp_path, suffix, kind):
+    if suffix in {"grey": (), "16 bits": (".jpg", ".bmp"), "alpha": (".jpg", ".bmp")}[kind]:
+        return
+    change = {
+        "grey": lambda rgb: rgb[..., 1],
+        "16 bits": lambda rgb: rgb.astype(np.uint16) * 257,
+        "alpha": lambda rgb: np.dstack([rgb, np.where(np.arange(rgb.shape[1]) < 40, 0, 255)[None].repeat(len(rgb), 0)]),
+    }[kind]
+    expected = {path.stem: read_rgb(path) for path in found.images}
+    images = [tmp_path / f"{stem}{suffix}" for stem in expected]
+    for path, rgb in zip(images, expected.values(), strict=True):
+        pixels = change(rgb)
+        write_image(path, pixels.astype(np.uint8) if kind == "alpha" else pixels)
+    model = pycolmap.Reconstruction(found.model)
+    for image in model.images.values():
+        image.name = Path(image.name).stem + suffix
+    names = tuple(path.name for path in images)
+    changed = replace(found, model=model, images=tuple(images), names=names)
+    write_sfm_scene(tmp_path / "scene", replace(atlas, images=tuple(images), models=(changed,)))
+    scene = open_scene(tmp_path / "scene", options=["split=all-train"])
+    for frame in scene.train:
+        rgb = expected[frame.name]
+        rgb = np.dstack([rgb[..., 1]] * 3) if kind == "grey" else rgb
+        np.testing.assert_allclose(frame.image.numpy().astype(int), rgb, atol=12 if suffix == ".jpg" else 0)
+        assert frame.mask is None if kind != "alpha" else (~frame.mask[:, :40]).all() and frame.mask[:, 40:].all()
+
+
+def test_what_hides_in_a_folder_of_images_and_what_is_not_read(tmp_path, caplog):
+    for name in ("1.png", "2.JPG", "._1.png", "._2.JPG", "Thumbs.db", ".DS_Store", "3.webp"):
+        (tmp_path / name).touch()
+    assert [path.name for path in list_images(tmp_path)] == ["1.png", "2.JPG", "3.webp"]
+    assert not caplog.records
+    for index in range(4, 9):
+        (tmp_path / f"{index}.HEIC").touch()
+    assert len(list_images(tmp_path)) == 3 and "5 images are not read, as 4.HEIC: convert them" in caplog.text
+    for path in list_images(tmp_path):
+        path.unlink()
+    with pytest.raises(InputError, match=r"holds 0 images .*4\.HEIC"):
+        list_images(tmp_path)
+
+
 def test_images_are_ordered_as_people_count(tmp_path):
     for name in ("10.PNG", "9.jpg", "a.txt", "8.jpeg"):
         (tmp_path / name).touch()
@@ -322,6 +366,10 @@ def test_masks_of_a_file_and_of_a_folder(tmp_path):
     assert not masks[images[0]].any()
     assert masks[images[1]].all()
     assert masks_for(tmp_path / "masks" / "b.png", images).all()
+    transparent = np.dstack([white, np.uint8([[0, 0, 0, 255, 255, 255]] * 4)])
+    write_image(tmp_path / "b.png", transparent)
+    np.testing.assert_array_equal(mask_of(tmp_path / "b.png", masks[images[1]]), transparent[..., 3] > 0)
+    np.testing.assert_array_equal(mask_of(tmp_path / "b.png", None), transparent[..., 3] > 0)
     with pytest.raises(InputError, match=r"has no mask for c.jpg. Expected c.jpg.png or c.png"):
         masks_for(tmp_path / "masks", [Path("c.jpg")])
 

@@ -7,8 +7,9 @@ import logging
 import os
 import posixpath
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -22,8 +23,38 @@ log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
+#: Of files that may be the frames of a video, or masks of them.
+FRAME_SUFFIXES = IMAGE_SUFFIXES | TIFF_SUFFIXES | {".bmp", ".webp"}
+#: Of masks; the first counts where there are several.
+MASK_SUFFIXES = (".png", *sorted(FRAME_SUFFIXES - {".png"}))
 DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
 ARRAY_SUFFIXES = frozenset({".npy"})
+
+
+def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Files of a folder with one of some suffixes in either case, by name; no hidden ones, as macOS's ``._1.png``."""
+    files = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith("."))
+    return sorted(path for path in files if path.is_file())
+
+
+def sidecar_files(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> dict[str, Path | None]:
+    """Files of images by name, as masks: ``a.jpg.png``, as COLMAP names them, or ``a.png``; None where missing.
+
+    The first of ``suffixes`` counts where there are several.
+    """
+
+    @cache
+    def held(parent: Path) -> dict[str, Path]:
+        if not parent.is_dir():
+            return {}
+        return {path.stem: path for suffix in reversed(suffixes) for path in files_in(parent, (suffix,))}
+
+    files: dict[str, Path | None] = {}
+    for name in names:
+        places = [folder / name, folder / name.replace("\\", "/")]  # the second: a name of Windows
+        found = [held(p.parent).get(p.name) or held(p.parent).get(p.stem) for p in places]
+        files[name] = found[0] or found[1]
+    return files
 
 
 def require_folder(folder: Path, expected: str) -> None:
@@ -174,8 +205,8 @@ def unposed_images(used: Sequence[Path], excluded: Iterable[Path | None] = ()) -
     return [
         path
         for folder in dict.fromkeys(path.parent for path in used)
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in suffixes and path not in known and path.is_file()
+        for path in files_in(folder, suffixes)
+        if path not in known
     ]
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.files import first_few
+from coliags_plugin.datamanagers.reading.files import files_in, first_few
 from coliags_plugin.datamanagers.reading.images import depth_format
 from coliags_plugin.datamanagers.rotatecolon import read_exr_channel
 from coliags_plugin.reconstruction.depth.views import Map, Mask
@@ -99,7 +99,7 @@ class FilePrior:
         """The prior of a folder with one map of each frame, named as the frame, of its aspect ratio."""
         if not folder.is_dir():
             raise InputError(f"--prior {folder}: no such folder", "a folder of depth maps named as the images")
-        files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
+        files = {path.stem: path for path in files_in(folder, _SUFFIXES)}
         missing = [frame.name for frame in frames if frame.name not in files]
         if missing:
             raise InputError(

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
-from coliags_plugin.core.images import write_mask
+from coliags_plugin.core.files import atomic_folder, atomic_write, link_or_copy, write_json
+from coliags_plugin.core.images import decode_image, encode_image, read_8_bit, write_mask
 from coliags_plugin.datamanagers.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
-from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.outputs.image_files import encode_jpeg, write_png
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
 
@@ -33,14 +33,14 @@ def write_sfm_scene(
     units: Sequence[Unit] = (),
     link: bool = False,
 ) -> None:
-    """Write a scene in COLMAP's layout: copies of the posed images, masks, the unit, and the models, largest first.
+    """Write a scene in COLMAP's layout: the posed images as 8-bit RGB, masks, the unit, and the models, largest first.
 
     ``atlas.json`` tells which images each model has, how good it is, and why the other images have no pose;
     ``atlas.png`` shows it. ``units`` are those of the models, unknown where not given: each has then one of its own.
     With ``link``, images are second names of the given files, where the disk allows it, and take no space.
     """
     unknown: list[Unit] = ["unknown"] * (len(atlas.models) - len(units))
-    units, copy = [*units, *unknown], link_or_copy if link else shutil.copyfile
+    units, copy = [*units, *unknown], link_or_copy if link else _copy_as_8_bit
     with atomic_folder(folder, overwrite) as scratch:
         (scratch / "images").mkdir()
         for number, reconstruction in enumerate(atlas.models):
@@ -53,6 +53,16 @@ def write_sfm_scene(
         write_unit(scratch, units[0])
         write_json(scratch / ATLAS_FILE, _record(atlas, units))
         write_png(scratch / RIBBON_FILE, draw_ribbon(atlas))
+
+
+def _copy_as_8_bit(source: Path, target: Path) -> None:
+    """Copy an image, or write it as 8-bit RGB if it is grey or of 16 bits."""
+    image = decode_image(source)
+    if image.ndim == 3 and image.dtype == np.uint8:
+        shutil.copyfile(source, target)
+    else:
+        pixels, is_jpeg = read_8_bit(source), target.suffix.lower() in (".jpg", ".jpeg")
+        atomic_write(target, encode_jpeg(pixels, quality=100) if is_jpeg else encode_image(pixels, target.suffix))
 
 
 def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:

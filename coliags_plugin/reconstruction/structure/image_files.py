@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,11 +10,15 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import decode_image
+from coliags_plugin.core.images import read_8_bit, read_alpha
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, MASK_SUFFIXES, files_in, inventory, sidecar_files
+from coliags_plugin.datamanagers.reading.images import all_of, read_mask
 from coliags_plugin.geometry.poses.trajectory import natural_order
 
-#: Suffixes of image files, in lower case.
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+log = logging.getLogger(__name__)
+
+#: Suffixes of images of other programs, which are not read.
+_UNREAD = (".avif", ".dng", ".exr", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".ppm")
 
 #: False where a pixel is ignored: one for all images, or one per image; None where none is.
 Masks = Mapping[Path, Bool[np.ndarray, "H W"]] | Bool[np.ndarray, "H W"] | None
@@ -27,23 +32,22 @@ def list_images(folder: Path) -> list[Path]:
         raise InputError(f"{folder} is a file", "a folder of images", f"{_FFMPEG}, if it is a video")
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", "a folder of images", "Check the path")
-    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    images, unread = files_in(folder, FRAME_SUFFIXES), files_in(folder, _UNREAD)
     if len(images) < 2:
+        seen = f" ({inventory(folder)})" if unread else ""
         raise InputError(
-            f"{folder} holds {len(images)} images",
-            f"at least two ({', '.join(IMAGE_SUFFIXES)})",
+            f"{folder} holds {len(images)} images{seen}",
+            f"at least two ({', '.join(sorted(FRAME_SUFFIXES))})",
             f"Give the folder of the frames; from a video, {_FFMPEG}",
         )
+    if unread:
+        log.warning("%s: %d images are not read, as %s: convert them", folder, len(unread), unread[0].name)
     return [images[index] for index in natural_order([path.name for path in images])]
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as 8-bit RGB, converting other formats."""
-    import cv2
-
-    # Ignore the EXIF orientation, as COLMAP's cameras do.
-    image = decode_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.ascontiguousarray(image[..., ::-1])
+    return np.ascontiguousarray(read_8_bit(path)[..., :3])
 
 
 #: Mean difference of neighbouring images, of 255, up to which one repeats the other: up to 0.3 where a video repeats
@@ -58,32 +62,32 @@ def is_repeated(before: UInt8[np.ndarray, "H W 3"], after: UInt8[np.ndarray, "H 
     return before.shape == after.shape and float(cv2.absdiff(before, after).mean()) <= _SAME
 
 
-def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Read a mask: True where the image is not black."""
-    return np.asarray(read_image(path).max(axis=2) > 0)
-
-
 def masks_for(path: Path, images: Sequence[Path]) -> Masks:
     """Read one mask for all images from a file, or from a folder a mask ``NAME.png`` or ``NAME.jpg.png`` per image."""
     if path.is_file():
-        return read_mask(path)
+        mask = read_mask(path, colored=True)
+        log.info("%s: %.0f %% of all images ignored", path, 100.0 * (1.0 - mask.mean()))
+        return mask
+    files = sidecar_files(path, [image.name for image in images], MASK_SUFFIXES)
     masks = {}
-    for image in images:
-        candidates = (path / f"{image.name}.png", path / f"{image.stem}.png")
-        file = next((candidate for candidate in candidates if candidate.is_file()), None)
+    for image, file in zip(images, files.values(), strict=True):
         if file is None:
             raise InputError(
                 f"{path} has no mask for {image.name}",
-                f"{candidates[0].name} or {candidates[1].name}",
+                f"{image.name}.png or {image.stem}.png",
                 "Give one mask for all images, or a folder with a mask for each",
             )
-        masks[image] = read_mask(file)
+        masks[image] = read_mask(file, colored=True)
+    log.info("%s: a mask for each of %d images", path, len(masks))
     return masks
 
 
 def mask_of(image: Path, masks: Masks) -> Bool[np.ndarray, "H W"] | None:
-    """The mask of an image."""
-    return masks.get(image) if isinstance(masks, Mapping) else masks
+    """The mask of an image, with that of its alpha channel."""
+    mask, shown = masks.get(image) if isinstance(masks, Mapping) else masks, read_alpha(image)
+    if mask is not None and shown is not None and mask.shape != shown.shape:
+        return mask  # which is refused with the image
+    return all_of(mask, shown)
 
 
 def file_names(names: Sequence[str], suffix: str) -> list[str]:

@@ -21,7 +21,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.datamanagers.reading.images import read_mask
+from coliags_plugin.datamanagers.reading.images import all_of, read_mask
 from coliags_plugin.datamanagers.recording import StoredFrame
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -152,10 +152,8 @@ def _view(frame: Frame) -> CoverageView:
         pose = camera.camera_to_world.double().numpy()
         return CoverageView(frame.name, pose, PinholeLens.of(camera.intrinsics), mask, frame.image.numpy)
     shot, rectification = frame.shot, frame.shot.rectification
-    content = rectification.stored_content
-    if shot.mask is not None:
-        mask = rectification.checked(shot.mask, read_mask(shot.mask))
-        content = mask if content is None else mask & content
+    mask = None if shot.mask is None else rectification.checked(shot.mask, read_mask(shot.mask))
+    content = all_of(rectification.stored_content, mask, shot.shown())
     pose = np.asarray(shot.camera_to_world, np.float64)
     return CoverageView(
         shot.name,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import html
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import pytest
 import tests.layouts  # noqa: F401  (registers c3vd-raw)
 from coliags_plugin.api.scenes import make_phantom
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_8_bit, write_image
 from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.surface.coverage.page import RESEARCH_USE
@@ -49,6 +52,17 @@ def test_frames_are_seen_through_the_lens_that_recorded_them(recorded):
     raw = isinstance(views[0].lens, OmnidirectionalLens)
     assert raw == (recorded.name == "c3vd-raw") and (views[0].mask is not None) == raw
     assert views[0].read_image().shape == (views[0].lens.height, views[0].lens.width, 3)
+
+
+def test_hidden_pixels_see_nothing(recorded, tmp_path):
+    scene = Path(shutil.copytree(recorded, tmp_path / "scene"))
+    before = recorded_views(open_recording(recorded))[0]
+    shown = np.arange(before.lens.width) >= 40
+    for path in scene.rglob("*.png"):
+        if (image := read_8_bit(path)).shape[:2] == (before.lens.height, before.lens.width):
+            write_image(path, np.dstack([image, np.broadcast_to(np.uint8(255) * shown, image.shape[:2])]))
+    mask = recorded_views(open_recording(scene))[0].mask
+    np.testing.assert_array_equal(mask, np.broadcast_to(shown, mask.shape) & (before.mask is None or before.mask))
 
 
 def test_the_true_mesh_has_its_true_coverage(recorded, tmp_path):
