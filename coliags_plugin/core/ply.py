@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.text_files import unreadable
+
+log = logging.getLogger(__name__)
+
+#: Names of colours, in lower case.
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
@@ -34,6 +40,32 @@ def read_triangles(path: Path) -> tuple[dict[str, np.ndarray], Int[np.ndarray, "
     if triangles.size and (triangles.min() < 0 or triangles.max() >= len(columns["x"])):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
     return columns, triangles.astype(np.int64)
+
+
+def vertex_colors(path: Path, columns: Mapping[str, np.ndarray]) -> UInt8[np.ndarray, "V 3"] | None:
+    """The colours among vertex properties, of any type, by the usual names; None if there are none."""
+    by_name = {name.lower(): values for name, values in columns.items()}
+    names = next((names for names in _COLORS if by_name.keys() >= set(names)), None)
+    if names is None:
+        return None
+    stored = np.stack([by_name[name] for name in names], axis=1)
+    colors, top = eight_bits(stored)
+    if stored.dtype != np.uint8:
+        log.info("%s: colours are %s, read as 0 to %d", path, stored.dtype, top)
+    return colors
+
+
+def eight_bits(stored: Shaped[np.ndarray, "N C"]) -> tuple[UInt8[np.ndarray, "N C"], int]:
+    """Colours of 8 bits, and the number that stands for full light: what PLY and OBJ leave open, their numbers tell.
+
+    1 of floating-point numbers with a mean up to 1, else 255 of numbers up to that, else 65535.
+    """
+    if stored.dtype == np.uint8:
+        return stored, 255
+    values = np.nan_to_num(stored) if stored.dtype.kind == "f" else stored.astype(np.float64)
+    shares = stored.dtype.kind == "f" and values.size and values.mean() <= 1.0
+    top = 1 if shares else 255 if values.max(initial=0.0) <= 255.0 else 65535
+    return np.rint(np.clip(values * (255.0 / top), 0.0, 255.0)).astype(np.uint8), top
 
 
 def write_ply(

@@ -12,7 +12,7 @@ import torch
 from coliags_plugin.core import bounds
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.ply import read_vertices
+from coliags_plugin.core.ply import read_vertices, vertex_colors
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.reading.files import parallel_map, required_file
@@ -21,7 +21,6 @@ log = logging.getLogger(__name__)
 
 #: Confidence from which on estimated depth makes initial points.
 _TRUSTED = 0.5
-_COLORS = ("red", "green", "blue")
 
 
 def fuse_depth(
@@ -130,11 +129,4 @@ def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     vertices = read_vertices(path)
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    if any(name not in vertices for name in _COLORS):
-        return positions, None
-    colors = np.stack([vertices[name] for name in _COLORS], axis=1)
-    if colors.dtype != np.uint8:
-        # Floating-point colours range from 0 to 1, integers from 0 to 255.
-        scale = 255.0 if np.issubdtype(colors.dtype, np.floating) else 1.0
-        colors = np.rint(np.clip(np.nan_to_num(colors) * scale, 0.0, 255.0)).astype(np.uint8)
-    return positions, colors
+    return positions, vertex_colors(path, vertices)

@@ -10,6 +10,7 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, read_triangles, read_vertices, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.geometry.meshes.files import read_mesh
 
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]
 WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}
@@ -67,11 +68,29 @@ def test_every_form(tmp_path, order, faces, triangles):
                 read_triangles(path)
 
 
-def test_colours_may_be_shares(tmp_path):
-    text = "ply\nformat ascii 1.0\nelement vertex 1\n"
-    text += "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
-    (tmp_path / "p.ply").write_text(f"{text}end_header\n1 2 3 0.5 1.5 nan\n")
-    assert load_points(tmp_path / "p.ply").colors.tolist() == [[128, 255, 0]]
+@pytest.mark.parametrize(
+    ("kind", "stored", "colors"),
+    [
+        ("float", "0.5 1.5 nan", [128, 255, 0]),
+        ("double", "127.6 255 0", [128, 255, 0]),
+        ("ushort", "32896 65535 0", [128, 255, 0]),
+        ("ushort", "128 255 0", [128, 255, 0]),
+        ("int", "300 -5 255", [1, 0, 1]),
+        ("uchar", "1 1 0", [1, 1, 0]),
+    ],
+)
+@pytest.mark.parametrize(
+    "names", ["red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "Red Green Blue"]
+)
+def test_colours_of_every_type_and_name(tmp_path, kind, stored, colors, names):
+    path = tmp_path / "p.ply"
+    properties = "".join(f"property float {name}\n" for name in "xyz")
+    properties += "".join(f"property {kind} {name}\n" for name in names.split())
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}{faces}end_header\n")
+    path.write_text(path.read_text() + f"1 2 3 {stored}\n" * 3 + "3 0 1 2\n")
+    assert load_points(path).colors.tolist() == [colors] * 3
+    assert read_mesh(path).colors.tolist() == [colors] * 3
 
 
 def test_open3d_agrees(tmp_path):

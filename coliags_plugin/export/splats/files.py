@@ -19,6 +19,7 @@ from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.export.splats.cloud import SplatCloud, sigmoid
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
+from coliags_plugin.geometry.meshes.files import linear_light
 
 log = logging.getLogger(__name__)
 
@@ -206,7 +207,7 @@ def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     """Write Gaussians as one primitive of points, float32, with the comment in ``asset.extras``.
 
     Attributes keep the world frame and unit of the cloud, and no node turns them, as in GLB files of meshes. Readers
-    without the extension see plain points in the colours of ``COLOR_0``.
+    without the extension see plain points in the colours of ``COLOR_0``, linear light as in all of glTF.
     """
     attributes = _attributes(cloud)
     views: list[dict[str, Any]] = []
@@ -247,7 +248,7 @@ def _attributes(cloud: SplatCloud) -> dict[str, np.ndarray]:
     opaque = np.clip(cloud.opacities, 0.0, 1.0)[:, None]
     named = {
         "POSITION": cloud.means,
-        "COLOR_0": np.concatenate([cloud.colors, opaque], axis=1),
+        "COLOR_0": np.concatenate([linear_light(cloud.colors), opaque], axis=1),
         f"{EXTENSION}:ROTATION": np.roll(cloud.unit_quats_wxyz, -1, axis=1),
         f"{EXTENSION}:SCALE": cloud.scales,
         f"{EXTENSION}:OPACITY": opaque,

@@ -18,14 +18,16 @@ from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
-from coliags_plugin.core.ply import point_properties, read_triangles, write_ply
+from coliags_plugin.core.ply import eight_bits, point_properties, read_triangles, vertex_colors, write_ply
 from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 
 #: Suffixes of the formats.
 MESH_FORMATS = ("ply", "obj", "glb")
 
-_COLORS = ("red", "green", "blue")
+#: Names of the colours in a GLB file, and of the same length those under which trimesh reads them in their own type:
+#: it takes the low byte of 16 bits.
+_COLORS, _RAW_COLORS = "COLOR_0", "_OLOR_0"
 
 
 def read_mesh(path: Path) -> TriangleMesh:
@@ -83,26 +85,29 @@ def _suffix(path: Path) -> str:
 
 def _read_ply(path: Path) -> TriangleMesh:
     columns, triangles = read_triangles(path)
-    colored = all(name in columns and columns[name].dtype == np.uint8 for name in _COLORS)
     with np.errstate(over="ignore"):
         vertices = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float32)
-    return TriangleMesh(vertices, triangles, np.stack([columns[name] for name in _COLORS], axis=1) if colored else None)
+    return TriangleMesh(vertices, triangles, vertex_colors(path, columns))
 
 
 def _read_glb(path: Path) -> TriangleMesh:
     import trimesh
 
     try:
-        read = trimesh.load_mesh(path, process=False, skip_materials=True)
+        content = io.BytesIO(path.read_bytes().replace(f'"{_COLORS}"'.encode(), f'"{_RAW_COLORS}"'.encode()))
+        read = trimesh.load_mesh(content, file_type="glb", process=False, skip_materials=True)
         vertices, triangles = np.asarray(read.vertices, np.float32), np.asarray(read.faces, np.int64)
-        colors = np.asarray(read.visual.vertex_colors)[:, :3] if read.visual.kind == "vertex" else None
+        colors = read.vertex_attributes.get(_RAW_COLORS)
     except Exception as error:  # trimesh raises whatever it meets
         raise unreadable(
             path, f"{path} cannot be read as GLB: {error}", "a complete GLB file", "Fetch it again"
         ) from error
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
-    return TriangleMesh(vertices, triangles, None if colors is None else _encoded(colors / 255.0))
+    if colors is None or len(colors) != len(vertices):
+        return TriangleMesh(vertices, triangles)
+    light = colors[:, :3] / (np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0)
+    return TriangleMesh(vertices, triangles, _encoded(np.clip(np.nan_to_num(light), 0.0, 1.0)))
 
 
 def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
@@ -119,7 +124,7 @@ def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
         visual = trimesh.visual.TextureVisuals(uv=places, material=image)
         material["baseColorTexture"] = {"index": 0}
     elif mesh.colors is not None:
-        linear = np.rint(_linear(mesh.colors) * 255.0).astype(np.uint8)
+        linear = np.rint(linear_light(mesh.colors / 255.0) * 255.0).astype(np.uint8)
         visual = trimesh.visual.ColorVisuals(vertex_colors=linear)
 
     def both_sides(document: dict[str, Any]) -> None:
@@ -138,9 +143,8 @@ def _split(mesh: TriangleMesh, texture: Texture) -> tuple[TriangleMesh, Float[np
     return TriangleMesh(mesh.vertices[vertices], corners.reshape(-1, 3)), places[used]
 
 
-def _linear(colors: UInt8[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-    """Linear light of sRGB colours, in [0, 1]. [V, 3]"""
-    encoded = colors / 255.0
+def linear_light(encoded: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Linear light of sRGB colours, both in [0, 1]. [V, 3]"""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
@@ -159,7 +163,7 @@ _LONGEST_TRIANGLE = 200
 def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     """Read the triangles of an OBJ file; polygons are split into fans.
 
-    The mesh has vertex colours where every ``v`` has six numbers, the last three in [0, 1]. Beside it, for each
+    The mesh has vertex colours where every ``v`` has six numbers, the last three up to 1 or to 255. Beside it, for each
     triangle, the texture index (``vt``, counted from 1) of its first corner; None where corners have none.
     """
     found: dict[str, list[str]] = {"v ": [], "f ": []}
@@ -177,7 +181,7 @@ def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
         raise InputError(f"{path} has faces of vertices that are not there", "a mesh", "Fetch it again")
     colors = None
     if vertices.shape[1] >= 6:
-        colors = np.rint(vertices[:, 3:6] * 255.0).clip(0, 255).astype(np.uint8)
+        colors, _ = eight_bits(vertices[:, 3:6])
     return TriangleMesh(vertices[:, :3].astype(np.float32), corners, colors), textures
 
 

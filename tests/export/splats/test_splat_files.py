@@ -159,6 +159,10 @@ def test_glb_follows_the_extension(tmp_path):
     assert primitive["mode"] == 0 and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
     assert extension == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     np.testing.assert_array_equal(values["POSITION"], cloud.means)
+    # COLOR_0 is linear light: encoded by the curve of sRGB, colours again.
+    light = values["COLOR_0"][:, :3]
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(srgb, np.clip(0.5 + 0.28209479177387814 * cloud.harmonics[:, 0], 0, 1), atol=1e-6)
     np.testing.assert_allclose(values["KHR_gaussian_splatting:ROTATION"], cloud.quats_wxyz[:, [1, 2, 3, 0]], atol=1e-6)
     np.testing.assert_array_equal(values["KHR_gaussian_splatting:SCALE"], cloud.scales)
     np.testing.assert_array_equal(values["KHR_gaussian_splatting:OPACITY"][:, 0], cloud.opacities)

@@ -131,6 +131,24 @@ def test_obj_polygons_and_negative_indices(tmp_path):
     assert mesh.areas.sum() == 1.0
 
 
+@pytest.mark.parametrize("colors", ["1 0 0.5\n", "255 0 127.6\n"])
+def test_colours_of_obj_up_to_1_or_255(colors, tmp_path):
+    (tmp_path / "m.obj").write_text(
+        "".join(f"v {place} {colors}" for place in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 3\n"
+    )
+    assert read_mesh(tmp_path / "m.obj").colors.tolist() == [[255, 0, 128]] * 3
+
+
+@pytest.mark.parametrize(("kind", "top"), [("u1", 255), ("u2", 65535), ("f4", 1)])
+def test_colours_of_glb_of_every_type(kind, top, tmp_path):
+    import trimesh
+
+    stored = (np.array([[1.0, 0.0, 0.2]] * 3) * top).astype(kind)  # 0.2 of linear light is 124 in sRGB
+    made = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False, vertex_attributes={"_OLOR_0": stored})
+    (tmp_path / "m.glb").write_bytes(made.export(file_type="glb").replace(b"_OLOR_0", b"COLOR_0"))
+    assert read_mesh(tmp_path / "m.glb").colors.tolist() == [[255, 0, 124]] * 3
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
