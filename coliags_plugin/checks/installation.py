@@ -34,6 +34,7 @@ LIBRARIES = {
     "numpy": "numpy",
     "kornia": "kornia",
     "opencv-contrib-python-headless": "cv2",
+    "av": "av",
     "scikit-image": "skimage",
     "scipy": "scipy",
     "pycolmap": "pycolmap",

@@ -16,7 +16,7 @@ from coliags_plugin.geometry.poses.trajectory import natural_order
 log = logging.getLogger(__name__)
 
 #: Suffixes of video files, in lower case.
-_VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv"}
+_VIDEO_SUFFIXES = {*".3gp .avi .dv .flv .m2ts .m4v .mkv .mov .mp4 .mpeg .mpg .mts .mxf .ts .vob .webm .wmv".split()}
 
 
 def formats() -> list[str]:

@@ -30,7 +30,7 @@ class FrameSettings(Settings):
     deinterlace: bool | None = Field(
         default=None,
         description="Whether of every frame one field is kept, and the rows of the other interpolated. None: where the "
-        "video looks interlaced.",
+        "video is flagged as interlaced, or looks so.",
     )
     every: int = Field(default=1, ge=1, description="Use the sharpest of every n frames.")
     segment: int = Field(

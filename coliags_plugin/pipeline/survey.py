@@ -211,7 +211,7 @@ class Video(BaseModel):
     size: tuple[int, int] | None = None  # width and height, pixels
     first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)] = 0  # that was looked at
     seek: bool = True  # whether frames are found by their number
-    deinterlace: bool = False  # whether they were read so
+    deinterlace: bool | None = False  # whether they were read so; None: those that are flagged
     segments: tuple[Segment, ...]
     skipped: tuple[Skipped, ...] = ()
 

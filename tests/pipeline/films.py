@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import struct
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 
@@ -30,35 +31,52 @@ def blurred(image: np.ndarray, sigma: float = 4.0) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma))
 
 
-def write_avi(frames, path: Path, rate: int, sound: bool = False) -> Path:
-    """A video of JPEG images, with a track of sound between them if asked for (8 bit, 8 kHz)."""
+def numbered(count: int, height: int = 48, width: int = 64) -> list[np.ndarray]:
+    """Frames whose red tells their number."""
+    ramp = np.linspace(10, 240, width).astype(np.uint8)
+    down = np.linspace(10, 240, height).astype(np.uint8)
+    return [
+        np.stack(np.broadcast_arrays(np.uint8(20 + 5 * number), ramp, down[:, None]), axis=2) for number in range(count)
+    ]
 
-    def chunk(name: bytes, *parts: bytes) -> bytes:
-        data = b"".join(parts)
-        return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
 
-    def stream(kind: bytes, codec: bytes, scale: int, per_scale: int, count: int, sample: int, detail: bytes) -> bytes:
-        header = struct.pack("<4s4s10I4H", kind, codec, 0, 0, 0, scale, per_scale, 0, count, 0, 0, sample, 0, 0, 0, 0)
-        return chunk(b"LIST", b"strl", chunk(b"strh", header), chunk(b"strf", detail))
+def number_of(image: np.ndarray) -> int:
+    """Number of one of these frames; -4 where it is black."""
+    return round((float(np.median(image[..., 0])) - 20) / 5)
 
-    height, width = frames[0].shape[:2]
-    jpeg = struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, b"MJPG", width * height * 3, 0, 0, 0, 0)
-    streams = [stream(b"vids", b"MJPG", 1, rate, len(frames), 0, jpeg)]
-    samples = 8000 // rate
-    if sound:
-        pcm = struct.pack("<HHIIHH", 1, 1, 8000, 8000, 1, 8)
-        streams.append(stream(b"auds", bytes(4), 1, 8000, samples * len(frames), 1, pcm))
-    main = struct.pack("<14I", 1_000_000 // rate, 0, 0, 16, len(frames), 0, len(streams), 0, width, height, 0, 0, 0, 0)
-    movie, index = b"movi", b""
-    for frame in frames:
-        encoded = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        tone = (128 + 100 * np.sin(np.arange(samples))).astype(np.uint8).tobytes()
-        for name, data in [(b"00dc", encoded), *([(b"01wb", tone)] if sound else [])]:
-            index += name + struct.pack("<III", 16, len(movie), len(data))
-            movie += chunk(name, data)
-    head = chunk(b"LIST", b"hdrl", chunk(b"avih", main), *streams)
-    path.write_bytes(chunk(b"RIFF", b"AVI ", head, chunk(b"LIST", movie), chunk(b"idx1", index)))
-    return path
+
+def write_film(frames, target, codec="libx264", rate=20, *, kind=None, times=None, sound=False, muxing=None, second=(),
+               turn=None, aspect=1, pix_fmt="yuv420p", **options):  # fmt: skip
+    """A video by a codec of PyAV; frames are at ``times``, ms, beside a track of sound and a second video, if given.
+
+    ``target`` may also be a file that is open for writing; then ``kind`` names the container.
+    """
+    name = f"file:{target}" if isinstance(target, Path) else target
+    with av.open(name, "w", kind, container_options=muxing or {}) as file:
+        films = []
+        for images in filter(len, (frames, second)):
+            stream = file.add_stream(codec, rate, {key: str(value) for key, value in options.items()})
+            stream.height, stream.width, stream.pix_fmt = *images[0].shape[:2], pix_fmt
+            stream.codec_context.sample_aspect_ratio = Fraction(aspect)
+            if times is not None:
+                stream.codec_context.time_base = Fraction(1, 1000)
+            if turn is not None:
+                stream.set_display_rotation(*turn)
+            films.append((stream, images))
+        track = file.add_stream("pcm_s16le", 8000, layout="mono") if sound else None
+        for stream, images in films:
+            for number, image in enumerate(images):
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                if times is not None:
+                    frame.pts, frame.time_base = times[number], Fraction(1, 1000)
+                file.mux(stream.encode(frame))
+                if track is not None:
+                    tone = (8000 * np.sin(np.arange(8000 // rate)))[None].astype(np.int16)
+                    noise = av.AudioFrame.from_ndarray(tone, format="s16", layout="mono")
+                    noise.sample_rate = 8000
+                    file.mux(track.encode(noise))
+            file.mux(stream.encode(None))
+    return target
 
 
 def write_images(folder: Path, frames) -> Path:

@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.frame_sources import Span, every_of, frame_at, frame_source
-from tests.pipeline.films import film, write_avi, write_images
+from tests.pipeline.films import film, write_film, write_images
 
 
 def test_frames_are_read_in_order(tmp_path):
@@ -132,7 +132,8 @@ def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
 
 def test_sound_is_left_out(tmp_path):
     frames = film(range(0, 60, 3))
-    silent, loud = (write_avi(frames, tmp_path / f"{sound}.avi", 20, sound) for sound in (False, True))
+    options = {"codec": "mjpeg", "rate": 20, "pix_fmt": "yuvj420p"}
+    silent, loud = (write_film(frames, tmp_path / f"{sound}.avi", sound=sound, **options) for sound in (False, True))
     assert loud.stat().st_size > silent.stat().st_size + 20 * 400
     source = frame_source(loud)
     assert source.expected == 20 and source.rate == pytest.approx(20.0)

@@ -115,7 +115,7 @@ def test_bad_input_leaves_nothing(tmp_path, capsys):
     (tmp_path / "full" / "thesis.tex").touch()
     out = tmp_path / "out"
     for argv, message in (
-        ((tmp_path / "noise.mp4", "--output", out), "cannot be opened as a video by OpenCV"),
+        ((tmp_path / "noise.mp4", "--output", out), "cannot be opened as a video by FFmpeg"),
         ((tmp_path / "empty", "--output", out), "holds 0 images"),
         ((tmp_path / "nowhere", "--output", out), "Expected a video file, or a folder of images"),
         ((folder, "--output", folder), "Expected a folder apart from the input"),

@@ -1,0 +1,378 @@
+"""Video files, decoded by PyAV: frames by their numbers, with their times and shapes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property, lru_cache
+from itertools import chain, islice, takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from coliags_plugin.core.errors import InputError
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame
+    from av.container import InputContainer
+    from av.video.codeccontext import VideoCodecContext
+    from av.video.stream import VideoStream
+
+log = logging.getLogger(__name__)
+
+#: Share of the frames stated by a video's header below which it is said that the others are missing.
+_COMPLETE = 0.95
+#: Frames a second that no header states in earnest.
+FASTEST = 1000.0
+#: Places by which packets precede or follow their place by time, at most: 16 frames in H.264 and HEVC.
+_REORDERED = 32
+#: Frames, from the first on, whose times are compared with those of packets before these are believed.
+_COMPARED = 16
+
+AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the folder"
+
+
+class Key(NamedTuple):
+    """A frame from which decoding can begin."""
+
+    time: int  # of presentation
+    size: int  # bytes
+    before: int  # decoding time of the key frame before: packets behind the place sought may have wrong times
+
+    def is_in(self, packet: Packet) -> bool:
+        """Whether a packet holds it."""
+        return bool(packet.is_keyframe) and (packet.pts, packet.size) == (self.time, self.size)
+
+
+@dataclass(frozen=True, eq=False)
+class VideoIndex:
+    """Times of a file's frames by its packets, in units of the stream.
+
+    Attributes:
+        times: Presentation times of the frames, ascending. [N]
+        keys: Of frames from which decoding can begin, presentation times, ascending, decoding times and bytes. [K, 3]
+        unit: Seconds.
+        stated: Number of frames that the file should have: more than N where it is cut off.
+    """
+
+    times: Int64[np.ndarray, "N"]
+    keys: Int64[np.ndarray, "K 3"]
+    unit: Fraction
+    stated: int
+
+    def key_before(self, number: int) -> Key | None:
+        """The last key frame up to a frame; None where it is the first."""
+        place = int(np.searchsorted(self.keys[:, 0], self.times[number], side="right")) - 1
+        if place < 1:
+            return None
+        time, _, size = self.keys[place].tolist()
+        return Key(time, size, int(self.keys[place - 1, 1]))
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video file, decoded anew by every iteration; frame n is what follows n frames, in every container."""
+
+    path: Path
+
+    @contextmanager
+    def opened(self) -> Iterator[tuple[InputContainer, VideoStream]]:
+        """The file and its video, which is no cover picture; InputError where there is none."""
+        import av
+        from av.stream import Disposition
+
+        try:
+            # Without the protocol, a name such as 12:30.mp4 would have one.
+            container = av.open(f"file:{self.path}")
+        except (av.FFmpegError, OSError) as error:
+            raise InputError(
+                f"{self.path} ({self.path.stat().st_size} bytes) cannot be opened as a video by FFmpeg "
+                f"({getattr(error, 'strerror', None) or error})",
+                "a video file with a codec of FFmpeg, for instance .mp4, .avi or .mov",
+                f"Fetch it again if it is incomplete. {AS_IMAGES}",
+            ) from None
+        with container:
+            videos = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+            if not videos:
+                held = ", ".join(each.type for each in container.streams) or "none"
+                raise InputError(f"{self.path} has no video among its streams ({held})", "a video", "Check the path")
+            best = container.streams.best("video")
+            stream = next((each for each in videos if each is best), videos[0])
+            if stream.codec_context is None:
+                raise InputError(f"FFmpeg does not know the codec of {self.path}", "another one", AS_IMAGES)
+            yield container, stream
+
+    def check(self) -> None:
+        """Refuse what cannot be opened; say, once, what of the file is used where it leaves a choice."""
+        _check(*self._identity)
+
+    @cached_property
+    def header(self) -> tuple[float | None, int | None]:
+        """Frames a second and number of frames as the header states them; None where it does not, in earnest."""
+        with self.opened() as (container, stream):
+            rate = float(stream.average_rate or 0)
+            seconds = float((stream.duration or 0) * (stream.time_base or 0)) or (container.duration or 0) / 1e6
+            known = rate if 0.0 < rate < FASTEST else None
+            count = stream.frames or (0 if known is None else round(seconds * known))
+            return known, count if 0 < count <= container.size else None
+
+    @property
+    def index(self) -> VideoIndex | None:
+        """Times of the frames, for which the file is read once; None where packets do not tell them."""
+        return _index(*self._identity)
+
+    @property
+    def expected(self) -> int:
+        """Number of frames by the header, or else :attr:`count`."""
+        return self.header[1] or self.count
+
+    @property
+    def count(self) -> int:
+        """Number of frames, those included that a file which is cut off lacks at its end; at least 1."""
+        return max(1, _decoded_frames(*self._identity) if self.index is None else self.index.stated)
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second, the mean of a variable rate; None where nothing tells."""
+        stated, times, index = self.header[0], self.times, self.index
+        if times is None or index is None or len(times) < 2:
+            return stated
+        numbers = np.arange(len(times))
+        if stated is not None and np.abs(times - numbers / stated).max() <= 1.01 * index.unit:
+            return stated
+        return float(numbers[-1] / times[-1])
+
+    @property
+    def times(self) -> Float64[np.ndarray, "N"] | None:
+        """Presentation times of the frames after that of the first, s; None where packets do not tell them."""
+        index = self.index
+        return None if index is None else (index.times - index.times[0]) * float(index.unit)
+
+    @property
+    def _identity(self) -> tuple[Path, int, int]:
+        status = self.path.stat()
+        return self.path.absolute(), status.st_size, status.st_mtime_ns
+
+    def frames(
+        self, first: int, stop: int, seek: bool, is_filled: bool, shown: Callable[[np.ndarray, bool], np.ndarray]
+    ) -> Iterator[tuple[UInt8[np.ndarray, "H W 3"], bool]]:
+        """Images from one on as far as there are, and whether each is flagged as interlaced.
+
+        Where the file is damaged and goes on behind that, the frames between are black, and, with ``is_filled``, those
+        before ``stop`` that it lacks. ``shown`` is applied to images
+        and flags as they are stored, before pixels become square and images are turned as the file says.
+        """
+        with self.opened() as (_, stream):
+            aspect = stream.sample_aspect_ratio or Fraction(1)
+        done, concealed = 0, 0
+        for number, frame in self._numbered(first, seek):
+            image, behind = _picture(frame, aspect, shown), min(number, stop)
+            if behind > first + done:
+                log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + done, number - 1)
+            while behind > first + done:
+                yield np.zeros(image.shape, np.uint8), False
+                done += 1
+            if number < stop:
+                concealed += frame.is_corrupt
+                yield image, frame.interlaced_frame
+                done += 1
+            if number + 1 >= stop:
+                break
+        if concealed:
+            log.warning("%s: %d damaged frames are shown as far as they can be decoded", self.path, concealed)
+        if is_filled and done < stop - first:
+            shape = image.shape if done else next(self.frames(0, 1, False, False, shown))[0].shape
+            yield from ((np.zeros(shape, np.uint8), False) for _ in range(first + done, stop))
+        elif done == 0 and first > 0:
+            raise InputError(f"{self.path} has no frame {first}", f"one of about {self.expected} frames")
+        elif done == 0:
+            raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec FFmpeg has", AS_IMAGES)
+        if done < _COMPLETE * (min(stop, self.expected) - first):
+            stated = min(stop, self.expected if self.index is None else self.index.stated) - first
+            if done < _COMPLETE * stated:
+                log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, done, stated)
+
+    def _numbered(self, first: int, seek: bool) -> Iterator[tuple[int, VideoFrame]]:
+        """Numbers and frames from one on; behind frames that cannot be decoded, numbers are those by time."""
+        number, frames = self._sought(first) if seek and first > 0 else (0, self.decoded())
+        for frame in frames:
+            if frame is None:
+                # Of a file whose first frame cannot be decoded, FFmpeg may take packets of gigabytes for others.
+                if number > 0:
+                    yield from self._behind_damage(max(number, first))
+                return
+            if number >= first:
+                yield number, frame
+            number += 1
+
+    def _sought(self, first: int) -> tuple[int, Iterator[VideoFrame | None]]:
+        """Frames from one on, which is found by its time, or else from the start; and the number of their first."""
+        index = self.index
+        if index is not None and first >= len(index.times):
+            return first, iter(())
+        if index is None or (key := index.key_before(first)) is None:
+            return 0, self.decoded()
+        found, time = self.decoded(key), int(index.times[first])
+        for frame in found:
+            if frame is None or frame.pts == time:
+                return first, chain([frame], found)
+            if frame.pts is None or frame.pts > time:
+                break
+        return 0, self.decoded()
+
+    def _behind_damage(self, first: int) -> Iterator[tuple[int, VideoFrame]]:
+        """Numbers and frames from one on, decoded by one thread: several lose frames along with damaged ones.
+
+        Where packets do not tell times, what cannot be decoded has no number.
+        """
+        index, number = self.index, 0
+        for frame in self.decoded(None if index is None else index.key_before(first), threads=1):
+            if frame is None:
+                continue
+            if index is not None:
+                number = int(np.searchsorted(index.times, np.int64(frame.pts or 0)))
+            if number >= first:
+                yield number, frame
+            number += 1
+
+    def decoded(self, key: Key | None = None, threads: int = 0) -> Iterator[VideoFrame | None]:
+        """All frames, or those from a key frame on; for a damaged one None, and then those from the next key frame on.
+
+        A stream may begin between key frames: what cannot be decoded before the first of them is no frame.
+        """
+        import av
+
+        with self.opened() as (container, stream):
+            codec, is_lost, is_before = stream.codec_context, False, False
+            codec.thread_type, codec.thread_count = "AUTO", threads
+            if key is not None:
+                container.seek(key.before, stream=stream)
+            is_first = key is None
+            for packet in _packets(container, stream):
+                if key is not None and not key.is_in(packet):
+                    continue
+                key, is_first, is_before = None, False, is_before or (is_first and not packet.is_keyframe)
+                if is_lost and not packet.is_keyframe:
+                    continue
+                is_lost = False
+                try:
+                    frames = codec.decode(packet)
+                except av.FFmpegError:
+                    if not is_before:
+                        is_lost = True
+                        yield from _drained(codec)
+                        yield None
+                        codec.flush_buffers()
+                    continue
+                is_before = is_before and not frames
+                yield from frames
+            if not is_lost:
+                yield from _drained(codec)
+
+
+def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packet]:
+    """Packets that hold something, of some streams or of all, as far as the file can be read."""
+    import av
+
+    with suppress(av.FFmpegError):
+        for packet in container.demux(*streams):
+            if packet.size:
+                yield packet
+
+
+def _drained(codec: VideoCodecContext) -> list[VideoFrame]:
+    """Frames that a decoder still holds, to show them in order."""
+    import av
+
+    try:
+        return codec.decode(None)
+    except av.FFmpegError:
+        return []
+
+
+@lru_cache(maxsize=64)
+def _check(path: Path, size: int, modified: int) -> None:
+    """Open a file, which is known by its size and time, and say what is not as usual."""
+    with VideoFile(path).opened() as (container, stream):
+        aspect, width, height = stream.sample_aspect_ratio or Fraction(1), stream.width, stream.height
+        if (count := len(container.streams.video)) > 1:
+            log.warning(
+                "%s has %d video streams: number %d is used, of %d x %d", path, count, stream.index, width, height
+            )
+        if (square := round(width * aspect)) != width:
+            what = "%s has pixels that are not square (%s) and is read as %d x %d: --params and --mask are of that size"
+            log.warning(what, path, aspect, square, height)
+
+
+@lru_cache(maxsize=64)
+def _decoded_frames(path: Path, size: int, modified: int) -> int:
+    """Number of frames that can be decoded of a file, which is known by its size and time."""
+    return sum(frame is not None for frame in VideoFile(path).decoded())
+
+
+@lru_cache(maxsize=64)
+def _index(path: Path, size: int, modified: int) -> VideoIndex | None:
+    """Index of a file, which is known by its size and time; None where times of packets are not those of frames."""
+    file = VideoFile(path)
+    shown, keys, begin, end = list[int | None](), list[tuple[int, int, int]](), np.inf, -np.inf
+    with file.opened() as (container, stream):
+        for packet in _packets(container):
+            time = packet.dts if packet.pts is None else packet.pts
+            if time is not None and packet.time_base is not None:
+                begin = min(begin, float(time * packet.time_base))
+                end = max(end, float((time + (packet.duration or 0)) * packet.time_base))
+            if packet.stream_index != stream.index:
+                continue
+            if packet.is_keyframe and packet.pts is not None:
+                keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+            if not packet.is_discard:
+                shown.append(packet.pts)
+        unit, seconds = stream.time_base, (container.duration or 0) / 1e6
+        # Of these containers, the header lists all frames.
+        listed = sum(not entry.is_discard for entry in stream.index_entries) if "mp4" in container.format.name else 0
+    if unit is None or not shown or not keys or None in shown:
+        return None
+    packets = np.array(shown, np.int64)
+    order = np.argsort(packets, kind="stable")
+    times = packets[order]
+    if (np.diff(times) <= 0).any() or np.abs(order - np.arange(len(order))).max() > _REORDERED:
+        return None
+    whole = takewhile(lambda frame: frame is not None, islice(file.decoded(), _COMPARED))
+    decoded = [getattr(frame, "pts", None) for frame in whole]
+    if not decoded or decoded[0] is None:
+        return None
+    times = times[times >= decoded[0]]
+    if times[: len(decoded)].tolist() != decoded:
+        return None
+    stated = max(len(times), listed)
+    if not listed and file.header[1] is not None and end - begin < _COMPLETE * seconds:
+        stated = round(len(times) * seconds / (end - begin))
+    return VideoIndex(times, np.array(sorted(keys), np.int64), unit, stated)
+
+
+def _picture(
+    frame: VideoFrame, aspect: Fraction, shown: Callable[[np.ndarray, bool], np.ndarray]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The image of a frame, with square pixels: rows stay, as those of an interlaced one are of two moments."""
+    import cv2
+
+    image: Any = shown(frame.to_ndarray(format="rgb24", interpolation="BICUBIC", threads=1), frame.interlaced_frame)
+    height, width = image.shape[:2]
+    if (square := round(width * aspect)) != width:
+        image = cv2.resize(
+            image, (square, height), interpolation=cv2.INTER_AREA if square < width else cv2.INTER_LINEAR
+        )
+    turn: Any = frame.side_data.get("DISPLAYMATRIX")
+    if turn is not None:
+        matrix = np.frombuffer(turn, np.int32)
+        if matrix[0] == 0:  # columns become rows
+            image, right, down = image.swapaxes(0, 1), matrix[3], matrix[1]
+        else:
+            right, down = matrix[0], matrix[4]
+        image = image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
+    return np.ascontiguousarray(image)

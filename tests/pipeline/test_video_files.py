@@ -1,0 +1,205 @@
+"""Video files of all kinds: frames by number, times, shapes, and files that are damaged."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.pipeline.frame_selection import one_field
+from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
+from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.video_files import VideoFile
+from tests.pipeline.films import number_of, numbered, write_film
+
+FRAMES = numbered(40)
+#: Some frames that depend on those after them, and keys that later frames refer across.
+ORDERED = {"g": 8, "bf": 2}
+OPEN = ORDERED | {"x264-params": "open-gop=1:scenecut=0"}
+
+
+WHOLE = Span()
+
+
+def numbers(path, span=WHOLE):
+    """Numbers of frames by their names and by what they show."""
+    pairs = [(int(name[-6:]), number_of(image)) for name, image in frame_source(path, span)]
+    assert [name for name, _ in pairs] == list(range(span.first, span.first + len(pairs)))
+    return [shown for _, shown in pairs]
+
+
+class Pipe:
+    """A file that cannot be sought, into which no length is written."""
+
+    def __init__(self, path):
+        self._file = path.open("wb")
+
+    def write(self, data):
+        return self._file.write(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options", "is_sought"),
+    [
+        ("a.mp4", "libx264", ORDERED, True),
+        ("a.mp4", "libx264", OPEN, True),
+        ("a.mov", "prores_ks", {"pix_fmt": "yuv422p10le"}, True),
+        ("a.mkv", "libx264", ORDERED, True),
+        ("a.mkv", "ffv1", {"pix_fmt": "yuva444p"}, True),
+        ("a.webm", "libvpx-vp9", {"g": 8, "cpu-used": 8}, True),
+        ("a.ts", "libx264", ORDERED, True),
+        ("a.m2ts", "libx264", OPEN, True),
+        ("a.ts", "mpeg2video", ORDERED, True),
+        ("a.mpg", "mpeg2video", ORDERED, True),
+        ("a.vob", "mpeg2video", {**ORDERED, "kind": "vob"}, True),
+        ("a.avi", "mjpeg", {"pix_fmt": "yuvj420p"}, True),
+        ("a.avi", "mpeg4", ORDERED, True),
+        ("a.mp4", "libx264", ORDERED | {"times": [-120 + 50 * n for n in range(40)]}, True),
+        ("a.mkv", "libx264", ORDERED | {"times": [90_000 + 50 * n for n in range(40)]}, True),
+        ("a.mp4", "libx264", ORDERED | {"muxing": {"movflags": "frag_keyframe+empty_moov"}}, True),
+    ],
+)
+def test_frame_n_is_what_follows_n_frames(tmp_path, name, codec, options, is_sought):
+    path = write_film(FRAMES, tmp_path / name, codec, 25, **({"b": 4_000_000} if codec[0] == "m" else {}), **options)
+    whole = numbers(path)
+    assert whole == list(range(40 - len(whole), 40))
+    assert frame_source(path).rate == pytest.approx(20 if "times" in options else 25)
+    for first in (1, 3, 7, 8, 13, 17, 31, len(whole) - 1):
+        assert numbers(path, Span(first, first + 1)) == whole[first : first + 2]
+    if is_sought:
+        assert VideoFile(path)._sought(30)[0] == 30
+    else:
+        assert VideoFile(path).index is None
+
+
+@pytest.mark.parametrize("kind", ["webm", "matroska", "mpegts", "avi"])
+def test_files_that_do_not_state_their_length_are_read_whole(tmp_path, kind):
+    codec = {"webm": "libvpx-vp9", "avi": "mjpeg"}.get(kind, "libx264")
+    suffix = {"matroska": "mkv", "mpegts": "mpg"}.get(kind, kind)
+    for part in range(2):
+        path = tmp_path / f"{part}.{suffix}"
+        write_film(FRAMES[:24], Pipe(path), codec, 12, kind=kind, pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p")
+    assert frame_source(path).expected == len(list(frame_source(path))) == 24
+    assert numbers(tmp_path) == [*range(24), *range(24)]
+    assert numbers(tmp_path, Span(20, 30)) == [*range(20, 24), *range(7)]
+
+
+def test_a_folder_keeps_the_places_of_frames_that_a_file_lacks(tmp_path, caplog):
+    whole = write_film(FRAMES, tmp_path / "2.mp4", muxing={"movflags": "faststart"}, **ORDERED).read_bytes()
+    cut = tmp_path / "1.mp4"
+    cut.write_bytes(whole[: 4 * len(whole) // 5])
+    there = numbers(cut)
+    assert there == list(range(len(there))) and 10 < len(there) < 38
+    assert f"1.mp4: {len(there)} frames, though its header says 40" in caplog.text
+    lacking = [-4] * (40 - len(there))
+    for span in (Span(), Span(5), Span(39), Span(39, 41, seek=False)):
+        assert numbers(tmp_path, span) == [*there, *lacking, *range(40)][span.first :][: span.count(80)]
+
+
+def test_what_comes_before_the_first_key_frame_is_no_frame(tmp_path):
+    whole = write_film(FRAMES, tmp_path / "whole.ts", **OPEN)
+    with av.open(str(whole)) as file:
+        places = [packet.pos for packet in file.demux(video=0) if packet.is_keyframe]
+    data = whole.read_bytes()
+    (tmp_path / "cut.ts").write_bytes(data[: 2 * 188] + data[places[1] + 188 * 3 :])
+    shown = [number_of(image) for _, image in frame_source(tmp_path / "cut.ts")]
+    assert shown == list(range(shown[0], 40)) and shown[0] in range(8, 17)
+    assert [number_of(image) for _, image in frame_source(tmp_path / "cut.ts", Span(9))] == shown[9:]
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options"),
+    [
+        ("a.mp4", "libx264", {"x264-params": "tff=1"}),
+        ("a.ts", "libx264", {"x264-params": "bff=1"}),
+        ("a.mpg", "mpeg2video", {"flags": "+ildct+ilme", "b": 4_000_000}),
+    ],
+)
+def test_flagged_frames_are_decoded_and_deinterlaced(tmp_path, name, codec, options):
+    """Of a picture that does not look interlaced."""
+    path = write_film(FRAMES[:12], tmp_path / name, codec, 25, **options)
+    plain = list(frame_source(path))
+    assert [number_of(image) for _, image in plain] == list(range(12))
+    read = chosen_frames(path, FrameSettings())
+    assert read.span.deinterlace
+    for (_, image), (_, stored) in zip(read, plain, strict=True):
+        np.testing.assert_array_equal(image, one_field(stored))
+    assert not chosen_frames(path, FrameSettings(deinterlace=False)).span.deinterlace
+
+
+def test_paths_are_no_addresses_and_no_patterns(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = write_film(FRAMES[:5], tmp_path / "plain.mp4").read_bytes()
+    for name in ("12:30:05.mp4", "http:.mp4", "a%20 100%.mp4", "%03d.mp4", "Fälle #1?.mp4", "pipe:/1 [x].mp4"):
+        path = Path(name)
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(data)
+        assert numbers(path) == numbers(path.absolute()) == list(range(5))
+    assert numbers(Path("pipe:")) == list(range(5))
+
+
+QUADRANTS = np.zeros((48, 64, 3), np.uint8)
+QUADRANTS[:24, :32], QUADRANTS[:24, 32:], QUADRANTS[24:, :32] = (240, 40, 40), (40, 240, 40), (40, 40, 240)
+
+
+@pytest.mark.parametrize("aspect", ["1", "16/15", "8/9", "4/3"])
+@pytest.mark.parametrize("turn", [None, (90,), (-90,), (180,), (0, True), (0, False, True), (90, True)])
+def test_pixels_are_square_and_images_turned_as_the_file_says(tmp_path, aspect, turn, caplog):
+    path = write_film([QUADRANTS] * 3, tmp_path / "a.mov", aspect=aspect, turn=turn, pix_fmt="yuv444p")
+    (_, image), *_ = frame_source(path)
+    width = round(64 * Fraction(aspect))
+    stored = np.repeat(QUADRANTS, width, axis=1)[:, 32::64]
+    angle, *mirrored = (turn or (0,)) + (False, False)
+    right = np.rot90(stored, angle // 90)
+    right = right[:: -1 if mirrored[1] else 1, :: -1 if mirrored[0] else 1]
+    assert image.shape == right.shape
+    assert np.median(np.abs(image.astype(int) - right)) <= 3 and np.mean(np.abs(image.astype(int) - right)) < 8
+    said = f"a.mov has pixels that are not square ({aspect}) and is read as {width} x 48"
+    assert caplog.text.count("not square") == (width != 64) and (width == 64 or said in caplog.text)
+
+
+def test_which_of_several_streams_is_used(tmp_path, caplog):
+    small = numbered(12, 24, 32)
+    two = write_film(FRAMES[:12], tmp_path / "two.mkv", second=small[::-1])
+    assert numbers(two) == list(range(12))
+    assert "two.mkv has 2 video streams: number 0 is used, of 64 x 48" in caplog.text
+    for name in ("sound.mkv", "cover.mp4"):
+        with av.open(str(tmp_path / name), "w") as file:
+            track = file.add_stream("aac", 8000, layout="mono")
+            tone = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            tone.sample_rate = 8000
+            if name == "cover.mp4":
+                cover = file.add_stream("mjpeg", 1)
+                cover.height, cover.width, cover.pix_fmt = 24, 32, "yuvj420p"
+                cover.disposition = av.stream.Disposition.attached_pic
+                file.mux(cover.encode(av.VideoFrame.from_ndarray(small[0], format="rgb24")))
+            file.mux([*track.encode(tone), *track.encode(None)])
+        with pytest.raises(InputError, match=rf"{name} has no video among its streams \(audio"):
+            frame_source(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt", "options"),
+    [
+        ("a.mkv", "ffv1", "gray", {}),
+        ("a.mkv", "ffv1", "yuv422p10le", {}),
+        ("a.mkv", "ffv1", "bgra", {}),
+        ("a.mov", "prores_ks", "yuva444p10le", {}),
+        ("a.mkv", "libx264", "yuvj444p", {"qp": 1}),
+        ("a.mkv", "libx265", "yuv420p10le", {"x265-params": "lossless=1:log-level=none"}),
+    ],
+)
+def test_pixel_formats(tmp_path, name, codec, pix_fmt, options):
+    frames = [np.full((48, 64, 3), 20 + 20 * n, np.uint8) for n in range(11)]
+    path = write_film(frames, tmp_path / name, codec, pix_fmt=pix_fmt, **options)
+    for (_, image), frame in zip(frame_source(path), frames, strict=True):
+        np.testing.assert_allclose(image.astype(int), frame, atol=3)
+
+
+def test_a_video_of_one_frame(tmp_path):
+    source = frame_source(write_film(FRAMES[7:8], tmp_path / "one.mp4"))
+    assert [number_of(image) for _, image in source] == [7] and source.expected == 1
