@@ -333,9 +333,11 @@ class ColmapDataManager(RecordedDataManager):
             raise InputError(
                 f"{path} has depths/, but the model's unit of length and the value of a step of depth are not given",
                 f"the option depth_unit: units of the model per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
-                "For instance --set datamanager.depth_unit=0.001 for millimetres in a model in metres; or move depths/ "
-                "away if it is relative",
+                "For millimetres in a model in metres --set datamanager.depth_unit=0.001, or unit.txt with m, "
+                "which means the same; move depths/ away if it is relative",
             )
+        if depth_unit is None and any(depths):
+            log.info("%s/depths is read at 1 mm a step; --set datamanager.depth_unit=MM changes that", path)
         size = (depth_unit or 1.0) / FACTORS[unit]
         return [None if depth is None else depth_format(depth, size) for depth in depths]
 

@@ -20,11 +20,11 @@ from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_ps
 from coliags_plugin.engine.devices import device_name, software
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.rendering import error_limit_of
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth, match_truth
 from coliags_plugin.outputs.colormaps import (
+    DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
     colorize_depth_error,
@@ -72,7 +72,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     sets = {name: frames for name, frames in scene.test_sets.items() if frames}
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name, against_truth=truth is not None)
-    evaluated = {name: EvaluatedSet(scene.length_unit, scorer) for name in sets}
+    scale = 1.0 if scene.is_metric else trained.model.scale
+    evaluated = {name: EvaluatedSet(scene.length_unit, scorer, scale) for name in sets}
     meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
@@ -82,7 +83,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 comparison = scorer.protocol.compare(output, placed)
                 refined = scorer.refined(trained.model, placed) if refine_poses else ()
                 evaluated[set_name].add(placed, comparison, output.alpha, *refined)
-                _write_images(scratch, set_name, frame, comparison, error_limit_of(trained))
+                _write_images(scratch, set_name, frame, comparison, DEPTH_ERROR_LIMIT_MM / scale)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
                 done += 1

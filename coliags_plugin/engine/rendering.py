@@ -58,14 +58,14 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
     path: Sequence[Frame | Camera] = choose_frames(trained.scene, "all")
     if along is not None:
         path = list(along.cameras(trained.scene.train[0].camera, options.fps))
-    limits, error_limit = sampled_depth_limits(trained, chosen or path, depth), error_limit_of(trained)
+    limits = sampled_depth_limits(trained, chosen or path, depth)
     with (
         atomic_folder(output, options.overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * options.video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
-            _write_frame(folder, frame, view, depth, limits, error_limit, trained.relit)
+            _write_frame(folder, frame, view, depth, limits, trained)
             if options.depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
@@ -73,7 +73,7 @@ def render_run(trained: TrainedRun, options: RenderOptions) -> Path:
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
         if (folder / "depth_error").exists():  # some frame has true depth
-            write_png(folder / "depth_error_scale.png", color_bar((0.0, error_limit), unit, "error"))
+            write_png(folder / "depth_error_scale.png", color_bar((0.0, error_limit_of(trained)), unit, "error"))
         if chosen and not trained.relit:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
         for light in (trained.lamp, trained.held):
@@ -136,24 +136,18 @@ def _as_rgb(channel: Tensor) -> Tensor:
 
 
 def _write_frame(
-    folder: Path,
-    frame: Frame,
-    output: RenderOutput,
-    depth_name: str,
-    limits: tuple[float, float],
-    error_limit: float,
-    relit: bool,
+    folder: Path, frame: Frame, output: RenderOutput, depth_name: str, limits: tuple[float, float], trained: TrainedRun
 ) -> None:
     name = f"{frame.name}.png"
     depth = output[depth_name]
     write_png(folder / "rgb" / name, eight_bit(output.rgb))
     write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
     valid = frame.valid.cpu()
-    if not relit:
+    if not trained.relit:
         errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
         write_png(folder / "rgb_error" / name, errors)
     if (true := frame.true_depth) is not None:
-        errors = colorize_depth_error(depth.cpu(), true, valid, error_limit)
+        errors = colorize_depth_error(depth.cpu(), true, valid, error_limit_of(trained))
         write_png(folder / "depth_error" / name, errors)
 
 

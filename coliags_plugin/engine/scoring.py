@@ -110,14 +110,17 @@ class Scorer:
 
 
 class EvaluatedSet:
-    """Scores, error profiles and hashes of one test set of a scene, whose unit of length is printed as ``unit``."""
+    """Scores, error profiles and hashes of one test set of a scene, whose unit of length is printed as ``unit``.
 
-    def __init__(self, unit: str, scorer: Scorer) -> None:
+    ``scale`` is that of lengths in training.
+    """
+
+    def __init__(self, unit: str, scorer: Scorer, scale: float = 1.0) -> None:
         self._scorer = scorer
         self._rows: dict[str, dict[str, float]] = {}
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
-        self._profiles = ErrorProfiles(unit)
+        self._profiles = ErrorProfiles(unit, scale)
         self._pixels = self._transparent = self._blank = 0
 
     def add(self, frame: Frame, comparison: Comparison, alpha: Float[Tensor, "H W"], *refined: Comparison) -> None:

@@ -22,11 +22,12 @@ class ErrorProfiles:
     """Sums of squared errors over the pixels of many frames whose true depth is known, in bins with fixed edges.
 
     A pixel counts if the frame's own true depth is finite and the protocol compares both its colour and its depth. Its
-    distance is that of the true surface, in ``unit``; pixels beyond the last edge are left out.
+    distance is that of the true surface, in ``unit``; pixels beyond the last edge are left out. Edges times ``scale``
+    are :data:`DISTANCE_EDGES`.
     """
 
-    def __init__(self, unit: str = "mm") -> None:
-        self._distance = _Bins(unit, DISTANCE_EDGES)
+    def __init__(self, unit: str = "mm", scale: float = 1.0) -> None:
+        self._distance = _Bins(unit, tuple(edge / scale for edge in DISTANCE_EDGES))
         self._angle = _Bins("degrees", ANGLE_EDGES)
         self._frames = 0
 

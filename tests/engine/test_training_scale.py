@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from coliags_plugin.config.options import ExportOptions
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine import training as training_module
@@ -111,6 +112,12 @@ def test_evaluations_are_in_its_own_unit(runs, factor):
     assert results[0].mean("psnr") == pytest.approx(results[1].mean("psnr"), abs=0.01)
     depths = [read_depth_tiff(next((run.run.evaluations / "paper/expected_depth/test").iterdir())) for run in runs]
     np.testing.assert_allclose(factor * depths[0], depths[1], rtol=1e-3)
+    edges, edges_mm = (result.sets["test"].profiles["distance"].edges for result in results)
+    np.testing.assert_allclose(factor * np.array(edges), edges_mm)
+    pixels, pixels_mm = (sum(result.sets["test"].profiles["distance"].pixels) for result in results)
+    assert 0 < pixels == pytest.approx(pixels_mm, rel=0.01)
+    errors = [read_rgb(next((run.run.evaluations / "paper/errors/test").iterdir())) for run in runs]
+    assert np.abs(errors[0].astype(int) - errors[1]).mean() < 1.0 and errors[1].std() > 5.0
     learned, learned_mm = (run.model.learned for run in runs)
     for name, numbers in learned["field"].items():  # of the model, at the size it was trained at
         np.testing.assert_allclose(numbers, learned_mm["field"][name], rtol=1e-4, atol=1e-6)
