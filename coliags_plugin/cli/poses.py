@@ -183,17 +183,19 @@ class PosesConvertCommand:
         if self.output.exists() and self.output.samefile(self.input):
             raise InputError(f"{self.output} is the input itself", "another output path")
         if pinhole is not None:
-            trajectory = replace(trajectory, intrinsics=pinhole)
+            trajectory = replace(trajectory, intrinsics=pinhole, cameras=None)
         if self.images is not None:
             trajectory = replace(trajectory, names=_image_names(self.images, len(trajectory)))
         lost = [
             part
-            for part in ("names", "timestamps", "intrinsics")
+            for part in ("names", "timestamps", "intrinsics", "cameras")
             if getattr(trajectory, part) is not None and part not in target.keeps
         ]
         write_trajectory(self.output, trajectory, self.to, self.overwrite)
         if lost:
             _LOG.info("%s does not store %s: dropped", self.to, ", ".join(lost))
+        if "cameras" in target.keeps and trajectory.intrinsics is None and trajectory.cameras is None:
+            _LOG.warning("%s has no camera, which its readers need; --intrinsics and --size give it one", self.output)
         if "names" in target.keeps and trajectory.names is None:
             _LOG.info("the input has no image names: using 0000.png, 0001.png, ...; --images takes the real names")
         if "timestamps" in target.keeps and trajectory.timestamps is None:

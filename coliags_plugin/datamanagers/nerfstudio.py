@@ -331,7 +331,7 @@ class NerfstudioDataManager(RecordedDataManager):
             "pixel_centers_in_file": settings.pixel_centers,
             "pose_convention": {
                 "stored_as": trajectory.stored_as,
-                "remarks": [remark for remark in trajectory.remarks if not remark.startswith("no intrinsics")],
+                "remarks": [remark for remark in trajectory.remarks if not remark.startswith("no ")],
             },
             "masks": sum(mask is not None for mask in masks),
         }

@@ -74,6 +74,7 @@ def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     assert "mean step" in said
     assert "mean looking direction (" in said
     assert "the input has no image names: using 0000.png" in said
+    assert "t.json has no camera, which its readers need; --intrinsics and --size give it one" in said
     assert "tum does not store names: dropped" in said
     assert "no timestamps: frame numbers are written instead" in said
 

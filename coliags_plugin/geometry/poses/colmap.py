@@ -23,6 +23,7 @@ from jaxtyping import Float, Int, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, final_place, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.text_files import text_lines
 from coliags_plugin.geometry.poses.formats import EXPECTED, Format, prefixed_errors, shortened
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
@@ -271,14 +272,44 @@ def read(path: Path) -> Trajectory:
             "Give the folder of the sparse model itself, often sparse/0",
         )
     images = ordered_images(path / f"images{suffix}")
-    intrinsics, remark = _common(read_pinholes(path / f"cameras{suffix}"), {image.camera for image in images})
+    used = [image.camera for image in images]
+    intrinsics, remark = _common(read_pinholes(path / f"cameras{suffix}"), set(used))
+    keys = {} if intrinsics else {n: _keys(camera) for n, camera in read_cameras(path / f"cameras{suffix}").items()}
+    cameras = [keys.get(number) for number in used]
     return Trajectory(
         camera_to_world(images),
         names=tuple(image.name for image in images),
         intrinsics=intrinsics,
+        cameras=tuple(camera for camera in cameras if camera) if all(cameras) else None,
         stored_as=f"world-to-camera translations and quaternions, w first, {'binary' if suffix == '.bin' else 'text'}",
         remarks=(remark,) if remark else (),
     )
+
+
+#: nerfstudio's model of those of COLMAP that it has, and its keys for their parameters; ``f`` is both focal lengths.
+_NERFSTUDIO = {
+    "SIMPLE_PINHOLE": ("PINHOLE", "f cx cy"),
+    "PINHOLE": ("PINHOLE", "fl_x fl_y cx cy"),
+    "SIMPLE_RADIAL": ("OPENCV", "f cx cy k1"),
+    "RADIAL": ("OPENCV", "f cx cy k1 k2"),
+    "OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
+    "FULL_OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", "f cx cy k1"),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", "f cx cy k1 k2"),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy k1 k2 k3 k4"),
+}
+
+
+def _keys(camera: ColmapCamera) -> JsonObject | None:
+    """A camera by nerfstudio's keys; None of a model that it does not have."""
+    model, names = _NERFSTUDIO.get(camera.model, ("", ""))
+    keys: JsonObject = dict(zip(names.split(), camera.params, strict=False))
+    # nerfstudio's k4 is that of OpenCV's fisheye alone.
+    if not model or (model == "OPENCV" and any(keys.pop(key, 0.0) for key in ("k4", "k5", "k6"))):
+        return None
+    if "f" in keys:
+        keys = {"fl_x": keys["f"], "fl_y": keys.pop("f"), **keys}
+    return {"camera_model": model, **keys, "w": camera.width, "h": camera.height}
 
 
 def camera_to_world(images: Sequence[ColmapImage]) -> Float[np.ndarray, "N 4 4"]:
@@ -388,10 +419,10 @@ def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intri
     others = [camera for camera in cameras.values() if isinstance(camera, str)]
     if len(shared) < len(used) or any(isinstance(camera, str) for camera in shared):
         reason = others[0] if others else "the model lacks a camera that an image names"
-        return None, f"no intrinsics: {reason}, not an undistorted pinhole"
+        return None, f"no common pinhole: {reason}, not an undistorted pinhole"
     pinholes = {camera for camera in shared if isinstance(camera, Intrinsics)}
     if len(pinholes) > 1:
-        return None, f"no intrinsics: the images have {len(pinholes)} different cameras"
+        return None, f"no common pinhole: the images have {len(pinholes)} different cameras"
     return pinholes.pop(), ""
 
 

@@ -27,7 +27,7 @@ class Format:
         write: Writes a file or folder, replacing an existing one; None if the format is read-only.
         recognise: Whether a path has this format, by content; None if another format recognises it.
         unit: Its unit of length, or ``"units"`` if the format defines none.
-        keeps: Further stored data: ``names``, ``timestamps``, ``intrinsics``.
+        keeps: Further stored data: ``names``, ``timestamps``, ``intrinsics``, ``cameras`` of each pose.
         folder: Whether the format is a folder of files.
     """
 

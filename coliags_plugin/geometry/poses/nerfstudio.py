@@ -6,6 +6,7 @@ Poses are camera-to-world with OpenGL axes.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,15 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.json_files import read_json, read_number
+from coliags_plugin.core.json_files import JsonObject, read_json, read_number
 from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: Keys of a camera, of the file or of a frame.
+_CAMERA = (*_PINHOLE, *_DISTORTION, "k5", "k6", "camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y")
 _UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 
 
@@ -54,26 +57,33 @@ def read(path: Path) -> Trajectory:
     if order != list(range(len(order))):
         remarks.append("frames are put in the order of their names")
     intrinsics, remark = _intrinsics(path, content, frames)
+    cameras = [{key: value for key, value in ({**content, **frame}).items() if key in _CAMERA} for frame in frames]
     return Trajectory(
         (camera_to_world @ FLIP_Y_AND_Z)[order],
         names=tuple(names[index] for index in order),
         intrinsics=intrinsics,
+        cameras=tuple(cameras[index] for index in order) if intrinsics is None and any(cameras) else None,
         stored_as="camera-to-world matrices, OpenGL axes",
         remarks=(*remarks, *([remark] if remark else [])),
     )
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a ``transforms.json``, with intrinsics if known."""
+    """Write a ``transforms.json``, with the camera of all frames, or of each, if known."""
     names = trajectory.names_or_numbers()
     refuse_repeated(names, str(path))
     content: dict[str, Any] = {}
     if (pinhole := trajectory.intrinsics) is not None:
         numbers = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
         content = {"camera_model": "PINHOLE", **dict(zip(_PINHOLE, numbers, strict=True))}
+    own: Sequence[JsonObject] = trajectory.cameras or [{}] * len(trajectory)
+    # nerfstudio reads the model of the file alone, and no distortion of frames where the file has any.
+    common = own[0].keys() if all(camera == own[0] for camera in own) else {"camera_model"}
+    content |= {key: own[0][key] for key in common if all(camera.get(key) == own[0].get(key, ()) for camera in own)}
     opengl = trajectory.camera_to_world @ FLIP_Y_AND_Z
     content["frames"] = [
-        {"file_path": name, "transform_matrix": matrix.tolist()} for name, matrix in zip(names, opengl, strict=True)
+        {"file_path": name, "transform_matrix": matrix.tolist()} | {k: camera[k] for k in camera if k not in content}
+        for name, matrix, camera in zip(names, opengl, own, strict=True)
     ]
     write_json(path, content)
 
@@ -115,7 +125,7 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
         }
         model = values.pop("camera_model")
         if model not in (None, *_UNDISTORTED) or any(values[key] for key in _DISTORTION):
-            return None, f"no intrinsics: the camera ({model or 'OPENCV'}) is distorted"
+            return None, f"no common pinhole: the camera ({model or 'OPENCV'}) is distorted"
         if values["fl_x"] is None and values["camera_angle_x"] is not None and values["w"] and values["h"]:
             # Blender's form: square pixels, the principal point in the middle.
             half_width, half_height = (0.5 * read_number(values, key, path) for key in ("w", "h"))
@@ -128,7 +138,7 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
         with prefixed_errors(str(path)):
             found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
     if len(found) > 1:
-        return None, f"no intrinsics: the images have {len(found)} different cameras"
+        return None, f"no common pinhole: the images have {len(found)} different cameras"
     return found.pop(), ""
 
 
@@ -137,5 +147,5 @@ FORMAT = Format(
     read,
     write,
     lambda path: head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"),  # a JSON object
-    keeps=frozenset({"names", "intrinsics"}),
+    keeps=frozenset({"names", "intrinsics", "cameras"}),
 )

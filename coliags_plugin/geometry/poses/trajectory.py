@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.geometry.poses.rigid import check_rigid
 
 
@@ -25,7 +26,9 @@ class Trajectory:
     camera_to_world: Float[np.ndarray, "N 4 4"]  # float64
     names: tuple[str, ...] | None = None  # image name of each pose in the file
     timestamps: Float[np.ndarray, "N"] | None = None  # capture time of each image, s. float64
-    intrinsics: Intrinsics | None = None  # the pinhole that took all images; None: unknown, or there are several
+    intrinsics: Intrinsics | None = None  # the pinhole that took all images; None: unknown, or other cameras
+    # The camera of each pose, by nerfstudio's keys, where they are not one pinhole and nerfstudio has them
+    cameras: tuple[JsonObject, ...] | None = None
     stored_as: str = ""  # convention of the file, for messages
     remarks: tuple[str, ...] = ()  # changes and omissions when the file was read
 
@@ -79,7 +82,8 @@ class Trajectory:
         """The intrinsics, for a file that must hold them; refuses a trajectory without."""
         if self.intrinsics is None:
             raise InputError(
-                f"no intrinsics for {path}",
+                f"no intrinsics for {path}"
+                + ("" if self.cameras is None else ", but cameras that are not one pinhole"),
                 f"{holder} to hold the camera's intrinsics and image size",
                 "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
             )

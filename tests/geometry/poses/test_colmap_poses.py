@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import numpy as np
@@ -10,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.datamanagers.nerfstudio import camera_of
+from coliags_plugin.geometry.poses import colmap, nerfstudio
 from tests.geometry.poses.winding import PINHOLE, winding
 
 NAMES = ("10.png", "2.png", "frame.png", "sub/1.png")
@@ -103,6 +105,47 @@ def test_common_pinholes(tmp_path, cameras, remark):
         assert remark in read.remarks[0]
 
 
+PARAMS = {
+    "SIMPLE_PINHOLE": "70 33 23",
+    "SIMPLE_RADIAL": "70 33 23 0.1",
+    "RADIAL": "70 33 23 0.1 -0.05",
+    "OPENCV": "70 71 33 23 0.1 -0.05 0.01 0.02",
+    "FULL_OPENCV": "70 71 33 23 0.1 -0.05 0.01 0.02 0.03 0 0 0",
+    "SIMPLE_RADIAL_FISHEYE": "70 33 23 0.1",
+    "RADIAL_FISHEYE": "70 33 23 0.1 -0.05",
+    "OPENCV_FISHEYE": "70 71 33 23 0.1 -0.05 0.02 0.01",
+    "FOV": "70 71 33 23 0.5",
+    "FULL_OPENCV ": "70 71 33 23 0.1 -0.05 0.01 0.02 0.03 0.1 0 0",
+}
+
+
+@pytest.mark.parametrize("model", PARAMS)
+@pytest.mark.parametrize("other", ["1", "2"])
+def test_nerfstudio_has_the_cameras_of_colmap(tmp_path, model, other):
+    """Several, or one that is distorted: its lenses project as pycolmap's do, if it has such a model at all."""
+    import pycolmap
+
+    write_text(
+        tmp_path,
+        f"1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 {other} b.png\n\n",
+        f"1 {model} 64 48 {PARAMS[model]}\n2 PINHOLE 64 48 80 81 32 24\n",
+    )
+    trajectory = colmap.read(tmp_path)
+    nerfstudio.write(tmp_path / "t.json", trajectory)
+    content, again = json.loads((tmp_path / "t.json").read_text()), nerfstudio.read(tmp_path / "t.json")
+    assert again.cameras == trajectory.cameras
+    if model in ("FOV", "FULL_OPENCV "):
+        assert again.cameras is again.intrinsics is None
+        return
+    points = np.array([[0.1, -0.2, 1.0], [0.3, 0.2, 1.0], [-0.4, 0.1, 2.0]])
+    names = [model, "PINHOLE" if other == "2" else model]
+    params = [PARAMS[model], "80 81 32 24" if other == "2" else PARAMS[model]]
+    for frame, name, numbers in zip(content["frames"], names, params, strict=True):
+        camera = pycolmap.Camera(model=name, width=64, height=48, params=[float(word) for word in numbers.split()])
+        lens = camera_of({**content, **frame}, "frame", "half", lambda: (0, 0))
+        np.testing.assert_allclose(lens.project(points), camera.img_from_cam(points), atol=1e-9)
+
+
 ONE = "1 1 0 0 0 5 6 7 1 a.png\n\n"
 CAMERA = "1 PINHOLE 64 48 70 71 32 24\n"
 
@@ -163,7 +206,7 @@ def test_a_real_model_read_as_pycolmap_reads_it(shared_data, tmp_path, folder):
     assert read.names == tuple(sorted(found))
     assert len(read) == 23
     np.testing.assert_allclose(read.camera_to_world, [found[name] for name in read.names], atol=1e-12)
-    assert "no intrinsics" in read.remarks[0]
+    assert "no common pinhole" in read.remarks[0]
     # The same model as text, observations and all.
     pycolmap.Reconstruction(str(source)).write_text(str(tmp_path))
     text = colmap.read(tmp_path)

@@ -253,7 +253,7 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
     content = json.loads(path.read_text())
     content["frames"][1]["fl_x"] = 99.0
     path.write_text(json.dumps(content))
-    assert nerfstudio.read(path).remarks == ("no intrinsics: the images have 2 different cameras",)
+    assert nerfstudio.read(path).remarks == ("no common pinhole: the images have 2 different cameras",)
 
 
 def frames(matrix, **content):
