@@ -332,7 +332,7 @@ class ColmapDataManager(RecordedDataManager):
         if depth_unit is None and unit == "unknown" and any(depths):
             raise InputError(
                 f"{path} has depths/, but the model's unit of length and the value of a step of depth are not given",
-                f"the option depth_unit: units of the model per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
+                f"the option depth_unit, scene lengths per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
                 "For millimetres in a model in metres --set datamanager.depth_unit=0.001, or unit.txt with m, "
                 "which means the same; move depths/ away if it is relative",
             )

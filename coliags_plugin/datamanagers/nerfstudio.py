@@ -150,6 +150,7 @@ class Transforms:
         if not any(files) and "depth_path" in named and content.get("enable_depth_loading", True):
             # As instant-ngp has it, there is no depth without a scale.
             step = read_number({"integer_depth_scale": 0, **content}, "integer_depth_scale", self.path)
+            step /= float(content.get("applied_scale", 1.0))  # which it knows nothing of
             if (step := given or step) > 0.0:
                 return self.files("depth_path", for_every=True), step
         if not any(files) and (others := sorted(key for key in named if "depth" in key)):

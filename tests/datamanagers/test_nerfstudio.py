@@ -165,6 +165,7 @@ NGP, UNREAD, DEFAULT = {"integer_depth_scale": 0.02}, "no depth is read from dep
             6.0,
             "",
         ),
+        ("depth_path", NGP | {"applied_scale": 0.5}, {}, 4.0, ""),
         ("depth_path", {}, {"depth_unit_scale_factor": 0.05}, 5.0, ""),
         ("depth_path", NGP | {"enable_depth_loading": False}, {}, None, UNREAD),
         ("depth_path", {"enable_depth_loading": True}, {}, None, UNREAD),
