@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -20,6 +21,8 @@ from coliags_plugin.core.text_files import unreadable
 
 if TYPE_CHECKING:
     import PIL.Image
+
+log = logging.getLogger(__name__)
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 #: Bytes of a chunk of a PNG besides its data: length, type and checksum.
@@ -80,13 +83,18 @@ def has_alpha(path: Path) -> bool:
     """Whether an image file has an alpha channel, or a colour that stands for transparency, by its header."""
     import PIL.Image
 
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        return False
     with suppress(Exception), warnings.catch_warnings():  # the decoder says what is wrong with a damaged file
         warnings.simplefilter("ignore")
         with PIL.Image.open(path) as header:
             return bool(header.has_transparency_data)
     return False
+
+
+def tell_of_alpha(where: Path, images: Sequence[Path]) -> None:
+    """Log how many images have an alpha channel, if any, and what becomes of it."""
+    if count := sum(map(has_alpha, images)):
+        said = "%s: %d of %d images have an alpha channel: pixels of alpha below 128 are masked"
+        log.info(said, where, count, len(images))
 
 
 def read_alpha(path: Path) -> Bool[np.ndarray, "H W"] | None:

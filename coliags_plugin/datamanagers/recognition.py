@@ -52,9 +52,12 @@ def find_format(path: Path) -> str:
 
 
 def videos_in(folder: Path) -> list[Path]:
-    """The videos of a recording's folder in natural order; none where images are there and no calibration file."""
+    """The videos of a recording's folder in natural order; none where images are there and no calibration file.
+
+    A WebP beside a video is its preview.
+    """
     videos = files_in(folder, _VIDEO_SUFFIXES)
-    if files_in(folder, FRAME_SUFFIXES) and not calibration_files(folder):
+    if files_in(folder, FRAME_SUFFIXES - {".webp"}) and not calibration_files(folder):
         return []
     return [videos[index] for index in natural_order([path.name for path in videos])]
 

@@ -19,7 +19,7 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.images import has_alpha, sizes_text
+from coliags_plugin.core.images import sizes_text, tell_of_alpha
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
@@ -173,13 +173,11 @@ class RecordedDataManager(DataManager):
         if masks:
             level = logging.INFO if len(masks) == len(shots) else logging.WARNING
             log.log(level, "%s: %d of %d frames have a mask", path, len(masks), len(shots))
-        if alpha := sum(has_alpha(shot.image) for shot in shots):
-            said = "%s: %d of %d images have an alpha channel: pixels of alpha below 128 are masked"
-            log.info(said, path, alpha, len(shots))
+        tell_of_alpha(path, [shot.image for shot in shots])
         used = {part for mask in masks for part in (mask, *mask.parents)}
         for file in path.iterdir():
             is_image = file.is_dir() or file.suffix.lower() in FRAME_SUFFIXES
-            if file.stem.lower() in ("mask", "masks") and is_image and file not in used:
+            if "mask" in file.stem.lower() and is_image and file not in used and file.name != self.masks_at:
                 log.warning("%s is not used: format %s reads %s", file, self.name, self.masks_at)
 
     def _valid_seen_masks(

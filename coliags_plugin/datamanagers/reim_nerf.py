@@ -94,6 +94,7 @@ class ReimNerfDataManager(RecordedDataManager):
 
     settings: ReimNerfDataSettings
     name = "reim-nerf"
+    masks_at = MASK_FILE
     #: REIM-NeRF trains and evaluates at a fifth of the raw size.
     fits = (270, 216)
     seen_split = "own"

@@ -18,6 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
+from coliags_plugin.datamanagers.reading.files import sidecar_files
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
 from coliags_plugin.geometry.poses import colmap as colmap_poses
@@ -203,6 +204,28 @@ def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     assert f"1 of {COUNT} frames have a mask" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
     assert scene.train[1].mask is None and scene.provenance["masks"] == 1
+
+
+def test_masks_and_alpha_hide_both(mine):
+    (mine / "masks").mkdir()
+    mask, alpha = np.full((2, HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :8], alpha[:8] = 0, 0
+    cv2.imwrite(str(mine / "masks/1.png"), mask)
+    image = cv2.imread(str(mine / "images/1.png"))
+    cv2.imwrite(str(mine / "images/1.png"), np.dstack([image, alpha]))
+    # Of a file that is misnamed, too.
+    (mine / "images/2.png").write_bytes(cv2.imencode(".webp", np.dstack([image, alpha]))[1].tobytes())
+    first, second = load(mine).train[:2]
+    np.testing.assert_array_equal(first.mask.numpy(), np.minimum(mask, alpha) > 0)
+    np.testing.assert_array_equal(second.mask.numpy(), alpha > 0)
+
+
+def test_files_of_images_with_names_of_windows(tmp_path):
+    for name in ("a/1.png", "a/2.jpg.png", r"a\3.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = sidecar_files(tmp_path, [r"a\1.jpg", r"a\2.jpg", r"a\3.jpg", r"b\4.jpg"], (".png",))
+    assert [path and path.name for path in found.values()] == ["1.png", "2.jpg.png", r"a\3.png", None]
 
 
 @pytest.mark.parametrize("name", ["1_mask.png", "frames/1.png", "1.png.txt"])

@@ -258,7 +258,7 @@ def test_no_working_pixel_mixes_in_the_colour_of_a_hidden_one(copied, name, size
 @pytest.mark.parametrize("name", KINDS)
 def test_masks_that_are_not_used_are_named(copied, caplog, name):
     folder = copied(name)
-    place = folder / ("masks.png" if name == "endomapper" or name.startswith("rgbd") else "Masks")
+    place = folder / ("lens_mask.png" if name == "endomapper" or name.startswith("rgbd") else "Masks")
     if place.suffix:  # masks/ is what these read
         cv2.imwrite(str(place), np.full((HEIGHT, WIDTH), 255, np.uint8))
     else:

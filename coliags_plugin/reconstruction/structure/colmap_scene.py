@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from coliags_plugin.core.files import atomic_folder, atomic_write, link_or_copy, write_json
-from coliags_plugin.core.images import decode_image, encode_image, read_8_bit, write_mask
+from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
+from coliags_plugin.core.images import decode_image, read_8_bit, write_image, write_mask
 from coliags_plugin.datamanagers.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
-from coliags_plugin.outputs.image_files import encode_jpeg, write_png
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
 
@@ -61,8 +61,7 @@ def _copy_as_8_bit(source: Path, target: Path) -> None:
     if image.ndim == 3 and image.dtype == np.uint8:
         shutil.copyfile(source, target)
     else:
-        pixels, is_jpeg = read_8_bit(source), target.suffix.lower() in (".jpg", ".jpeg")
-        atomic_write(target, encode_jpeg(pixels, quality=100) if is_jpeg else encode_image(pixels, target.suffix))
+        write_image(target, read_8_bit(source))
 
 
 def _record(atlas: Atlas, units: Sequence[Unit]) -> dict[str, object]:
