@@ -21,6 +21,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio import camera_of
 from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder, required_file
@@ -81,7 +82,8 @@ def read_exr_channel(path: Path, channel: str, do: str = _CHANNEL) -> Float32[np
             if not channels:
                 raise ValueError("no channels")
     except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(
+        raise unreadable(
+            path,
             f"{path} ({path.stat().st_size} bytes) cannot be decoded",
             "a complete OpenEXR file",
             "It is damaged or cut short: fetch it again",

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.files import user_path
+from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
 
 WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
@@ -115,7 +116,7 @@ def _read(file: Path) -> dict[str, Tensor]:
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, ValueError, LookupError, pickle.UnpicklingError) as error:
-        raise UnavailableError(f"{file} cannot be read as torch weights") from error
+        raise UnavailableError(unreadable(file, f"{file} cannot be read as torch weights", "").seen) from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise UnavailableError(f"{file} does not hold a table of tensors")
     return state

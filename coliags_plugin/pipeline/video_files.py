@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import unreadable
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -90,7 +91,8 @@ class VideoFile:
             # Without the protocol, a name such as 12:30.mp4 would have one.
             container = av.open(f"file:{self.path}")
         except (av.FFmpegError, OSError) as error:
-            raise InputError(
+            raise unreadable(
+                self.path,
                 f"{self.path} ({self.path.stat().st_size} bytes) cannot be opened as a video by FFmpeg "
                 f"({getattr(error, 'strerror', None) or error})",
                 "a video file with a codec of FFmpeg, for instance .mp4, .avi or .mov",

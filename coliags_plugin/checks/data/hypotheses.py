@@ -13,6 +13,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.geometry.poses.rigid import w_first
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
 from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
 from coliags_plugin.reconstruction.structure.point_tracks import PointTracker
@@ -39,6 +40,7 @@ CHANGES: dict[str, Change] = {
     "rotation transposed": _transposed,
     "translation of opposite sign": lambda pose: pose * pose.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4]),
     "camera axes y up, z backward": lambda pose: pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0]),
+    "quaternions with w first": lambda pose: torch.from_numpy(w_first(pose[None].cpu().double().numpy())[0]).to(pose),
 }
 
 #: Advice where a hypothesis fits.
@@ -47,6 +49,8 @@ ADVICE = {
     "rotation transposed": "The rotations look transposed: the program that wrote the file confused rows and columns",
     "translation of opposite sign": "The translations look negated: check the sign in the program that wrote the file",
     "camera axes y up, z backward": "The camera axes look like OpenGL's; negate the second and third column",
+    "quaternions with w first": "The quaternions look as if w came first: put it last, or name the columns on top of a "
+    "TUM file, '# timestamp tx ty tz qw qx qy qz'",
 }
 
 

@@ -9,7 +9,9 @@ Computer Vision 103, 2013.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.endogslam import image_indices
-from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse, rigid, rotation_angles_deg, w_first
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 Match = Literal["auto", "name", "time", "index", "endogslam-train"]
@@ -410,6 +412,35 @@ def align(
         relative_translation_errors=np.linalg.norm(difference[:, :3, 3], axis=1),
         relative_rotation_errors_deg=rotation_angles_deg(difference[:, :3, :3]),
     )
+
+
+#: Other readings of poses, by what these are in them.
+_READINGS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
+    "quaternions with w first": w_first,
+    "camera axes y up, z backward": lambda poses: poses @ FLIP_Y_AND_Z,
+    "world-to-camera": inverse,
+}
+#: Rotation error from which on others are tried, degrees; and the share of it that another must leave at most.
+_SUSPICIOUS_DEG, _CLEARLY_BETTER = 15.0, 0.3
+
+
+def better_reading(estimate: Trajectory, reference: Trajectory, result: Alignment) -> str:
+    """Another reading of one of two trajectories that leaves little of their rotation error; empty if there is none."""
+    errors: dict[str, float] = {}
+    for name, change in _READINGS.items() if result.rotation_deg.rmse > _SUSPICIOUS_DEG else ():
+        for which, pair in (
+            ("estimate", (_changed(estimate, change), reference)),
+            ("reference", (estimate, _changed(reference, change))),
+        ):
+            with suppress(InputError):  # a camera that does not move, in that reading
+                found = align(*pair, result.matches, result.with_scale, result.delta).rotation_deg.rmse
+                errors[f"the poses of the {which} are read as {name}, the rotation error is {found:.3g} deg"] = found
+    best = min(errors, key=lambda text: errors[text], default="")
+    return best if best and errors[best] < _CLEARLY_BETTER * result.rotation_deg.rmse else ""
+
+
+def _changed(trajectory: Trajectory, change: Callable[[np.ndarray], np.ndarray]) -> Trajectory:
+    return replace(trajectory, camera_to_world=change(trajectory.camera_to_world))
 
 
 def _motion(camera_to_world: np.ndarray, delta: int) -> np.ndarray:

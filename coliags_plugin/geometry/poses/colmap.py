@@ -24,7 +24,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, final_place, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.text_files import text_lines
+from coliags_plugin.core.text_files import text_lines, unreadable
 from coliags_plugin.geometry.poses.formats import EXPECTED, Format, prefixed_errors, shortened
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
@@ -166,7 +166,7 @@ def _binary_records(path: Path, read: Callable[[_Cursor], _Record]) -> list[_Rec
             raise ValueError("more than the records")
     except (struct.error, ValueError, OverflowError) as error:
         message = f"{path} ({len(cursor.data)} bytes) is damaged or cut short"
-        raise InputError(message, "a file written by COLMAP", "Copy it again") from error
+        raise unreadable(path, message, "a file written by COLMAP", "Copy it again") from error
     return records
 
 

@@ -94,6 +94,12 @@ def wxyz_from_rotations(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarr
     return np.asarray(xyzw[:, [3, 0, 1, 2]])
 
 
+def w_first(matrices: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
+    """Rigid transforms read again from quaternions whose first number, not the last, is w. [N, 4, 4]"""
+    stored = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+    return rigid(Rotation.from_quat(stored, scalar_first=True).as_matrix(), matrices[:, :3, 3])
+
+
 def rigid(rotations: Float[np.ndarray, "N 3 3"], translations: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4 4"]:
     """Rigid transforms from rotations and translations. [N, 4, 4]"""
     matrices = np.tile(np.eye(4), (len(rotations), 1, 1))

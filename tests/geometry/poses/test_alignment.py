@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.alignment import FrameMatches, Similarity, align, associate, umeyama, world_rotation
+from coliags_plugin.geometry.poses.alignment import (
+    FrameMatches,
+    Similarity,
+    align,
+    associate,
+    better_reading,
+    umeyama,
+    world_rotation,
+)
+from coliags_plugin.geometry.poses.rigid import w_first
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.geometry.poses.winding import some_transform, trajectories, winding
 
@@ -214,6 +224,29 @@ def test_errors_by_their_definitions(delta):
     np.testing.assert_allclose(result.relative_translation_errors, translations)
     np.testing.assert_allclose(result.relative_rotation_errors_deg, angles, rtol=1e-6)
     assert result.ate.rmse == pytest.approx(np.sqrt(np.mean(np.square(positions))))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("quaternions with w first", lambda poses: w_first(w_first(w_first(poses)))),
+        ("camera axes y up, z backward", lambda poses: poses @ np.diag([1.0, -1.0, -1.0, 1.0])),
+        ("world-to-camera", np.linalg.inv),
+    ],
+)
+@pytest.mark.parametrize("which", ["estimate", "reference"])
+def test_another_reading_that_explains_the_rotation_error_is_named(name, change, which):
+    true = winding(20)
+    pair = [moved(true, some_transform(1)), true]
+    assert better_reading(*pair, aligned(*pair)) == ""
+    index = ("estimate", "reference").index(which)
+    pair[index] = replace(pair[index], camera_to_world=change(pair[index].camera_to_world))
+    found = better_reading(*pair, aligned(*pair))
+    assert f"read as {name}, the rotation error is" in found
+    # The two cannot tell which of them is of other axes.
+    assert which in found or "axes" in name
+    random = [winding(20, seed) for seed in (1, 2)]
+    assert better_reading(*random, aligned(*random)) == ""
 
 
 @pytest.mark.parametrize("delta", [0, -1, 12, 100])
