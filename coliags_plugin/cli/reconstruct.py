@@ -39,7 +39,8 @@ class ReconstructCommand(options.ReconstructOptions):
     every: options.OptionalInt = None
     """Use the sharpest of every n frames; default: all."""
     frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
-    """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate."""
+    """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate, or of every
+    1/F s of a variable one."""
     size: options.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
     method: options.OptionalText = None
@@ -81,7 +82,7 @@ class ReconstructCommand(options.ReconstructOptions):
         )
 
     def _frames(self) -> dict[str, Any]:
-        """Settings of which frames are used, None where nothing is given; times by the video's rate."""
+        """Settings of which frames are used, None where nothing is given."""
         from coliags_plugin.pipeline.frame_sources import every_of, frame_at, frame_source
 
         if self.every is not None and self.frames_per_second is not None:
@@ -90,8 +91,11 @@ class ReconstructCommand(options.ReconstructOptions):
             return {"frames.every": self.every}
         source = frame_source(self.video)
         first, last = (None if time is None else frame_at(source, time) for time in (self.start, self.end))
-        every = self.every if self.frames_per_second is None else every_of(source, self.frames_per_second)
-        return {"frames.first": first, "frames.last": last, "frames.every": every}
+        frames = {"frames.first": first, "frames.last": last, "frames.every": self.every}
+        if self.frames_per_second is None:
+            return frames
+        every, by_time = every_of(source, self.frames_per_second), source.is_variable
+        return {**frames, "frames.every": every, "frames.per_second": self.frames_per_second if by_time else None}
 
 
 def _stages(contents: Contents) -> Iterator[str]:

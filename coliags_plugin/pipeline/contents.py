@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from pydantic import BaseModel
 
 from coliags_plugin.core.errors import InputError
@@ -145,6 +145,20 @@ class Contents:
     def kept(self) -> set[int]:
         """Frames of use."""
         return {number for segment in self.segments for number in segment.kept}
+
+    def seconds(self, frames: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
+        """Times of frames by their numbers, s; the numbers where neither times nor a rate are known."""
+        times, first = None if self.survey is None else self.survey.times, self.video.first
+        if times is not None:
+            return np.asarray(np.interp(frames, np.arange(first, first + len(times)), times))
+        return np.asarray(frames) / (self.video.rate or 1.0)
+
+    def frames_at(self, seconds: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
+        """Numbers of the frames at times: the inverse of :meth:`seconds`."""
+        times, first = None if self.survey is None else self.survey.times, self.video.first
+        if times is not None:
+            return np.asarray(np.interp(seconds, times, np.arange(first, first + len(times))))
+        return np.asarray(seconds) * (self.video.rate or 1.0)
 
 
 class _Joins(BaseModel):

@@ -15,7 +15,7 @@ from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES
 from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.pipeline.contents import SubmapContents, common_frames, read_contents
+from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents
 from coliags_plugin.pipeline.context import Submap
 
 #: Name of the record of an export, and version of its schema.
@@ -48,7 +48,7 @@ def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = 
             first, to_first = placed[submap.key]
             own = f"{submap.segment or 'submap'}-{submap.number}"
             copy = link_or_copy if link else shutil.copyfile
-            has_depth = _write_submap(out / submap.segment, submap, video.rate, scratch / own, copy)
+            has_depth = _write_submap(out / submap.segment, submap, contents, scratch / own, copy)
             entries.append(
                 {
                     "name": submap.name,
@@ -76,7 +76,7 @@ def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = 
 
 
 def _write_submap(
-    segment: Path, submap: SubmapContents, rate: float | None, folder: Path, copy: Callable[[Path, Path], object]
+    segment: Path, submap: SubmapContents, contents: Contents, folder: Path, copy: Callable[[Path, Path], object]
 ) -> bool:
     """Write the files of one sub-map, images by ``copy``; returns whether there is dense depth."""
     scene, model = segment / "poses", segment / "poses" / submap.model
@@ -92,7 +92,7 @@ def _write_submap(
     frames = np.array([numbers[name] for name in posed])
     order = np.argsort(frames)
     make_folder(folder)
-    trajectory = Trajectory(poses.camera_to_world[order], timestamps=frames[order] / (rate or 1.0))
+    trajectory = Trajectory(poses.camera_to_world[order], timestamps=contents.seconds(frames[order]))
     tum.write(folder / "trajectory.txt", trajectory)
     files = [(scene / "images" / name, f"colmap/images/{name}") for name in posed]
     masks = [(scene / "masks" / f"{name}.png", f"colmap/masks/{name}.png") for name in posed]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -42,10 +42,18 @@ _CHANGING, _LOOKED_AT = 300, 3000
 THINNED, EMPTY, RESTING = "thinned out", "black or without any texture", "the camera rests"
 
 
-def sharpest_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[list[int], dict[int, str]]:
-    """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped."""
-    values, step = np.asarray(sharpness), settings.every
-    best = [first + int(np.argmax(values[first : first + step])) for first in range(0, len(values), step)]
+def sharpest_frames(
+    sharpness: Sequence[float], settings: FrameSettings, times: Float64[np.ndarray, "N"] | None = None
+) -> tuple[list[int], dict[int, str]]:
+    """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped.
+
+    ``times``, s, count for ``settings.per_second``.
+    """
+    values, part = np.asarray(sharpness), np.arange(len(sharpness)) // settings.every
+    if settings.per_second is not None and times is not None:
+        part = np.floor(times * settings.per_second + 1e-6).astype(int)
+    bounds = [*np.flatnonzero(np.diff(part, prepend=-1)).tolist(), len(values)]
+    best = [first + int(np.argmax(values[first:stop])) for first, stop in pairwise(bounds)]
     dropped = dict.fromkeys(set(range(len(values))) - set(best), THINNED)
     some = [index for index in best if values[index] > 0.0]
     return some, dropped | dict.fromkeys(set(best) - set(some), EMPTY)

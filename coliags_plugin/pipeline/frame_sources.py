@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
@@ -73,8 +73,30 @@ class FrameSource:
 
     @property
     def rate(self) -> float | None:
-        """Frames a second of the first file; None where it does not say, and of images."""
-        return VideoFile(self.videos[0]).rate if self.videos else None
+        """Frames a second of the first file, or of all if they differ in theirs; None where it does not say."""
+        if not self.videos or (rate := VideoFile(self.videos[0]).rate) is None:
+            return None
+        times = self.times if len(self.videos) > 1 else None
+        return rate if times is None or not _is_variable(times, rate) else float((len(times) - 1) / times[-1])
+
+    @cached_property
+    def times(self) -> Float64[np.ndarray, "N"] | None:
+        """Presentation times of all frames after the first one, s, of one file after the other; None where unknown."""
+        found, start = list[Float64[np.ndarray, "N"]](), 0.0
+        for path in self.videos:
+            file = VideoFile(path)
+            if (rate := file.rate) is None or (file.index is None and len(self.videos) == 1):
+                return None
+            times = np.zeros(1) if file.times is None else file.times
+            lacking = np.arange(1, self._counts[path] - len(times) + 1) / rate
+            found.append(start + np.append(times, times[-1] + lacking))
+            start = found[-1][-1] + 1.0 / rate
+        return np.concatenate(found) if found else None
+
+    @property
+    def is_variable(self) -> bool:
+        """Whether some frame is half a frame or more away from its place by the rate."""
+        return self.times is not None and self.rate is not None and _is_variable(self.times, self.rate)
 
     @cached_property
     def _counts(self) -> dict[Path, int]:
@@ -128,6 +150,10 @@ class FrameSource:
                 for number, (image, is_interlaced) in enumerate(frames, start + first):
                     yield path, f"frame_{number:06d}", image, is_interlaced
             start += count
+
+
+def _is_variable(times: Float64[np.ndarray, "N"], rate: float) -> bool:
+    return bool(np.abs(times * rate - np.arange(len(times))).max() >= 0.5)
 
 
 def frame_source(path: Path, span: Span = Span()) -> FrameSource:
@@ -196,8 +222,12 @@ def every_of(source: FrameSource, rate: float) -> int:
             "Use one of every n frames: --every N",
         )
     every = max(1, round(own / rate))
-    what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
-    log.info(what, source.path, own, every, own / every)
+    if source.is_variable:
+        what = "%s has a variable rate, of %.4g frames a second in the mean: the sharpest of every 1/%.4g s is used"
+        log.info(what, source.path, own, rate)
+    else:
+        what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
+        log.info(what, source.path, own, every, own / every)
     return every
 
 
@@ -222,7 +252,12 @@ def frame_at(source: FrameSource, time: str) -> int:
             "a video whose header does",
             "Give numbers of frames: --set frames.first=100 --set frames.last=400",
         )
-    return round(sum(part * 60.0**power for power, part in enumerate(reversed(parts))) * rate)
+    seconds, times = sum(part * 60.0**power for power, part in enumerate(reversed(parts))), source.times
+    if times is None:
+        return round(seconds * rate)
+    # The frame that is shown then, or comes within half a frame, as times are rounded.
+    place = int(np.searchsorted(times, seconds + 0.5 * np.diff(times).min(initial=1.0 / rate), side="right")) - 1
+    return place if place < len(times) - 1 else place + round((seconds - times[-1]) * rate)
 
 
 @contextmanager

@@ -88,7 +88,7 @@ def write_frames(
             "a mask of the frames' size",
         )
     used = survey.mask if given is None else given
-    chosen, dropped = sharpest_frames(sharpnesses, settings)
+    chosen, dropped = sharpest_frames(sharpnesses, settings, survey.times)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
         kept, last, left = [], None, set(chosen)

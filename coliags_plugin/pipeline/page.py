@@ -122,7 +122,7 @@ def write_page(out: Path, record: Record | None = None, segment: str = "", scene
 
 def _facts(contents: Contents) -> Iterator[Fact]:
     video, used, posed = contents.video, contents.kept, contents.posed
-    length = "" if video.rate is None else duration(video.frames / video.rate)
+    length = "" if video.rate is None else duration(float(np.diff(contents.seconds([video.first, video.stop]))[0]))
     size = "" if video.size is None else "{} x {} px".format(*video.size)
     parts = (counted(video.frames, "frame"), length, size, "deinterlaced" if video.deinterlace else "")
     if video.size is not None:

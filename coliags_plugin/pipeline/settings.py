@@ -33,6 +33,12 @@ class FrameSettings(Settings):
         "video is flagged as interlaced, or looks so.",
     )
     every: int = Field(default=1, ge=1, description="Use the sharpest of every n frames.")
+    per_second: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="Use the sharpest of every 1/n s by the frames' times, which are n `every` apart in the mean: for "
+        "videos of a variable rate.",
+    )
     segment: int = Field(
         default=1500,
         ge=50,

@@ -10,7 +10,7 @@ from typing import Annotated
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt32
+from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt32
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
@@ -50,6 +50,7 @@ class Survey:
         size: Height and width of the frames, pixels.
         mask: False outside of the lens's image and on overlays; None where all counts. [H, W]
         first: Number of the first frame.
+        times: After that of the video's first frame, s, where they are not numbers over a rate; else None. [N]
     """
 
     sharpness: Float[np.ndarray, "N"]
@@ -59,6 +60,7 @@ class Survey:
     size: tuple[int, int]
     mask: Bool[np.ndarray, "H W"] | None
     first: int = 0
+    times: Float64[np.ndarray, "N"] | None = None
 
     def __len__(self) -> int:
         return len(self.sharpness)
@@ -66,22 +68,24 @@ class Survey:
     def part(self, first: int, last: int | None) -> Survey:
         """Some of the frames, by their numbers, both inclusive; without ``last`` up to the end."""
         place = slice(first - self.first, None if last is None else last + 1 - self.first)
-        return replace(self, first=first, **{name: getattr(self, name)[place] for name in _ARRAYS})
+        times = None if self.times is None else self.times[place]
+        return replace(self, first=first, times=times, **{name: getattr(self, name)[place] for name in _ARRAYS})
 
     def write(self, folder: Path) -> None:
         """Write ``survey.npz``."""
         mask = np.zeros((0, 0), bool) if self.mask is None else self.mask
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         numbers = {"size": np.array(self.size), "first": np.array(self.first), "mask": mask}
-        write_arrays(folder / SURVEY_FILE, {**arrays, **numbers})
+        times = {} if self.times is None else {"times": self.times}
+        write_arrays(folder / SURVEY_FILE, {**arrays, **numbers, **times})
 
     @classmethod
     def read(cls, folder: Path) -> Survey:
         """Read ``survey.npz``; InputError where it is damaged."""
-        arrays = read_arrays(folder / SURVEY_FILE, MADE, (*_ARRAYS, "size", "first", "mask"))
-        own, mask = {name: arrays[name] for name in _ARRAYS}, arrays["mask"]
+        arrays = read_arrays(folder / SURVEY_FILE, MADE, (*_ARRAYS, "size", "first", "mask"), ["times"])
+        own, mask = {name: arrays[name] for name in (*_ARRAYS, "times") if name in arrays}, arrays["mask"]
         shapes = {name: array.shape for name, array in arrays.items() if name != "mask"}
-        expected = dict.fromkeys(_ARRAYS, (len(np.ravel(own["sharpness"])),)) | {"size": (2,), "first": ()}
+        expected = dict.fromkeys(own, (len(np.ravel(own["sharpness"])),)) | {"size": (2,), "first": ()}
         if shapes != expected or any(array.dtype.kind not in "fiu" for array in own.values()) or mask.dtype != bool:
             raise InputError(f"{folder / SURVEY_FILE} has {shapes}", "a number for each frame")
         height, width = arrays["size"].tolist()
@@ -155,10 +159,11 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
         followed.append(share)
         checksums.append(checksum(gray))
         last = gray
-    mask, single = whole.mask(), np.float32
+    mask, single, first = whole.mask(), np.float32, source.span.first
+    times = source.times[first : first + len(motions)] if source.is_variable and source.times is not None else None
     return Survey(
         np.array(whole.sharpnesses), np.array(followed, single), np.array(motions, single),
-        np.array(checksums, np.uint32), whole.size, mask, source.span.first,
+        np.array(checksums, np.uint32), whole.size, mask, first, times,
     )  # fmt: skip
 
 

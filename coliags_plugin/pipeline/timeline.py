@@ -69,7 +69,7 @@ def clock(contents: Contents, frame: float) -> str:
     """Time of a frame in minutes and seconds, ``3:05``, with hours from the first one on; empty for an unknown rate."""
     if contents.video.rate is None:
         return ""
-    minutes, seconds = divmod(int(frame / contents.video.rate + 1e-6), 60)
+    minutes, seconds = divmod(int(contents.seconds([frame])[0] + 1e-6), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
@@ -222,10 +222,10 @@ def _ticks(contents: Contents) -> Iterator[tuple[float, list[str]]]:
         for tick in linear_ticks(video.first, video.stop):
             yield tick, [tick_label(tick)]
         return
-    seconds = video.frames / video.rate
-    step = next((step for step in _STEPS if seconds / step <= _TICKS), math.ceil(seconds / _TICKS))
-    for number in range(math.ceil(video.first / video.rate / step), int(video.stop / video.rate / step) + 1):
-        frame = number * step * video.rate
+    first, last = contents.seconds([video.first, video.stop]).tolist()
+    step = next((step for step in _STEPS if (last - first) / step <= _TICKS), math.ceil((last - first) / _TICKS))
+    ticks = step * np.arange(math.ceil(first / step), int(last / step) + 1)
+    for frame in contents.frames_at(ticks).tolist():
         yield frame, [clock(contents, frame), str(round(frame))]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.pipeline.export import export_atlas
+from coliags_plugin.pipeline.survey import Survey
 from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity
 
 
@@ -59,6 +61,15 @@ def test_timestamps_are_frame_numbers_where_the_rate_is_unknown(out, tmp_path):
     change_video(out, rate=None)
     assert export_atlas(out, tmp_path / "export")["timestamps"] == "frame number"
     assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
+
+
+def test_timestamps_are_those_of_frames_where_the_rate_varies(out, tmp_path):
+    times = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.3, 100))
+    replace(Survey.read(out), times=times).write(out)
+    manifest = export_atlas(out, tmp_path / "export")
+    for one in manifest["submaps"]:
+        path = tum.read(tmp_path / "export" / one["folder"] / "trajectory.txt")
+        np.testing.assert_array_equal(path.timestamps, times[one["frames"]])
 
 
 @pytest.mark.parametrize(("link", "other_disk"), [(False, False), (True, False), (True, True)])

@@ -32,6 +32,13 @@ def test_the_sharpest_of_every_few_is_used():
     assert dropped == dict.fromkeys([0, 2, 4, 5], THINNED)
 
 
+def test_the_sharpest_of_every_stretch_of_time_is_used():
+    times = np.array([0.0, 0.04, 0.08, 0.12, 1.0, 1.3, 1.7])
+    values, settings = [0.5, 0.9, 0.6, 0.8, 0.7, 0.75, 0.6], FrameSettings(every=2, per_second=2.0)
+    assert sharpest_frames(values, settings, times)[0] == [1, 5, 6]
+    assert sharpest_frames(values, settings)[0] == [1, 3, 5, 6]
+
+
 def test_empty_frames_are_dropped_and_blurred_ones_marked():
     values = [0.5] * 20
     values[4], values[5], values[9] = 0.1, 0.2, 0.0

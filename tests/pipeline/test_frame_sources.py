@@ -101,7 +101,7 @@ def test_times_are_frames(tmp_path):
 )
 def test_of_how_many_frames_one_is_used(rate, wanted, every, caplog):
     with caplog.at_level(logging.INFO):
-        assert every_of(SimpleNamespace(path="film.mp4", rate=rate), wanted) == every
+        assert every_of(SimpleNamespace(path="film.mp4", rate=rate, is_variable=False), wanted) == every
     assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
 
 

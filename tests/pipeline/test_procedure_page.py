@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from coliags_plugin.pipeline import page
 from coliags_plugin.pipeline.contents import common_frames, read_contents
 from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table, write_page
 from coliags_plugin.pipeline.stages import Record
-from coliags_plugin.pipeline.timeline import frame_states, timeline
+from coliags_plugin.pipeline.survey import Survey
+from coliags_plugin.pipeline.timeline import clock, frame_states, timeline
 from coliags_plugin.reporting.text_formats import terminal_text
 from tests.pipeline.reconstructions import (
     FAILURE,
@@ -215,6 +217,16 @@ def test_the_time_line_has_one_axis(out):
     assert (first, last) == ("5.0 100.0", "995.0 0.0")  # middles of columns; shares of 0 and 1
     assert values["curves"][2]["path"].count("M") == 1
     assert values["curves"][2]["path"].startswith("M105.0")  # where motion was measured first
+
+
+def test_times_are_those_of_frames_where_the_rate_varies(out):
+    times = np.concatenate([np.arange(50) / 10.0, 65.0 + np.arange(50) / 10.0])
+    replace(Survey.read(out), times=times).write(out)
+    contents = read_contents(out)
+    assert [clock(contents, frame) for frame in (0, 49, 50, 99)] == ["0:00", "0:04", "1:05", "1:09"]
+    ticks = timeline(contents, *frame_states(contents)).values["ticks"]
+    assert [tick["texts"] for tick in (ticks[0], ticks[-1])] == [["0:00", "0"], ["1:00", "50"]]
+    assert "100 frames, 1 min 10 s" in page_of(out)
 
 
 def test_an_unknown_rate_leaves_frame_numbers(out):

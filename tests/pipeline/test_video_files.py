@@ -11,8 +11,9 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.pipeline.frame_selection import one_field
-from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
+from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, every_of, frame_at, frame_source
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile
 from tests.pipeline.films import number_of, numbered, write_film
 
@@ -140,6 +141,43 @@ def test_paths_are_no_addresses_and_no_patterns(tmp_path, monkeypatch):
         path.write_bytes(data)
         assert numbers(path) == numbers(path.absolute()) == list(range(5))
     assert numbers(Path("pipe:")) == list(range(5))
+
+
+#: Ten frames in 0.4 s, a second without any, ten more that come half as fast.
+VARIABLE = [40 * n for n in range(10)] + [1400 + 80 * n for n in range(10)]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.webm"])
+def test_times_are_those_of_the_frames(tmp_path, name, caplog):
+    codec = {"codec": "libvpx-vp9", "cpu-used": 8} if name == "a.webm" else ORDERED
+    source = frame_source(write_film(FRAMES[:20], tmp_path / name, times=VARIABLE, **codec))
+    np.testing.assert_allclose(source.times, np.array(VARIABLE) / 1000, atol=1e-9)
+    assert source.is_variable and source.rate == pytest.approx(19 / 2.12) and numbers(source.path) == list(range(20))
+    for text, frame in (("0", 0), ("0.2", 5), ("0.359", 9), ("1.2", 9), ("1.4", 10), ("1.75", 14), ("0:02.12", 19)):
+        assert frame_at(source, text) == frame
+    with caplog.at_level("INFO"):
+        assert every_of(source, 3.0) == 3
+    assert "variable rate" in caplog.text and "every 1/3 s" in caplog.text
+    survey = survey_video(frame_source(source.path, Span(5)))
+    survey.write(tmp_path)
+    np.testing.assert_array_equal(Survey.read(tmp_path).part(7, 12).times, source.times[7:13])
+
+
+@pytest.mark.parametrize("name", ["a.ts", "a.mkv", "a.avi", "a.mp4"])
+def test_even_rates_are_not_variable(tmp_path, name):
+    codec = {"codec": "mjpeg", "pix_fmt": "yuvj420p"} if name == "a.avi" else ORDERED
+    source = frame_source(write_film(FRAMES, tmp_path / name, rate=Fraction(30000, 1001), **codec))
+    assert source.rate == pytest.approx(30000 / 1001, rel=1e-4) and not source.is_variable
+    assert [frame_at(source, str(number * 1001 / 30000)) for number in range(40)] == list(range(40))
+    assert survey_video(source).times is None
+
+
+def test_files_of_a_folder_may_have_other_rates(tmp_path):
+    for part, rate in enumerate((10, 20)):
+        write_film(FRAMES[:20], tmp_path / f"{part}.mp4", rate=rate)
+    source = frame_source(tmp_path)
+    np.testing.assert_allclose(source.times, [*np.arange(20) / 10, *(2.0 + np.arange(20) / 20)], atol=1e-9)
+    assert source.is_variable and source.rate == pytest.approx(39 / 2.95) and frame_at(source, "2.5") == 30
 
 
 QUADRANTS = np.zeros((48, 64, 3), np.uint8)

@@ -322,6 +322,10 @@ def measured(noise=0.0, speed=0.0):
     return rigidity(model, tracks)
 
 
+def test_a_model_without_images_has_no_limit():
+    assert rigid_frames(pycolmap.Reconstruction(), []) is None
+
+
 def test_a_rigid_scene_is_one_to_the_noise():
     assert set(measured()) == {1, 2}  # farther apart too few points are common
     assert max(measured().values()) < 1e-3

@@ -265,6 +265,8 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
     Distances over which fewer than four pairs have 40 tracks in common are left out. Image i has ID i + 1.
     """
     frames = sorted(number - 1 for number in model.reg_image_ids())
+    if not frames:
+        return {}
     camera = model.images[frames[0] + 1].camera
     directions = {frame: np.asarray(camera.cam_from_img(tracks[frame].pixels.astype(np.float64))) for frame in frames}
     measured = {}
