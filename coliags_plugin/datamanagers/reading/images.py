@@ -153,10 +153,11 @@ class InverseDepth(DepthSteps):
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`; float32, 0 where unknown."""
         stored = super().read(path)
-        inverse = self.scale * stored.astype(np.float64) / 65536.0 + self.offset
-        # The sky, thousands of times as far as the rest, is at no distance.
-        known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
-        return np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0).astype(np.float32)
+        with np.errstate(over="ignore"):
+            inverse = self.scale * (stored / 65536.0) + self.offset
+            # The sky, thousands of times as far as the rest, is at no distance.
+            known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
+            return np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0).astype(np.float32)
 
 
 class DepthArray(DepthSteps):
