@@ -212,8 +212,12 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
         failures = CellRuns(folder, executor, options, cells).run()
-        results = [result for cell in cells if (result := folder.done(cell)) is not None]
-    return FinishedComparison(folder.path, cells, results, failures)
+        results = [(cell.title, result) for cell in cells if (result := folder.done(cell)) is not None]
+    for title, result in results:
+        for name, part in result.sets.items():
+            if part.blank:
+                log.warning("%s, set %s: %s", title, name, part.transparency_warning)
+    return FinishedComparison(folder.path, cells, [result for _, result in results], failures)
 
 
 def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:

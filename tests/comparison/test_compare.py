@@ -101,6 +101,14 @@ def test_what_is_done_is_not_run_again(wall, folder, monkeypatch, lost, count):
     assert [result.method for result in done.results] == ["coliags", "scaffold-gs"]
 
 
+def test_views_that_show_nothing_are_told(wall, folder, caplog):
+    (path,) = (folder / "results" / "wall" / "coliags").iterdir()
+    path.write_text(path.read_text().replace('"blank": 0', '"blank": 1'))
+    again(wall, folder)
+    (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert warning.startswith("wall coliags seed 0, set test: 1 of 2 views show nothing")
+
+
 def test_a_comparison_is_extended(wall, folder):
     _, ran = again(wall, folder, ["scaffold-gs", "coliags"], seeds=2)
     assert ran == ["wall scaffold-gs seed 1", "wall coliags seed 1"]
