@@ -76,16 +76,14 @@ class PosesSfmCommand:
         survey = FrameSurvey(frames)
         with progress_callback() as progress, image_files(frames, progress, survey.add) as files:
             images = files[:: self.every][: self.max_frames]
-            masks: Masks = None
+            for path in images if frames.is_dir() else ():
+                survey.add(read_image(path))
+            masks: Masks = (found := survey.mask())
             if self.mask is not None:
                 masks = masks_for(self.mask, images)
-            else:
-                for path in images if frames.is_dir() else ():
-                    survey.add(read_image(path))
-                if (found := survey.mask()) is not None:
-                    share = 100.0 * (1.0 - found.mean())
-                    _LOG.info("ignored: black surroundings and overlays, %.0f %% of the image", share)
-                    masks = found
+            elif found is not None:
+                share = 100.0 * (1.0 - found.mean())
+                _LOG.info("ignored: black surroundings and overlays, %.0f %% of the image", share)
             atlas = reconstruct(images, settings, masks, progress)
             factor = millimetres(atlas.largest, self.diameter, known_distance)
             if factor is not None:

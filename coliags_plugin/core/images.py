@@ -103,6 +103,8 @@ def read_alpha(path: Path) -> Bool[np.ndarray, "H W"] | None:
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
         return None
     shown = np.asarray(image[..., 3] > np.iinfo(image.dtype).max // 2)
+    if not shown.any():
+        raise InputError(f"{path}: its alpha channel hides all", "alpha of 128 or more somewhere", "Drop the channel")
     return None if shown.all() else shown
 
 

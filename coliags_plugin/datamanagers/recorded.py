@@ -24,7 +24,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, parallel_map
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, StoredFrame, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import (
@@ -172,7 +172,10 @@ class RecordedDataManager(DataManager):
         masks = [shot.mask for shot in shots if shot.mask is not None]
         if masks:
             level = logging.INFO if len(masks) == len(shots) else logging.WARNING
-            log.log(level, "%s: %d of %d frames have a mask", path, len(masks), len(shots))
+            files = {file for folder in {mask.parent for mask in masks} for file in files_in(folder, FRAME_SUFFIXES)}
+            left = len(files.difference(masks, (shot.image for shot in shots)))
+            others = f"; {left} other files beside the masks" if left else ""
+            log.log(level, "%s: %d of %d frames have a mask%s", path, len(masks), len(shots), others)
         tell_of_alpha(path, [shot.image for shot in shots])
         used = {part for mask in masks for part in (mask, *mask.parents)}
         for file in path.iterdir():

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.datamanagers.scene_settings import read_unit
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
@@ -284,6 +285,15 @@ def test_what_sfm_refuses(tube, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tube.parent)
     assert message in " ".join(refused(capsys, "poses", "sfm", "tube/images", "--output", "new", *argv).split())
     assert [path.name for path in tube.parent.iterdir()] == ["tube"]
+
+
+def test_images_too_dark_for_sfm_are_refused_with_a_mask_too(tmp_path, capsys):
+    for index in range(3):
+        write_image(tmp_path / f"frames/{index}.png", np.full((48, 64), 4095, np.uint16))
+    write_mask(tmp_path / "mask.png", np.ones((48, 64), bool))
+    for more in ((), ("--mask", tmp_path / "mask.png")):
+        said = refused(capsys, "poses", "sfm", tmp_path / "frames", "--output", tmp_path / "out", *more)
+        assert "no pixel of the 3 frames" in said and "brighter than 15 of 255" in said
 
 
 def test_defaults_of_a_part_stay_where_one_of_its_options_is_set():

@@ -201,7 +201,10 @@ def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     cv2.imwrite(str(mine / pattern.format(1)), mask)
     (mine / pattern.format("1").replace("/", "/._")).touch()  # macOS's
     scene = load(mine)
-    assert f"1 of {COUNT} frames have a mask" in caplog.text
+    assert f"1 of {COUNT} frames have a mask\n" in caplog.text
+    cv2.imwrite(str((mine / pattern).parent / "9.png"), mask)
+    load(mine)
+    assert f"1 of {COUNT} frames have a mask; 1 other files beside the masks" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
     assert scene.train[1].mask is None and scene.provenance["masks"] == 1
 

@@ -81,6 +81,13 @@ def test_alpha_below_half_is_a_mask(tmp_path, name, pixels, options, binary):
     assert read.dtype == np.uint8
 
 
+def test_alpha_that_hides_all_is_refused(tmp_path):
+    """As of four bytes a pixel whose last means nothing."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([COLORS, 0 * ALPHA]))
+    with pytest.raises(InputError, match=r"a\.png: its alpha channel hides all.*Drop the channel"):
+        read_alpha(tmp_path / "a.png")
+
+
 WHITE = np.repeat(np.uint8([0, 255]), 32)[None].repeat(48, 0)
 
 

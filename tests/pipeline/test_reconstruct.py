@@ -122,6 +122,7 @@ def test_bad_input_leaves_nothing(tmp_path, capsys):
         ((folder, "--output", folder / "out"), "Expected a folder apart from the input"),
         ((folder, "--output", tmp_path / "full"), "already exists and is no reconstruction"),
         ((folder, "--output", out, "--mask", tmp_path / "no.png"), "no file"),
+        ((folder, "--output", out, "--mask", folder), "is a folder. Expected an image, black where"),
         ((folder, "--output", out, "--diameter", 0), "diameter"),
         ((folder, "--output", out, "--set", "frames.evry=2"), "Did you mean 'every'?"),
         ((folder, "--output", out, "--size", "big"), "--size big"),
