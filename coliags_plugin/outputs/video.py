@@ -1,14 +1,15 @@
-"""MP4 video writing with the codecs of OpenCV's wheel."""
+"""MP4 video writing with the codecs of PyAV's wheel."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
-import cv2
+import av
 import numpy as np
 from jaxtyping import UInt8
 
@@ -17,26 +18,28 @@ from coliags_plugin.core.files import atomic_path
 from coliags_plugin.outputs.image_files import checked_rgb
 
 if TYPE_CHECKING:
+    from av.container import OutputContainer
+    from av.video.stream import VideoStream
     from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
 
-#: In order of preference. OpenCV's wheels have no H.264 encoder; VP9 plays in browsers, MPEG-4 part 2 in players only.
-CODECS = ("vp09", "mp4v")
+#: With their options, in order of preference: VP9 plays in browsers, MPEG-4 part 2 in players only.
+CODECS = {
+    "libvpx-vp9": {"crf": "15", "b": "0", "deadline": "realtime", "cpu-used": "6"},
+    "mpeg4": {"qmin": "2", "qmax": "4", "b": "50M"},
+}
 
 
 def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Path, fps: float) -> None:
     """Write an MP4 video atomically; frames are consumed one at a time, so that a generator may render them.
 
-    An odd width or height is padded by repeating the last column or row: the codecs halve the chroma planes, and OpenCV
-    would crop a line instead.
+    An odd width or height is padded by repeating the last column or row: the codecs halve the chroma planes.
     """
     if path.suffix.lower() != ".mp4":
         raise InputError(f"video file {path}", "a name that ends in .mp4")
     check_rate(fps)
-    # FFmpeg chooses the container by the suffix, and opens the file itself.
     with atomic_path(path) as scratch:
-        scratch.write_bytes(bytes(4096))  # OpenCV would call a full disk a missing codec
         count = _encode(frames, scratch, fps)
         if count == 0:
             raise InputError(f"no frames for {path}", "at least one")
@@ -52,45 +55,45 @@ def check_rate(fps: float) -> None:
 
 
 def _frame_count(path: Path) -> int:
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
-        return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    finally:
-        video.release()
+        with av.open(f"file:{path}") as file:
+            return file.streams.video[0].frames
+    except av.FFmpegError:
+        return 0
 
 
 def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) -> int:
-    writer: Any = None
     shape: tuple[int, ...] = ()
-    count = 0
-    try:
+    count, stream = 0, None
+    # With the protocol, as a colon in the path would name another one.
+    with av.open(f"file:{scratch}", "w", "mp4") as file:
         for frame in frames:
             image = checked_rgb(frame, f"frame {count}")
-            if writer is None:
+            if stream is None:
                 shape = image.shape
-                writer = _writer(scratch, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
+                stream = _stream(file, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
             elif image.shape != shape:
                 raise InputError(
                     f"frame {count} is {image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px as frame 0"
                 )
             even = np.pad(image, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
-            writer.write(np.ascontiguousarray(even[:, :, ::-1]))
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
             count += 1
-    finally:
-        if writer is not None:
-            writer.release()
+        if stream is not None:
+            file.mux(stream.encode(None))
     return count
 
 
-def _writer(scratch: Path, fps: float, width: int, height: int) -> Any:
-    for codec in CODECS:
-        writer = cv2.VideoWriter(
-            str(scratch), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), float(fps), (width, height)
-        )
-        if writer.isOpened():
-            return writer
+def _stream(file: OutputContainer, fps: float, width: int, height: int) -> VideoStream:
+    for codec, options in CODECS.items():
+        try:
+            stream = cast("VideoStream", file.add_stream(codec, Fraction(fps).limit_denominator(100_000), options))
+        except av.codec.codec.UnknownCodecError:
+            continue
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        return stream
     raise InputError(
-        f"OpenCV {cv2.__version__} opens none of the codecs {', '.join(CODECS)} for {width} x {height} px",
-        "an OpenCV built with FFmpeg",
-        "Install opencv-contrib-python-headless from PyPI, or write the frames as PNG",
+        f"PyAV {av.__version__} has none of the codecs {', '.join(CODECS)}",
+        "one of them",
+        "Install av from PyPI, or write the frames as PNG",
     )

@@ -125,7 +125,7 @@ class FrameSurvey:
         if self._sum is None:
             raise InputError(f"no frames in {self.path}", "a video")
         darkest, brightest = self._extremes
-        if (top := int(brightest.max())) < _DARK:
+        if 0 < (top := int(brightest.max())) < _DARK:
             raise InputError(
                 f"no pixel of the {len(self.sharpnesses)} frames of {self.path} is brighter than {top} of 255",
                 "images that use the range of their 8 or 16 bits",
