@@ -110,7 +110,7 @@ def read_model(folder: Path) -> SparseModel:
         raise InputError(
             f"{folder} holds no COLMAP model" + (f", but {reading.inventory(folder)}" if folder.is_dir() else ""),
             "a folder with cameras, images and points3D, all .bin or all .txt",
-            "Give the model's folder with --set datamanager.model=FOLDER",
+            "Restore what is missing, or give another model's folder with --set datamanager.model=FOLDER",
         )
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
     registered = colmap_poses.ordered_images(files[1])

@@ -210,7 +210,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
-                "timestamps of one clock in names and trajectory, in seconds",
+                "timestamps of one clock in names and trajectory, in seconds, not nanoseconds",
                 "Shift the trajectory's timestamps, or --set datamanager.association=order if line n is image n's",
             )
         deep = np.zeros(len(posed), np.int64)

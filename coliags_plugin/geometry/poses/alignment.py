@@ -124,7 +124,11 @@ def _by_time(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
         return _NO_PAIRS, "timestamps are repeated"
     partner = nearest_in_time(first.timestamps, second.timestamps, tolerance)
     matched = np.flatnonzero(partner >= 0)
-    return np.column_stack([matched, partner[matched]]), f"{len(matched)} within {tolerance:g} s"
+    why_few = f"{len(matched)} within {tolerance:g} s"
+    if not len(matched):
+        ranges = [f"{times.min():.6f} to {times.max():.6f}" for times in (first.timestamps, second.timestamps)]
+        why_few += f" of {' and '.join(ranges)}: seconds of one clock are expected, not nanoseconds"
+    return np.column_stack([matched, partner[matched]]), why_few
 
 
 def _by_index(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
