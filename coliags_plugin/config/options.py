@@ -94,7 +94,7 @@ class Options:
     def __post_init__(self) -> None:
         types = get_type_hints(type(self))
         for name, value in vars(self).items():
-            if types[name] in (Path, Path | None) and value is not None:
+            if types[name] in (Path, Path | None) and isinstance(value, (str, Path)):
                 object.__setattr__(self, name, user_path(value))
             elif name == "settings" and not isinstance(value, tuple):
                 object.__setattr__(self, name, assignments(value))
