@@ -24,7 +24,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, parallel_map
+from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, first_few, parallel_map
 from coliags_plugin.datamanagers.recording import Recording, Shot, StoredFrame, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import (
@@ -59,7 +59,7 @@ class RecordedDataManager(DataManager):
     #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
     #: Where the format has masks, for messages.
-    masks_at: ClassVar[str] = "no files of masks for frames"
+    masks_at: ClassVar[str] = "no files"
     #: Unit of length of the dataset's files, where a scene states none.
     unit: ClassVar[Unit] = "mm"
 
@@ -177,11 +177,13 @@ class RecordedDataManager(DataManager):
             others = f"; {left} other files beside the masks" if left else ""
             log.log(level, "%s: %d of %d frames have a mask%s", path, len(masks), len(shots), others)
         tell_of_alpha(path, [shot.image for shot in shots])
-        used = {part for mask in masks for part in (mask, *mask.parents)}
-        for file in path.iterdir():
-            is_image = file.is_dir() or file.suffix.lower() in FRAME_SUFFIXES
-            if "mask" in file.stem.lower() and is_image and file not in used and file.name != self.masks_at:
-                log.warning("%s is not used: format %s reads %s", file, self.name, self.masks_at)
+        used = {path / self.masks_at, *(shot.image for shot in shots), *masks, *(p for m in masks for p in m.parents)}
+        folders = {path, *(shot.image.parent for shot in shots)}
+        named = {file for folder in folders for file in folder.glob("*[mM][aA][sS][kK]*")} - used
+        names = [portable_name(file, path) for file in named if file.is_dir() or file.suffix.lower() in FRAME_SUFFIXES]
+        if names:
+            what = first_few(sorted(names))
+            log.warning("%s: %s not used: format %s reads %s as masks", path, what, self.name, self.masks_at)
 
     def _valid_seen_masks(
         self, recording: Recording, train: Sequence[int], test: Sequence[int], path: Path

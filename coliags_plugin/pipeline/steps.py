@@ -96,7 +96,7 @@ def _submap_rows(context: StageContext, source: Mapping[str, Any]) -> Iterator[_
 
 def identity_of(path: Path) -> Mapping[str, Any]:
     """Name and size of a file or folder: enough to notice that it is another one."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = sorted(path.glob("[!.]*")) if path.is_dir() else [path]
     return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}
 
 

@@ -264,7 +264,7 @@ def test_masks_that_are_not_used_are_named(copied, caplog, name):
     else:
         place.mkdir()
     load(folder, name)
-    assert f"{place} is not used: format {KINDS[name].format} reads" in caplog.text
+    assert f"{place.name} not used: format {KINDS[name].format} reads" in caplog.text
 
 
 # Seen masks

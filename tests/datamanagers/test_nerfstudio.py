@@ -199,6 +199,13 @@ def test_masks_under_another_key_are_named(mine, caplog, change, of_frames):
     assert f"masks are the mask_path of a frame; ignored: {next(iter(change))}" in caplog.text
 
 
+def test_masks_of_instant_ngp_are_named(mine, caplog):
+    for index in (1, 2):  # not black = ignored
+        cv2.imwrite(str(mine / f"images/dynamic_mask_frame_0000{index}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    load(mine)
+    assert "images/dynamic_mask_frame_00001.png, images/dynamic_mask_frame_00002.png not used: format" in caplog.text
+
+
 def test_masks_of_some_frames(mine):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[5:20, 3:9] = 0

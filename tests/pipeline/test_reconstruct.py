@@ -22,6 +22,7 @@ from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.reconstruct import forecast
 from coliags_plugin.pipeline.settings import ReconstructionSettings
+from coliags_plugin.pipeline.steps import identity_of
 from coliags_plugin.results.reading import read_result
 from tests import commands
 from tests.pipeline.conftest import CAPTURE, TRAINING
@@ -71,6 +72,12 @@ def test_another_video_is_noticed(done, video, tmp_path):
     write_video(film(range(0, 60, 4)), video, 15.0)
     with pytest.raises(InputError, match=r"stage survey was made with source.bytes \d+, not \d+"):
         cp.reconstruct(video, tmp_path / "out")
+
+
+def test_hidden_files_make_no_other_video(tmp_path):
+    before = identity_of(write_images(tmp_path / "images", film(range(2))))
+    (tmp_path / "images/.DS_Store").write_bytes(b"view of the folder")
+    assert identity_of(tmp_path / "images") == before
 
 
 def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, video, tmp_path):
