@@ -33,6 +33,10 @@ def _transposed(pose: Tensor) -> Tensor:
     return turned
 
 
+def _with_w(pose: Tensor, is_first: bool) -> Tensor:
+    return torch.from_numpy(w_first(pose[None].cpu().double().numpy(), is_first)[0]).to(pose)
+
+
 CHANGES: dict[str, Change] = {
     GIVEN: lambda pose: pose,
     NO_MOTION: lambda pose: torch.eye(4, dtype=pose.dtype),
@@ -40,7 +44,10 @@ CHANGES: dict[str, Change] = {
     "rotation transposed": _transposed,
     "translation of opposite sign": lambda pose: pose * pose.new_tensor([[1.0, 1.0, 1.0, -1.0]] * 3 + [[1.0] * 4]),
     "camera axes y up, z backward": lambda pose: pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0]),
-    "quaternions with w first": lambda pose: torch.from_numpy(w_first(pose[None].cpu().double().numpy())[0]).to(pose),
+    "quaternions with w first": lambda pose: _with_w(pose, is_first=True),
+    "world-to-camera quaternions with w last": lambda pose: torch.linalg.inv(
+        _with_w(torch.linalg.inv(pose), is_first=False)
+    ),
 }
 
 #: Advice where a hypothesis fits.
@@ -51,6 +58,7 @@ ADVICE = {
     "camera axes y up, z backward": "The camera axes look like OpenGL's; negate the second and third column",
     "quaternions with w first": "The quaternions look as if w came first: put it last, or name the columns on top of a "
     "TUM file, '# timestamp tx ty tz qw qx qy qz'",
+    "world-to-camera quaternions with w last": "The quaternions look as if w came last: COLMAP's order is QW QX QY QZ",
 }
 
 

@@ -113,6 +113,12 @@ def ordered_images(path: Path) -> list[ColmapImage]:
         raise InputError(f"{path} holds no poses", "at least one registered image")
     names = [image.name for image in images]
     refuse_repeated(names, str(path))
+    if turned := [image for image in images if not any((*image.quat_wxyz[:3], *image.translation))]:
+        log.warning(
+            "%s: the camera is at the origin, and turned by half a turn about z; does w come last in the file? COLMAP "
+            "has QW QX QY QZ",
+            turned[0].source,
+        )
     return [images[index] for index in natural_order(names)]
 
 

@@ -94,10 +94,10 @@ def wxyz_from_rotations(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarr
     return np.asarray(xyzw[:, [3, 0, 1, 2]])
 
 
-def w_first(matrices: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-    """Rigid transforms read again from quaternions whose first number, not the last, is w. [N, 4, 4]"""
-    stored = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    return rigid(Rotation.from_quat(stored, scalar_first=True).as_matrix(), matrices[:, :3, 3])
+def w_first(matrices: Float[np.ndarray, "N 4 4"], is_first: bool = True) -> Float[np.ndarray, "N 4 4"]:
+    """Rigid transforms whose quaternions were read with w last, read again with w first; or the reverse. [N, 4, 4]"""
+    stored = Rotation.from_matrix(matrices[:, :3, :3]).as_quat(scalar_first=not is_first)
+    return rigid(Rotation.from_quat(stored, scalar_first=is_first).as_matrix(), matrices[:, :3, 3])
 
 
 def rigid(rotations: Float[np.ndarray, "N 3 3"], translations: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4 4"]:

@@ -81,6 +81,14 @@ def test_a_count_in_the_header_that_is_not_that_of_the_images_is_told(tmp_path, 
     assert "holds 3 images, but its header says 4: is it cut short?" in caplog.text
 
 
+def test_w_last_is_suspected_where_the_first_camera_is_the_world(tmp_path, caplog):
+    images = "1 {} 0 0 0 1 a.png\n\n2 0.8 0.6 0 0 5 6 7 1 b.png\n\n"
+    colmap.read(write_text(tmp_path, images.format("1 0 0 0"), "1 PINHOLE 64 48 70 71 32 24\n"))
+    assert not caplog.messages
+    colmap.read(write_text(tmp_path, images.format("0 0 0 1"), "1 PINHOLE 64 48 70 71 32 24\n"))
+    assert "images.txt, line 1: the camera is at the origin" in caplog.text and "QW QX QY QZ" in caplog.text
+
+
 def write_text(folder, images, cameras):
     (folder / "images.txt").write_text(images)
     (folder / "cameras.txt").write_text(cameras)
