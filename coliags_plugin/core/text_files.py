@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import codecs
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 
 from coliags_plugin.core import bounds
@@ -18,9 +20,9 @@ def encoding_of(start: bytes) -> str:
     return "utf-16" if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
 
 
-def stand_in(path: Path) -> str:
-    """Words for what a file holds in the place of its content, and what to do about it; none if it holds that."""
-    start = _start(path).removeprefix(codecs.BOM_UTF8).lstrip().lower()
+def _stand_in(start: bytes) -> str:
+    """Words for what begins so in the place of a file, and what to do about it; none if it may be the file itself."""
+    start = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     if start.startswith(b"version https://git-lfs"):
         return "it is a pointer of Git LFS, in the place of the file, which `git lfs pull` fetches"
     if start.startswith((b"<!doctype html", b"<html")):
@@ -31,7 +33,8 @@ def stand_in(path: Path) -> str:
 def unreadable(path: Path, seen: str, expected: str, do: str = "") -> InputError:
     """The error about a file that its reader does not understand: ``seen``, unless it is something in its place."""
     try:
-        found = stand_in(path)
+        with path.open("rb") as file:
+            found = _stand_in(file.read(_START_BYTES))
     except OSError:
         found = ""
     return InputError(f"cannot read {path}: {found}" if found else seen, expected, "" if found else do)
@@ -42,7 +45,8 @@ def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
-    return path.read_text(encoding=_encoding(path))
+    with _opened(path) as text:
+        return text.read()
 
 
 def read_text(path: Path, expected: str) -> str:
@@ -56,22 +60,20 @@ def read_text(path: Path, expected: str) -> str:
 def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
     """The lines of a text file, as :func:`whole_text`, with their numbers, from 1, one by one: files may be large."""
     try:
-        with path.open(encoding=_encoding(path)) as file:
-            yield from enumerate(file, start=1)
+        with _opened(path) as text:
+            yield from enumerate(text, start=1)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {error}", expected) from error
 
 
-def _encoding(path: Path) -> str:
-    """The encoding of a text file; ValueError if it holds something in the place of its content."""
-    if found := stand_in(path):
-        raise ValueError(found)
-    return encoding_of(_start(path))
-
-
-def _start(path: Path) -> bytes:
+@contextmanager
+def _opened(path: Path) -> Iterator[TextIOWrapper]:
+    """A text file, opened once, as it may be a pipe; ValueError if something is in its place."""
     with path.open("rb") as file:
-        return file.read(_START_BYTES)
+        start = file.peek(_START_BYTES)[:_START_BYTES]
+        if found := _stand_in(start):
+            raise ValueError(found)
+        yield TextIOWrapper(file, encoding=encoding_of(start))
 
 
 def without_places(text: str, places: Iterable[Path]) -> str:
