@@ -161,17 +161,22 @@ class Transforms:
         return files, given
 
     def _indices(self, key: str, listed: Any) -> list[int]:
-        index_of = {posixpath.normpath(name): index for index, name in enumerate(self.names)}
+        index_of = {_normal(name): index for index, name in enumerate(self.names)}
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{self.path}: {key} is not a list of names", "file_paths of frames")
-        unknown = [name for name in listed if posixpath.normpath(name) not in index_of]
+        unknown = [name for name in listed if _normal(name) not in index_of]
         if unknown:
             hint = did_you_mean(unknown[0], index_of)
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
-        return sorted({index_of[posixpath.normpath(name)] for name in listed})
+        return sorted({index_of[_normal(name)] for name in listed})
 
     def _named(self, name: str) -> Path:
         return reading.named_file(self.path.parent, name, str(self.path), self._outside)
+
+
+def _normal(name: str) -> str:
+    """A path without repeated or relative parts, with slashes."""
+    return posixpath.normpath(name.replace("\\", "/"))
 
 
 def camera_of(

@@ -460,7 +460,7 @@ def in_a_folder(folder: Path) -> None:
 
 #: Damages that make names in a file those of Windows, by kind.
 WINDOWS = {
-    "nerfstudio": edit("transforms.json", r"(images|depth)/", r"\1\\\\"),
+    "nerfstudio": edit("transforms.json", r"(path\": \"(images|depth))/", r"\1\\\\"),
     "reim-nerf": lambda folder: [
         edit(path.name, r"(images|distmaps)/", r"\1\\\\")(folder)
         for path in files(folder, "transforms_*.json")

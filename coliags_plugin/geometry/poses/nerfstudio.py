@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import JsonObject, read_json, read_number
-from coliags_plugin.geometry.poses.formats import Format, head, prefixed_errors
+from coliags_plugin.geometry.poses.formats import Format, head_text, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
@@ -146,6 +146,6 @@ FORMAT = Format(
     "nerfstudio",
     read,
     write,
-    lambda path: head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"),  # a JSON object
+    lambda path: head_text(path).lstrip().startswith("{"),  # a JSON object
     keeps=frozenset({"names", "intrinsics", "cameras"}),
 )
