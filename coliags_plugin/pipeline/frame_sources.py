@@ -313,7 +313,10 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
     if calibration is None:
         return source, settings
     height, width = next(iter(frames))[1].shape[:2]
-    model, params = camera_of_lens(calibration.lens, str(calibration.path), width, height)
+    lens, aspect = calibration.lens, VideoFile(source).aspect if frames.videos == (source,) else 1
+    if round(lens.height * width / height) == round(lens.width * aspect):  # calibrated with pixels as they are stored
+        lens = lens.resized(round(lens.width * aspect), lens.height)
+    model, params = camera_of_lens(lens, str(calibration.path), width, height)
     log.info("%s: camera of %s, for frames of %d x %d", source, calibration.path, width, height)
     known = camera.model_copy(update={"model": model, "params": params})
     return source, settings.model_copy(update={"camera": known})

@@ -32,6 +32,8 @@ _COMPLETE = 0.95
 FASTEST = 1000.0
 #: Places by which packets precede or follow their place by time, at most: 16 frames in H.264 and HEVC.
 _REORDERED = 32
+#: Share of even steps between frames above which longer ones are taken for frames that were lost.
+_EVEN = 0.9
 #: Frames, from the first on, whose times are compared with those of packets before these are believed.
 _COMPARED = 16
 
@@ -65,6 +67,16 @@ class VideoIndex:
     keys: Int64[np.ndarray, "K 3"]
     unit: Fraction
     stated: int
+
+    @property
+    def room(self) -> int:
+        """Number of frames that fit between the first and the last, if nearly all follow each other evenly; else N."""
+        if len(self.times) < 2:
+            return len(self.times)
+        steps = np.diff(self.times)
+        step = np.median(steps)
+        is_even = np.mean(np.abs(steps - step) <= max(0.1 * step, 1)) > _EVEN
+        return 1 + round((self.times[-1] - self.times[0]) / step) if is_even else len(self.times)
 
     def key_before(self, number: int) -> Key | None:
         """The last key frame up to a frame; None where it is the first."""
@@ -114,24 +126,32 @@ class VideoFile:
         _check(*self._identity)
 
     @cached_property
-    def header(self) -> tuple[float | None, int | None]:
-        """Frames a second and number of frames as the header states them; None where it does not, in earnest."""
+    def aspect(self) -> Fraction:
+        """Width of a pixel as stored over its height."""
+        with self.opened() as (_, stream):
+            return stream.sample_aspect_ratio or Fraction(1)
+
+    @cached_property
+    def header(self) -> tuple[float | None, int]:
+        """Frames a second and number of frames as the header states them in earnest; else None and 0."""
         with self.opened() as (container, stream):
-            rate = float(stream.average_rate or 0)
-            seconds = float((stream.duration or 0) * (stream.time_base or 0)) or (container.duration or 0) / 1e6
-            known = rate if 0.0 < rate < FASTEST else None
-            count = stream.frames or (0 if known is None else round(seconds * known))
-            return known, count if 0 < count <= container.size else None
+            rate, count = float(stream.average_rate or 0), stream.frames
+            return rate if 0.0 < rate < FASTEST else None, count if count <= container.size else 0
 
     @property
     def index(self) -> VideoIndex | None:
         """Times of the frames, for which the file is read once; None where packets do not tell them."""
-        return _index(*self._identity)
+        return _packets_of(*self._identity)[0]
+
+    @property
+    def stated(self) -> int:
+        """Number of frames that the file says it has, also where it is cut off; 0 where it does not."""
+        return self.header[1] if self.index is None else self.index.stated
 
     @property
     def expected(self) -> int:
-        """Number of frames by the header, or else :attr:`count`."""
-        return self.header[1] or self.count
+        """Number of frames, for progress: as it is stated, or about that of packets; at least 1."""
+        return max(1, self.stated or _packets_of(*self._identity)[1])
 
     @property
     def count(self) -> int:
@@ -169,11 +189,15 @@ class VideoFile:
         before ``stop`` that it lacks. ``shown`` is applied to images
         and flags as they are stored, before pixels become square and images are turned as the file says.
         """
-        with self.opened() as (_, stream):
-            aspect = stream.sample_aspect_ratio or Fraction(1)
+        import av
+
         done, concealed = 0, 0
         for number, frame in self._numbered(first, seek):
-            image, behind = _picture(frame, aspect, shown), min(number, stop)
+            try:
+                image, behind = _picture(frame, self.aspect, shown), min(number, stop)
+            except av.FFmpegError as error:
+                seen = f"FFmpeg does not convert {frame.format.name} with the colour matrix {frame.colorspace}"
+                raise InputError(f"{self.path}: {seen}: {error.strerror}", "BT.601 or BT.709", AS_IMAGES) from None
             if behind > first + done:
                 log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + done, number - 1)
             while behind > first + done:
@@ -186,7 +210,7 @@ class VideoFile:
             if number + 1 >= stop:
                 break
         if concealed:
-            log.warning("%s: %d damaged frames are shown as far as they can be decoded", self.path, concealed)
+            log.warning("%s: damaged frames, %d, are shown as far as they can be decoded", self.path, concealed)
         if is_filled and done < stop - first:
             shape = image.shape if done else next(self.frames(0, 1, False, False, shown))[0].shape
             yield from ((np.zeros(shape, np.uint8), False) for _ in range(first + done, stop))
@@ -194,10 +218,12 @@ class VideoFile:
             raise InputError(f"{self.path} has no frame {first}", f"one of about {self.expected} frames")
         elif done == 0:
             raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec FFmpeg has", AS_IMAGES)
-        if done < _COMPLETE * (min(stop, self.expected) - first):
-            stated = min(stop, self.expected if self.index is None else self.index.stated) - first
-            if done < _COMPLETE * stated:
-                log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, done, stated)
+        if done < _COMPLETE * (stated := min(stop, self.stated) - first):
+            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, done, stated)
+        elif first == 0 and self.index is not None and done < _COMPLETE * (room := self.index.room) and done < stop:
+            log.warning(
+                "%s: %d frames, though there is time for %d: some are missing in between", self.path, done, room
+            )
 
     def _numbered(self, first: int, seek: bool) -> Iterator[tuple[int, VideoFrame]]:
         """Numbers and frames from one on; behind frames that cannot be decoded, numbers are those by time."""
@@ -318,43 +344,42 @@ def _decoded_frames(path: Path, size: int, modified: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _index(path: Path, size: int, modified: int) -> VideoIndex | None:
-    """Index of a file, which is known by its size and time; None where times of packets are not those of frames."""
-    file = VideoFile(path)
-    shown, keys, begin, end = list[int | None](), list[tuple[int, int, int]](), np.inf, -np.inf
+def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None, int]:
+    """Index of a file, which is known by its size and time, and number of packets; None where these lack times."""
+    file, shown, keys = VideoFile(path), list[int | None](), list[tuple[int, int, int]]()
+    begin, end = np.inf, -np.inf  # of all streams, s
     with file.opened() as (container, stream):
         for packet in _packets(container):
             time = packet.dts if packet.pts is None else packet.pts
             if time is not None and packet.time_base is not None:
                 begin = min(begin, float(time * packet.time_base))
                 end = max(end, float((time + (packet.duration or 0)) * packet.time_base))
-            if packet.stream_index != stream.index:
-                continue
-            if packet.is_keyframe and packet.pts is not None:
-                keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
-            if not packet.is_discard:
-                shown.append(packet.pts)
-        unit, seconds = stream.time_base, (container.duration or 0) / 1e6
-        # Of these containers, the header lists all frames.
+            if packet.stream_index == stream.index:
+                if packet.is_keyframe and packet.pts is not None:
+                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+                shown += [] if packet.is_discard else [packet.pts]
+        unit, seconds = stream.time_base or Fraction(1), (container.duration or 0) / 1e6
+        # The header of MP4 and MOV lists all frames; that of AVI may state nonsense, of which the length is then.
         listed = sum(not entry.is_discard for entry in stream.index_entries) if "mp4" in container.format.name else 0
-    if unit is None or not shown or not keys or None in shown:
-        return None
-    packets = np.array(shown, np.int64)
+        if not listed and stream.frames <= size and end - begin < _COMPLETE * seconds:
+            listed = stream.frames or round(len(shown) * seconds / (end - begin))
+    times = _times(file, shown)
+    if times is None or not keys:
+        return None, len(shown)
+    return VideoIndex(times, np.array(sorted(keys), np.int64), unit, max(len(times), listed)), len(shown)
+
+
+def _times(file: VideoFile, shown: list[int | None]) -> Int64[np.ndarray, "N"] | None:
+    """Times of frames by those of packets; None where some have none or the same, or the first frames have others."""
+    packets = np.array([time for time in shown if time is not None], np.int64)
     order = np.argsort(packets, kind="stable")
-    times = packets[order]
-    if (np.diff(times) <= 0).any() or np.abs(order - np.arange(len(order))).max() > _REORDERED:
+    times, places = packets[order], np.arange(len(order))
+    if len(times) < max(1, len(shown)) or (np.diff(times) <= 0).any() or np.abs(order - places).max() > _REORDERED:
         return None
     whole = takewhile(lambda frame: frame is not None, islice(file.decoded(), _COMPARED))
     decoded = [getattr(frame, "pts", None) for frame in whole]
-    if not decoded or decoded[0] is None:
-        return None
-    times = times[times >= decoded[0]]
-    if times[: len(decoded)].tolist() != decoded:
-        return None
-    stated = max(len(times), listed)
-    if not listed and file.header[1] is not None and end - begin < _COMPLETE * seconds:
-        stated = round(len(times) * seconds / (end - begin))
-    return VideoIndex(times, np.array(sorted(keys), np.int64), unit, stated)
+    times = times[times >= decoded[0]] if decoded and decoded[0] is not None else times[:0]
+    return times if len(times) and times[: len(decoded)].tolist() == decoded else None
 
 
 def _picture(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,11 +11,21 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.pipeline.frame_selection import one_field
-from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, every_of, frame_at, frame_source
+from coliags_plugin.pipeline.frame_sources import (
+    Span,
+    chosen_frames,
+    every_of,
+    frame_at,
+    frame_source,
+    opened_recording,
+)
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from tests.layouts.endomapper import calibration_text
 from tests.pipeline.films import number_of, numbered, write_film
 
 FRAMES = numbered(40)
@@ -112,6 +123,40 @@ def test_what_comes_before_the_first_key_frame_is_no_frame(tmp_path):
     assert [number_of(image) for _, image in frame_source(tmp_path / "cut.ts", Span(9))] == shown[9:]
 
 
+def test_an_edit_list_says_which_frames_are_shown(tmp_path):
+    """From frame 10 on, for a second: decoding begins before it."""
+    data = bytearray(write_film(FRAMES, tmp_path / "a.mp4", rate=25, **ORDERED).read_bytes())
+    place = data.index(b"elst") + 12
+    length, start = struct.unpack_from(">Ii", data, place)
+    assert length == 1600
+    struct.pack_into(">Ii", data, place, 1000, start + 10 * 512)
+    (tmp_path / "a.mp4").write_bytes(data)
+    source = frame_source(tmp_path / "a.mp4")
+    assert [number_of(image) for _, image in source] == list(range(10, 35))
+    assert source.expected == 25 and frame_at(source, "0.4") == 10
+    for first in (1, 6, 13, 24):
+        assert number_of(next(iter(frame_source(source.path, Span(first))))[1]) == 10 + first
+
+
+@pytest.mark.parametrize("name", ["a.ts", "a.mkv", "a.avi"])
+def test_frames_that_a_file_lacks_are_told(tmp_path, name, caplog):
+    """Cut out of the middle of a stream, and off the end of files whose header has the length."""
+    codec = {"codec": "mjpeg", "pix_fmt": "yuvj420p"} if name == "a.avi" else {"g": 1}
+    path = write_film(FRAMES, tmp_path / name, **codec)
+    data = path.read_bytes()
+    step = len(data) // 188 // 4 * 188
+    path.write_bytes(data[:step] + data[2 * step :] if name == "a.ts" else data[: 2 * step])
+    count = len(list(frame_source(path)))
+    said = "there is time for 40" if name == "a.ts" else "its header says 40"
+    assert 15 < count < 38 and f"{name}: {count} frames, though {said}" in caplog.text
+
+
+def test_colours_that_cannot_be_converted_are_refused(tmp_path):
+    path = write_film(FRAMES[:2], tmp_path / "a.mkv", pix_fmt="yuv444p", colorspace=8)
+    with pytest.raises(InputError, match=r"a.mkv: FFmpeg does not convert yuv444p with the colour matrix 8"):
+        list(frame_source(path))
+
+
 @pytest.mark.parametrize(
     ("name", "codec", "options"),
     [
@@ -198,6 +243,17 @@ def test_pixels_are_square_and_images_turned_as_the_file_says(tmp_path, aspect, 
     assert np.median(np.abs(image.astype(int) - right)) <= 3 and np.mean(np.abs(image.astype(int) - right)) < 8
     said = f"a.mov has pixels that are not square ({aspect}) and is read as {width} x 48"
     assert caplog.text.count("not square") == (width != 64) and (width == 64 or said in caplog.text)
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_a_calibration_is_of_pixels_as_they_are_stored_or_square(tmp_path, stored):
+    lens = LENSES["fisheye"].resized(64 if stored else 80, 48)
+    write_film(FRAMES[:2], tmp_path / "a.mp4", aspect="5/4")
+    (tmp_path / "a.xml").write_text(calibration_text(lens))
+    camera = opened_recording(tmp_path, SfmSettings())[1].camera
+    assert camera.model == "OPENCV_FISHEYE"
+    pinhole = LENSES["fisheye"].resized(80, 48).pinhole
+    np.testing.assert_allclose(camera.params[:4], (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), rtol=1e-6)
 
 
 def test_which_of_several_streams_is_used(tmp_path, caplog):
