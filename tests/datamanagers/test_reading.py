@@ -58,6 +58,7 @@ def with_alpha(*channels: np.ndarray, dtype=np.uint8) -> np.ndarray:
         ("16.png", with_alpha(COLORS[..., ::-1], dtype=np.uint16), None, False),
         ("16.tif", with_alpha(COLORS[..., ::-1], dtype=np.uint16), None, False),
         ("opaque.png", np.dstack([COLORS, ALPHA | 128]), {}, True),
+        ("unused.png", np.dstack([COLORS, ALPHA & 127]), {}, True),
         ("rgb.png", COLORS, {}, True),
         ("grey.png", GREY, {}, True),
         ("rgb.jpg", COLORS, {}, True),
@@ -79,13 +80,6 @@ def test_alpha_below_half_is_a_mask(tmp_path, name, pixels, options, binary):
     read = read_8_bit(path)
     np.testing.assert_allclose(read[:, 4:, :3], np.broadcast_to(color, (4, 2, 3)), atol=1)
     assert read.dtype == np.uint8
-
-
-def test_alpha_that_hides_all_is_refused(tmp_path):
-    """As of four bytes a pixel whose last means nothing."""
-    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([COLORS, 0 * ALPHA]))
-    with pytest.raises(InputError, match=r"a\.png: its alpha channel hides all.*Drop the channel"):
-        read_alpha(tmp_path / "a.png")
 
 
 WHITE = np.repeat(np.uint8([0, 255]), 32)[None].repeat(48, 0)
