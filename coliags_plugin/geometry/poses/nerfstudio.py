@@ -76,14 +76,14 @@ def write(path: Path, trajectory: Trajectory) -> None:
     if (pinhole := trajectory.intrinsics) is not None:
         numbers = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
         content = {"camera_model": "PINHOLE", **dict(zip(_PINHOLE, numbers, strict=True))}
-    own: Sequence[JsonObject] = trajectory.cameras or [{}] * len(trajectory)
+    given: Sequence[JsonObject] = trajectory.cameras or [{}] * len(trajectory)
     # nerfstudio reads the model of the file alone, and no distortion of frames where the file has any.
-    common = own[0].keys() if all(camera == own[0] for camera in own) else {"camera_model"}
-    content |= {key: own[0][key] for key in common if all(camera.get(key) == own[0].get(key, ()) for camera in own)}
+    common = given[0].keys() if all(camera == given[0] for camera in given) else {"camera_model"}
+    content |= {key: given[0][key] for key in common if all(each.get(key) == given[0].get(key, ()) for each in given)}
     opengl = trajectory.camera_to_world @ FLIP_Y_AND_Z
     content["frames"] = [
         {"file_path": name, "transform_matrix": matrix.tolist()} | {k: camera[k] for k in camera if k not in content}
-        for name, matrix, camera in zip(names, opengl, own, strict=True)
+        for name, matrix, camera in zip(names, opengl, given, strict=True)
     ]
     write_json(path, content)
 

@@ -70,8 +70,8 @@ def _seem_w_first(centers: Float[np.ndarray, "N 3"], quats: Float[np.ndarray, "N
 
     def along_an_axis(turns: Rotation) -> float:
         """Mean square cosine of the angles of steps and the axis nearest to them, of the camera before each step."""
-        own = turns[:-1][moves].inv().apply(steps)
-        return float(np.linalg.eigvalsh(own.T @ own / len(own))[-1])
+        local = turns[:-1][moves].inv().apply(steps)
+        return float(np.linalg.eigvalsh(local.T @ local / len(local))[-1])
 
     return (
         len(steps) >= _LEAST_STEPS
