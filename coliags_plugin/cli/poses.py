@@ -203,16 +203,16 @@ class PosesConvertCommand:
 
 def _image_names(folder: Path, count: int) -> tuple[str, ...]:
     """Names of a folder's images in natural order, one per pose."""
-    from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in
+    from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, files_in
     from coliags_plugin.geometry.poses.trajectory import natural_order
 
     if not folder.is_dir():
         raise InputError(f"--images {folder}", "a folder of images")
-    names = [path.name for path in files_in(folder, FRAME_SUFFIXES)]
+    names = [path.name for path in files_in(folder, IMAGE_SUFFIXES)]
     if len(names) != count:
         raise InputError(
             f"{folder} holds {len(names)} images for {count} poses",
-            f"one image ({', '.join(sorted(FRAME_SUFFIXES))}) for each pose",
+            "one image (.png, .jpg, .jpeg) for each pose",
             "Give the folder of exactly these frames",
         )
     return tuple(names[index] for index in natural_order(names))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,15 +35,20 @@ def list_images(folder: Path) -> list[Path]:
         raise InputError(f"no folder {folder}", "a folder of images", "Check the path")
     images, unread = files_in(folder, FRAME_SUFFIXES), files_in(folder, _UNREAD)
     if len(images) < 2:
-        seen = f" ({inventory(folder)})" if unread else ""
         raise InputError(
-            f"{folder} holds {len(images)} images{seen}",
+            f"{folder} holds {len(images)} images" + (f" that are read, and {inventory(folder)}" if unread else ""),
             f"at least two ({', '.join(sorted(FRAME_SUFFIXES))})",
-            f"Give the folder of the frames; from a video, {_FFMPEG}",
+            "Convert them" if unread else f"Give the folder of the frames; from a video, {_FFMPEG}",
         )
     if unread:
-        log.warning("%s: %d images are not read, as %s: convert them", folder, len(unread), unread[0].name)
+        _warn_of_unread(folder, len(unread), unread[0].name)
     return [images[index] for index in natural_order([path.name for path in images])]
+
+
+@cache
+def _warn_of_unread(folder: Path, count: int, example: str) -> None:
+    """Log a warning, once, of images in formats that are not read."""
+    log.warning("%s: %d images are not read, as %s: convert them", folder, count, example)
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
