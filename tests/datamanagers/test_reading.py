@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import cv2
@@ -350,3 +351,11 @@ def test_files_that_hold_no_points(tmp_path, name, content, message):
         (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
         read_points(tmp_path / name, 10, rng())
+
+
+@pytest.mark.parametrize("stored", ["NFC", "NFD"])
+@pytest.mark.parametrize("said", ["NFC", "NFD"])
+def test_letters_with_marks_are_found_however_they_are_spelled(tmp_path, said, stored):
+    path = tmp_path / unicodedata.normalize(stored, "Fälle é.png")
+    path.touch()
+    assert named_file(tmp_path, unicodedata.normalize(said, "Fälle é.png"), "a file", outside=False) == path

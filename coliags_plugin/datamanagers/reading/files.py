@@ -7,6 +7,7 @@ import logging
 import os
 import posixpath
 import re
+import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -162,8 +163,9 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
     ``outside`` tells whether it may lie outside of the folder. Links within the folder may always lead anywhere.
     """
     path = folder / name
-    if "\\" in name and not os.path.lexists(path):  # a name of Windows
-        path = folder / name.replace("\\", "/")
+    if not os.path.lexists(path):  # a name of Windows, or of macOS, which splits letters from their marks
+        spelled = [name.replace("\\", "/"), *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
+        path = folder / next((other for other in spelled if os.path.lexists(folder / other)), spelled[0])
     within = Path(posixpath.normpath(folder.absolute()))
     if not outside and not Path(posixpath.normpath(path.absolute())).is_relative_to(within):
         raise InputError(
