@@ -119,7 +119,7 @@ def write_frames(
                 "source": source.path.name,
                 "frames": total,
                 "every": settings.every,
-                "deinterlaced": source.span.deinterlace,
+                "deinterlaced": bool(source.span.deinterlace),
                 "size": [size[1], size[0]],
                 "masked": None if used is None else round(float(1.0 - used.mean()), 4),
                 "kept": [

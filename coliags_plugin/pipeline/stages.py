@@ -254,11 +254,11 @@ def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> N
     """
     for number, stage in enumerate(stages):
         known = record.stages.get(stage.name)
-        if known is None or known.options == _plain(stage.options):
+        if known is None or not (differences := _differences(known.options, stage.options)):
             continue
         if not overwrite and known.state != "failed":
             raise InputError(
-                f"{record.folder}: stage {stage.name} was made with {_differences(known.options, stage.options)}",
+                f"{record.folder}: stage {stage.name} was made with {differences}",
                 "the options that it was begun with",
                 f"Choose another --output, or pass --overwrite to repeat {stage.name} and what follows it",
             )
@@ -267,10 +267,10 @@ def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> N
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """The first differing option, with both values."""
+    """The first differing option, with both values; empty if there is none. What an older version lacks is None."""
     old, new = dict(_leaves(before)), dict(_leaves(_plain(now)))
-    name = next(key for key in [*old, *new] if old.get(key) != new.get(key))
-    return f"{name} {old.get(name)}, not {new.get(name)}"
+    differing = (key for key in [*old, *new] if old.get(key) != new.get(key))
+    return next((f"{name} {old.get(name)}, not {new.get(name)}" for name in differing), "")
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

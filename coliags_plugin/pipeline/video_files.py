@@ -10,19 +10,19 @@ from fractions import Fraction
 from functools import cached_property, lru_cache
 from itertools import chain, islice, takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import av
 import numpy as np
+from av import Packet, VideoFrame
+from av.container import InputContainer
+from av.stream import Disposition
+from av.video.codeccontext import VideoCodecContext
+from av.video.stream import VideoStream
 from jaxtyping import Float64, Int64, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import unreadable
-
-if TYPE_CHECKING:
-    from av import Packet, VideoFrame
-    from av.container import InputContainer
-    from av.video.codeccontext import VideoCodecContext
-    from av.video.stream import VideoStream
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,8 @@ _COMPLETE = 0.95
 FASTEST = 1000.0
 #: Places by which packets precede or follow their place by time, at most: 16 frames in H.264 and HEVC.
 _REORDERED = 32
+#: Bytes of a packet of MPEG-4 part 2 that says that there is no new frame, at most.
+_EMPTY = 12
 #: Share of even steps between frames above which longer ones are taken for frames that were lost.
 _EVEN = 0.9
 #: Frames, from the first on, whose times are compared with those of packets before these are believed.
@@ -71,12 +73,10 @@ class VideoIndex:
     @property
     def room(self) -> int:
         """Number of frames that fit between the first and the last, if nearly all follow each other evenly; else N."""
-        if len(self.times) < 2:
-            return len(self.times)
-        steps = np.diff(self.times)
+        steps = np.diff(self.times, append=2 * self.times[-1] - self.times[-2:][0])
         step = np.median(steps)
         is_even = np.mean(np.abs(steps - step) <= max(0.1 * step, 1)) > _EVEN
-        return 1 + round((self.times[-1] - self.times[0]) / step) if is_even else len(self.times)
+        return round(steps.sum() / step) if is_even and step else len(self.times)
 
     def key_before(self, number: int) -> Key | None:
         """The last key frame up to a frame; None where it is the first."""
@@ -96,12 +96,9 @@ class VideoFile:
     @contextmanager
     def opened(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         """The file and its video, which is no cover picture; InputError where there is none."""
-        import av
-        from av.stream import Disposition
-
         try:
             # Without the protocol, a name such as 12:30.mp4 would have one.
-            container = av.open(f"file:{self.path}")
+            container = av.open(f"file:{self.path}", metadata_errors="replace")
         except (av.FFmpegError, OSError) as error:
             raise unreadable(
                 self.path,
@@ -186,11 +183,9 @@ class VideoFile:
         """Images from one on as far as there are, and whether each is flagged as interlaced.
 
         Where the file is damaged and goes on behind that, the frames between are black, and, with ``is_filled``, those
-        before ``stop`` that it lacks. ``shown`` is applied to images
-        and flags as they are stored, before pixels become square and images are turned as the file says.
+        before ``stop`` that it lacks. ``shown`` is applied to images and flags as they are stored, before pixels become
+        square and images are turned as the file says.
         """
-        import av
-
         done, concealed = 0, 0
         for number, frame in self._numbered(first, seek):
             try:
@@ -273,13 +268,12 @@ class VideoFile:
 
         A stream may begin between key frames: what cannot be decoded before the first of them is no frame.
         """
-        import av
-
         with self.opened() as (container, stream):
             codec, is_lost, is_before = stream.codec_context, False, False
             codec.thread_type, codec.thread_count = "AUTO", threads
             if key is not None:
-                container.seek(key.before, stream=stream)
+                with suppress(av.FFmpegError):  # all is read then
+                    container.seek(key.before, stream=stream)
             is_first = key is None
             for packet in _packets(container, stream):
                 if key is not None and not key.is_in(packet):
@@ -305,8 +299,6 @@ class VideoFile:
 
 def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packet]:
     """Packets that hold something, of some streams or of all, as far as the file can be read."""
-    import av
-
     with suppress(av.FFmpegError):
         for packet in container.demux(*streams):
             if packet.size:
@@ -315,8 +307,6 @@ def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packe
 
 def _drained(codec: VideoCodecContext) -> list[VideoFrame]:
     """Frames that a decoder still holds, to show them in order."""
-    import av
-
     try:
         return codec.decode(None)
     except av.FFmpegError:
@@ -349,6 +339,7 @@ def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None
     file, shown, keys = VideoFile(path), list[int | None](), list[tuple[int, int, int]]()
     begin, end = np.inf, -np.inf  # of all streams, s
     with file.opened() as (container, stream):
+        codec = stream.codec_context.name
         for packet in _packets(container):
             time = packet.dts if packet.pts is None else packet.pts
             if time is not None and packet.time_base is not None:
@@ -357,11 +348,14 @@ def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None
             if packet.stream_index == stream.index:
                 if packet.is_keyframe and packet.pts is not None:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
-                shown += [] if packet.is_discard else [packet.pts]
+                # VP8 marks packets that show nothing; in MPEG-4 part 2 they are of a few bytes, and may be real frames.
+                is_shown = not packet.is_discard and (codec != "vp8" or bool(bytes(packet)[0] & 0x10))
+                is_sure = codec != "mpeg4" or packet.size > _EMPTY
+                shown += [packet.pts if is_sure else None] if is_shown else []
         unit, seconds = stream.time_base or Fraction(1), (container.duration or 0) / 1e6
         # The header of MP4 and MOV lists all frames; that of AVI may state nonsense, of which the length is then.
         listed = sum(not entry.is_discard for entry in stream.index_entries) if "mp4" in container.format.name else 0
-        if not listed and stream.frames <= size and end - begin < _COMPLETE * seconds:
+        if not listed and stream.frames <= size and 0.0 < end - begin < _COMPLETE * seconds:
             listed = stream.frames or round(len(shown) * seconds / (end - begin))
     times = _times(file, shown)
     if times is None or not keys:

@@ -52,20 +52,6 @@ def test_what_cannot_be_read_is_refused(tmp_path):
             list(frame_source(tmp_path / name, Span(first)))
 
 
-def test_a_truncated_video_is_read_as_far_as_it_goes_or_refused(tmp_path, caplog):
-    write_video(film(range(0, 160, 4)), tmp_path / "film.mp4", 15.0)
-    whole = (tmp_path / "film.mp4").read_bytes()
-    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
-    try:
-        with caplog.at_level(logging.WARNING):
-            count = len(list(frame_source(tmp_path / "cut.mp4")))
-    except InputError as error:
-        assert "cut.mp4" in str(error)
-    else:
-        assert 0 < count < 40
-        assert "is it complete?" in caplog.text
-
-
 @pytest.mark.parametrize("name", ["film.mp4", "images"])
 @pytest.mark.parametrize("seek", [True, False])
 def test_some_frames_are_those_of_the_whole(tmp_path, name, seek):

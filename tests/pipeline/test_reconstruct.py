@@ -26,7 +26,7 @@ from coliags_plugin.pipeline.steps import identity_of
 from coliags_plugin.results.reading import read_result
 from tests import commands
 from tests.pipeline.conftest import CAPTURE, TRAINING
-from tests.pipeline.films import film, write_images
+from tests.pipeline.films import film, write_film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 _COVERAGE = steps.coverage
@@ -60,6 +60,12 @@ def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
     record = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]["frames"]
     assert record["options"]["frames"]["every"] == 2 and record["options"]["frames"]["last"] == 30
     assert record["summary"].startswith("16 of 31 frames")
+    times = [*range(0, 400, 20), *range(2000, 6000, 200)]
+    write_film(film(range(0, 120, 3)), tmp_path / "variable.mp4", times=times)
+    variable = ("reconstruct", tmp_path / "variable.mp4", "--output", tmp_path / "variable", "--frames-per-second")
+    assert commands.run(*variable, 10, "--from", 0.2, "--to", "0:04") == 0
+    kept = [frame["frame"] for frame in json.loads((tmp_path / "variable/frames/frames.json").read_text())["kept"]]
+    assert [frame // 5 for frame in kept[:2]] == [2, 3] and kept[2:] == list(range(20, 31))
     images = write_images(tmp_path / "images", film(range(0, 60, 6)))
     assert "Expected one of them" in commands.refused(capsys, *argv, 30, "--every", 2)
     assert "a number between 0 and" in commands.refused(capsys, *argv, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -47,6 +48,15 @@ class Workshop:
         check_options(stages, record, overwrite)
         run_stages(stages, record)
         return self.done
+
+
+def test_an_option_that_the_version_of_a_record_did_not_have_is_none(tmp_path):
+    shop = Workshop(tmp_path)
+    shop.run()
+    record, (first, *_) = Record.of(tmp_path), shop.stages()
+    check_options([replace(first, options={"value": 0, "new": None})], record, overwrite=False)
+    with pytest.raises(InputError, match="made with new None, not 2"):
+        check_options([replace(first, options={"value": 0, "new": 2})], record, overwrite=False)
 
 
 def test_done_stages_are_left_out(tmp_path):

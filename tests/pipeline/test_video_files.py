@@ -294,6 +294,29 @@ def test_pixel_formats(tmp_path, name, codec, pix_fmt, options):
         np.testing.assert_allclose(image.astype(int), frame, atol=3)
 
 
+@pytest.mark.parametrize(("codec", "name"), [("libvpx", "a.webm"), ("mpeg4", "a.avi")])
+def test_packets_that_show_nothing_are_no_frames(tmp_path, codec, name):
+    """A flag that VP8 clears; and in MPEG-4 a header of a type, time (5 bits) and no content."""
+    path = write_film(FRAMES, tmp_path / f"whole-{name}", codec, 25, g=20, bf=0, b=4_000_000)
+    with av.open(str(path)) as file, av.open(str(tmp_path / name), "w") as out:
+        stream = file.streams.video[0]
+        copied = out.add_stream_from_template(stream)
+        for number, packet in enumerate(packet for packet in file.demux(stream) if packet.size):
+            data = bytes(packet)
+            if number in (26, 27) and codec == "libvpx":
+                data = bytes([data[0] & ~0x10]) + data[1:]
+            elif number in (26, 27):
+                data = b"\0\0\1\xb6" + (0b0101_0000_0100_1111 | (number - 25) << 7).to_bytes(2, "big")
+            made = av.Packet(data)
+            made.pts, made.dts, made.time_base = packet.pts, packet.dts, packet.time_base
+            made.is_keyframe, made.stream = packet.is_keyframe, copied
+            out.mux(made)
+    whole = [image for _, image in frame_source(tmp_path / name)]
+    assert len(whole) == VideoFile(tmp_path / name).count == 38
+    for first in (24, 25, 30, 37):
+        np.testing.assert_array_equal(next(iter(frame_source(tmp_path / name, Span(first))))[1], whole[first])
+
+
 def test_a_video_of_one_frame(tmp_path):
     source = frame_source(write_film(FRAMES[7:8], tmp_path / "one.mp4"))
     assert [number_of(image) for _, image in source] == [7] and source.expected == 1
