@@ -30,13 +30,15 @@ log = logging.getLogger(__name__)
 _COMPLETE = 0.95
 #: Frames a second that no header states in earnest.
 FASTEST = 1000.0
+#: Ratio of the sides of a pixel that is in earnest, at most.
+_STRETCHED = 8
 #: Places by which packets precede or follow their place by time, at most: 16 frames in H.264 and HEVC.
 _REORDERED = 32
 #: Bytes of a packet of MPEG-4 part 2 that says that there is no new frame, at most.
 _EMPTY = 12
 #: Share of even steps between frames above which longer ones are taken for frames that were lost.
 _EVEN = 0.9
-#: Frames, from the first on, whose times are compared with those of packets before these are believed.
+#: Frames, from three key frames on, whose times are compared with those of packets before these are believed.
 _COMPARED = 16
 
 AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the folder"
@@ -80,7 +82,7 @@ class VideoIndex:
 
     def key_before(self, number: int) -> Key | None:
         """The last key frame up to a frame; None where it is the first."""
-        place = int(np.searchsorted(self.keys[:, 0], self.times[number], side="right")) - 1
+        place = int(np.searchsorted(self.keys[:, 0], self.times[: number + 1][-1], side="right")) - 1
         if place < 1:
             return None
         time, _, size = self.keys[place].tolist()
@@ -108,15 +110,13 @@ class VideoFile:
                 f"Fetch it again if it is incomplete. {AS_IMAGES}",
             ) from None
         with container:
-            videos = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
-            if not videos:
+            if not (videos := _videos(container)):
                 held = ", ".join(each.type for each in container.streams) or "none"
                 raise InputError(f"{self.path} has no video among its streams ({held})", "a video", "Check the path")
-            best = container.streams.best("video")
-            stream = next((each for each in videos if each is best), videos[0])
-            if stream.codec_context is None:
+            known = [each for each in videos if each.codec_context is not None]
+            if not known:
                 raise InputError(f"FFmpeg does not know the codec of {self.path}", "another one", AS_IMAGES)
-            yield container, stream
+            yield container, max(known, key=lambda stream: stream.width * stream.height)
 
     def check(self) -> None:
         """Refuse what cannot be opened; say, once, what of the file is used where it leaves a choice."""
@@ -124,9 +124,10 @@ class VideoFile:
 
     @cached_property
     def aspect(self) -> Fraction:
-        """Width of a pixel as stored over its height."""
+        """Width of a pixel as stored over its height; 1 where the file does not say, in earnest."""
         with self.opened() as (_, stream):
-            return stream.sample_aspect_ratio or Fraction(1)
+            found = stream.sample_aspect_ratio or Fraction(1)
+            return found if 1 / _STRETCHED <= found <= _STRETCHED else Fraction(1)
 
     @cached_property
     def header(self) -> tuple[float | None, int]:
@@ -297,9 +298,14 @@ class VideoFile:
                 yield from _drained(codec)
 
 
+def _videos(container: InputContainer) -> list[VideoStream]:
+    """Streams of video, without cover pictures."""
+    return [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+
+
 def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packet]:
     """Packets that hold something, of some streams or of all, as far as the file can be read."""
-    with suppress(av.FFmpegError):
+    with suppress(av.FFmpegError, IndexError):  # at the end, of streams that begin within the file
         for packet in container.demux(*streams):
             if packet.size:
                 yield packet
@@ -317,8 +323,8 @@ def _drained(codec: VideoCodecContext) -> list[VideoFrame]:
 def _check(path: Path, size: int, modified: int) -> None:
     """Open a file, which is known by its size and time, and say what is not as usual."""
     with VideoFile(path).opened() as (container, stream):
-        aspect, width, height = stream.sample_aspect_ratio or Fraction(1), stream.width, stream.height
-        if (count := len(container.streams.video)) > 1:
+        aspect, width, height = VideoFile(path).aspect, stream.width, stream.height
+        if (count := len(_videos(container))) > 1:
             log.warning(
                 "%s has %d video streams: number %d is used, of %d x %d", path, count, stream.index, width, height
             )
@@ -357,23 +363,24 @@ def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None
         listed = sum(not entry.is_discard for entry in stream.index_entries) if "mp4" in container.format.name else 0
         if not listed and stream.frames <= size and 0.0 < end - begin < _COMPLETE * seconds:
             listed = stream.frames or round(len(shown) * seconds / (end - begin))
-    times = _times(file, shown)
-    if times is None or not keys:
-        return None, len(shown)
-    return VideoIndex(times, np.array(sorted(keys), np.int64), unit, max(len(times), listed)), len(shown)
-
-
-def _times(file: VideoFile, shown: list[int | None]) -> Int64[np.ndarray, "N"] | None:
-    """Times of frames by those of packets; None where some have none or the same, or the first frames have others."""
     packets = np.array([time for time in shown if time is not None], np.int64)
     order = np.argsort(packets, kind="stable")
     times, places = packets[order], np.arange(len(order))
-    if len(times) < max(1, len(shown)) or (np.diff(times) <= 0).any() or np.abs(order - places).max() > _REORDERED:
-        return None
-    whole = takewhile(lambda frame: frame is not None, islice(file.decoded(), _COMPARED))
-    decoded = [getattr(frame, "pts", None) for frame in whole]
-    times = times[times >= decoded[0]] if decoded and decoded[0] is not None else times[:0]
-    return times if len(times) and times[: len(decoded)].tolist() == decoded else None
+    is_even = len(times) == len(shown) and (np.diff(times) > 0).all() and (np.abs(order - places) <= _REORDERED).all()
+    if not keys or not is_even or (start := next(file.decoded(), None)) is None or start.pts is None:
+        return None, len(shown)
+    times = times[times >= start.pts]
+    index = VideoIndex(times, np.array(sorted(keys), np.int64), unit, max(len(times), listed))
+    looked_at = {index.key_before(number) for number in (0, len(times) // 2, len(times) - 1)} if len(times) else {}
+    return index if looked_at and all(_is_right(file, index, key) for key in looked_at) else None, len(shown)
+
+
+def _is_right(file: VideoFile, index: VideoIndex, key: Key | None) -> bool:
+    """Whether frames from a key frame on have the times that the index says, up to one that is damaged."""
+    whole = (frame.pts for frame in takewhile(lambda frame: frame is not None, file.decoded(key)) if frame is not None)
+    decoded = [time for time in islice(whole, _COMPARED) if time is not None and (key is None or time >= key.time)]
+    place = np.searchsorted(index.times, decoded[0]) if decoded else 0
+    return index.times[place:][: len(decoded)].tolist() == decoded
 
 
 def _picture(

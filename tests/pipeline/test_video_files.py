@@ -261,18 +261,30 @@ def test_which_of_several_streams_is_used(tmp_path, caplog):
     two = write_film(FRAMES[:12], tmp_path / "two.mkv", second=small[::-1])
     assert numbers(two) == list(range(12))
     assert "two.mkv has 2 video streams: number 0 is used, of 64 x 48" in caplog.text
-    for name in ("sound.mkv", "cover.mp4"):
-        with av.open(str(tmp_path / name), "w") as file:
-            track = file.add_stream("aac", 8000, layout="mono")
-            tone = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
-            tone.sample_rate = 8000
-            if name == "cover.mp4":
-                cover = file.add_stream("mjpeg", 1)
-                cover.height, cover.width, cover.pix_fmt = 24, 32, "yuvj420p"
-                cover.disposition = av.stream.Disposition.attached_pic
-                file.mux(cover.encode(av.VideoFrame.from_ndarray(small[0], format="rgb24")))
-            file.mux([*track.encode(tone), *track.encode(None)])
-        with pytest.raises(InputError, match=rf"{name} has no video among its streams \(audio"):
+
+
+@pytest.mark.parametrize(
+    ("name", "codecs"), [("a.mkv", ["aac"]), ("a.mp4", ["aac", "mjpeg"]), ("a.mp4", ["mjpeg", "aac", "libx264"])]
+)
+def test_sound_and_cover_pictures_are_no_video(tmp_path, name, codecs, caplog):
+    with av.open(str(tmp_path / name), "w") as file:
+        streams = {}
+        for codec in codecs:
+            if codec == "aac":
+                streams[codec] = file.add_stream(codec, 8000, layout="mono")
+                continue
+            streams[codec] = stream = file.add_stream(codec, 20)
+            stream.height, stream.width, stream.pix_fmt = 48, 64, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            stream.disposition = av.stream.Disposition.attached_pic if codec == "mjpeg" else 0
+        for codec, stream in streams.items():
+            frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            frame.sample_rate = 8000
+            picture = av.VideoFrame.from_ndarray(FRAMES[codec == "libx264"], format="rgb24")
+            file.mux([*stream.encode(frame if codec == "aac" else picture), *stream.encode(None)])
+    if "libx264" in codecs:
+        assert [number_of(image) for _, image in frame_source(tmp_path / name)] == [1] and not caplog.records
+    else:
+        with pytest.raises(InputError, match=r"has no video among its streams \((audio|audio, video)\)"):
             frame_source(tmp_path / name)
 
 
