@@ -29,7 +29,6 @@ from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, ca
 
 log = logging.getLogger(__name__)
 
-
 #: Share of the frames looked at that are flagged as interlaced above which all are deinterlaced.
 _INTERLACED = 0.1
 
@@ -57,7 +56,7 @@ class Span:
 class FrameSource:
     """Frames of a folder of images, of a video file or of several, in order; every iteration reads them anew.
 
-    Images are in the natural order of their names, frames of videos numbered through by what their headers say.
+    Images are in the natural order of their names, frames of videos are numbered through.
     """
 
     path: Path
@@ -66,9 +65,9 @@ class FrameSource:
 
     @property
     def expected(self) -> int:
-        """Number of frames, at least 1: by what a file says, for progress alone; of several, as numbers have it."""
+        """Number of frames, at least 1: for progress, of one file about so many."""
         if len(self.videos) == 1:
-            return self.span.count(VideoFile(self.path).expected)
+            return self.span.count(VideoFile(self.videos[0]).expected)
         return self.span.count(sum(self._counts.values()) or len(list_images(self.path)))
 
     @property

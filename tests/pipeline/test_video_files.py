@@ -330,5 +330,7 @@ def test_packets_that_show_nothing_are_no_frames(tmp_path, codec, name):
 
 
 def test_a_video_of_one_frame(tmp_path):
-    source = frame_source(write_film(FRAMES[7:8], tmp_path / "one.mp4"))
-    assert [number_of(image) for _, image in source] == [7] and source.expected == 1
+    path = write_film(FRAMES[7:8], tmp_path / "one.mp4")
+    for source in (frame_source(path), frame_source(tmp_path)):
+        assert [number_of(image) for _, image in source] == [7]
+        assert (source.expected, source.rate, source.is_variable) == (1, 20.0, False)
