@@ -17,7 +17,6 @@ import numpy as np
 from av import Packet, VideoFrame
 from av.container import InputContainer
 from av.stream import Disposition
-from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from jaxtyping import Float64, Int64, UInt8
 
@@ -129,37 +128,27 @@ class VideoFile:
             found = stream.sample_aspect_ratio or Fraction(1)
             return found if 1 / _STRETCHED <= found <= _STRETCHED else Fraction(1)
 
-    @cached_property
-    def header(self) -> tuple[float | None, int]:
-        """Frames a second and number of frames as the header states them in earnest; else None and 0."""
-        with self.opened() as (container, stream):
-            rate, count = float(stream.average_rate or 0), stream.frames
-            return rate if 0.0 < rate < FASTEST else None, count if count <= container.size else 0
-
     @property
     def index(self) -> VideoIndex | None:
         """Times of the frames, for which the file is read once; None where packets do not tell them."""
         return _packets_of(*self._identity)[0]
 
     @property
-    def stated(self) -> int:
-        """Number of frames that the file says it has, also where it is cut off; 0 where it does not."""
-        return self.header[1] if self.index is None else self.index.stated
-
-    @property
     def expected(self) -> int:
-        """Number of frames, for progress: as it is stated, or about that of packets; at least 1."""
-        return max(1, self.stated or _packets_of(*self._identity)[1])
+        """Number of frames that the file should have, or of packets where these do not tell; at least 1."""
+        return max(1, _packets_of(*self._identity)[1] if self.index is None else self.index.stated)
 
     @property
     def count(self) -> int:
         """Number of frames, those included that a file which is cut off lacks at its end; at least 1."""
         return max(1, _decoded_frames(*self._identity) if self.index is None else self.index.stated)
 
-    @property
+    @cached_property
     def rate(self) -> float | None:
         """Frames a second, the mean of a variable rate; None where nothing tells."""
-        stated, times, index = self.header[0], self.times, self.index
+        with self.opened() as (_, stream):
+            rate = float(stream.average_rate or 0.0)
+        stated, times, index = rate if 0.0 < rate < FASTEST else None, self.times, self.index
         if times is None or index is None or len(times) < 2:
             return stated
         numbers = np.arange(len(times))
@@ -189,11 +178,7 @@ class VideoFile:
         """
         done, concealed = 0, 0
         for number, frame in self._numbered(first, seek):
-            try:
-                image, behind = _picture(frame, self.aspect, shown), min(number, stop)
-            except av.FFmpegError as error:
-                seen = f"FFmpeg does not convert {frame.format.name} with the colour matrix {frame.colorspace}"
-                raise InputError(f"{self.path}: {seen}: {error.strerror}", "BT.601 or BT.709", AS_IMAGES) from None
+            image, behind = self._picture(frame, shown), min(number, stop)
             if behind > first + done:
                 log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + done, number - 1)
             while behind > first + done:
@@ -214,12 +199,40 @@ class VideoFile:
             raise InputError(f"{self.path} has no frame {first}", f"one of about {self.expected} frames")
         elif done == 0:
             raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec FFmpeg has", AS_IMAGES)
-        if done < _COMPLETE * (stated := min(stop, self.stated) - first):
+        if (index := self.index) is None:
+            return
+        if done < _COMPLETE * (stated := min(stop, index.stated) - first):
             log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, done, stated)
-        elif first == 0 and self.index is not None and done < _COMPLETE * (room := self.index.room) and done < stop:
-            log.warning(
-                "%s: %d frames, though there is time for %d: some are missing in between", self.path, done, room
+        elif first == 0 and done < min(stop, _COMPLETE * index.room):
+            what = "%s: %d frames, though there is time for %d: some are missing in between"
+            log.warning(what, self.path, done, index.room)
+
+    def _picture(
+        self, frame: VideoFrame, shown: Callable[[np.ndarray, bool], np.ndarray]
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The image of a frame, with square pixels: rows stay, as those of an interlaced one are of two moments."""
+        import cv2
+
+        try:
+            image: Any = frame.to_ndarray(format="rgb24", interpolation="BICUBIC", threads=1)
+        except av.FFmpegError as error:
+            seen = f"FFmpeg does not convert {frame.format.name} with the colour matrix {frame.colorspace}"
+            raise InputError(f"{self.path}: {seen}: {error.strerror}", "BT.601 or BT.709", AS_IMAGES) from None
+        image = shown(image, frame.interlaced_frame)
+        height, width = image.shape[:2]
+        if (square := round(width * self.aspect)) != width:
+            image = cv2.resize(
+                image, (square, height), interpolation=cv2.INTER_AREA if square < width else cv2.INTER_LINEAR
             )
+        turn: Any = frame.side_data.get("DISPLAYMATRIX")
+        if turn is not None:
+            matrix = np.frombuffer(turn, np.int32)
+            if matrix[0] == 0:  # columns become rows
+                image, right, down = image.swapaxes(0, 1), matrix[3], matrix[1]
+            else:
+                right, down = matrix[0], matrix[4]
+            image = image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
+        return np.ascontiguousarray(image)
 
     def _numbered(self, first: int, seek: bool) -> Iterator[tuple[int, VideoFrame]]:
         """Numbers and frames from one on; behind frames that cannot be decoded, numbers are those by time."""
@@ -288,14 +301,16 @@ class VideoFile:
                 except av.FFmpegError:
                     if not is_before:
                         is_lost = True
-                        yield from _drained(codec)
+                        with suppress(av.FFmpegError):
+                            yield from codec.decode(None)  # those held back for their order
                         yield None
                         codec.flush_buffers()
                     continue
                 is_before = is_before and not frames
                 yield from frames
             if not is_lost:
-                yield from _drained(codec)
+                with suppress(av.FFmpegError):
+                    yield from codec.decode(None)
 
 
 def _videos(container: InputContainer) -> list[VideoStream]:
@@ -311,23 +326,14 @@ def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packe
                 yield packet
 
 
-def _drained(codec: VideoCodecContext) -> list[VideoFrame]:
-    """Frames that a decoder still holds, to show them in order."""
-    try:
-        return codec.decode(None)
-    except av.FFmpegError:
-        return []
-
-
 @lru_cache(maxsize=64)
 def _check(path: Path, size: int, modified: int) -> None:
     """Open a file, which is known by its size and time, and say what is not as usual."""
     with VideoFile(path).opened() as (container, stream):
         aspect, width, height = VideoFile(path).aspect, stream.width, stream.height
         if (count := len(_videos(container))) > 1:
-            log.warning(
-                "%s has %d video streams: number %d is used, of %d x %d", path, count, stream.index, width, height
-            )
+            what = "%s has %d video streams: number %d is used, of %d x %d"
+            log.warning(what, path, count, stream.index, width, height)
         if (square := round(width * aspect)) != width:
             what = "%s has pixels that are not square (%s) and is read as %d x %d: --params and --mask are of that size"
             log.warning(what, path, aspect, square, height)
@@ -381,26 +387,3 @@ def _is_right(file: VideoFile, index: VideoIndex, key: Key | None) -> bool:
     decoded = [time for time in islice(whole, _COMPARED) if time is not None and (key is None or time >= key.time)]
     place = np.searchsorted(index.times, decoded[0]) if decoded else 0
     return index.times[place:][: len(decoded)].tolist() == decoded
-
-
-def _picture(
-    frame: VideoFrame, aspect: Fraction, shown: Callable[[np.ndarray, bool], np.ndarray]
-) -> UInt8[np.ndarray, "H W 3"]:
-    """The image of a frame, with square pixels: rows stay, as those of an interlaced one are of two moments."""
-    import cv2
-
-    image: Any = shown(frame.to_ndarray(format="rgb24", interpolation="BICUBIC", threads=1), frame.interlaced_frame)
-    height, width = image.shape[:2]
-    if (square := round(width * aspect)) != width:
-        image = cv2.resize(
-            image, (square, height), interpolation=cv2.INTER_AREA if square < width else cv2.INTER_LINEAR
-        )
-    turn: Any = frame.side_data.get("DISPLAYMATRIX")
-    if turn is not None:
-        matrix = np.frombuffer(turn, np.int32)
-        if matrix[0] == 0:  # columns become rows
-            image, right, down = image.swapaxes(0, 1), matrix[3], matrix[1]
-        else:
-            right, down = matrix[0], matrix[4]
-        image = image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
-    return np.ascontiguousarray(image)
