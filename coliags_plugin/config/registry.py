@@ -136,7 +136,7 @@ def _is_components(found: object) -> TypeGuard[dict[str, dict[str, object]]]:
 @cache
 def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
     found: dict[str, dict[str, dict[str, object]]] = {}
-    for path in filter(None, path_list.split(os.pathsep)):
+    for path in map(os.path.expanduser, filter(None, path_list.split(os.pathsep))):
         if not Path(path).is_file():
             raise InputError(
                 f"{PLUGIN_PATH_VARIABLE} names '{path}', which is not a file",

@@ -58,7 +58,8 @@ def test_entry_points_are_found(monkeypatch):
 def test_plugin_path_files_are_found(monkeypatch, tmp_path):
     plugin = tmp_path / "mine.py"
     plugin.write_text("class Mine: pass\nCOMPONENTS = {'fields': {'mine': Mine}}\n")
-    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", "~/mine.py")
     registry = Registry("fields", {}, "thing")
     assert registry.get("mine").__name__ == "Mine"
     assert registry.source("mine") == str(plugin)
