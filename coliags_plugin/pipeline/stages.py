@@ -267,7 +267,7 @@ def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> N
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """The first differing option, with both values; empty if there is none. What an older version lacks is None."""
+    """The first differing option, with both values; empty if there is none. An option that is not there is None."""
     old, new = dict(_leaves(before)), dict(_leaves(_plain(now)))
     differing = (key for key in [*old, *new] if old.get(key) != new.get(key))
     return next((f"{name} {old.get(name)}, not {new.get(name)}" for name in differing), "")
