@@ -39,7 +39,6 @@ class Span:
 
     first: int = 0
     last: int | None = None  # inclusive; None: to the end
-    seek: bool = True  # whether the first is sought, or all before it are decoded
     #: Whether of every frame one field is kept, and the rows of the other interpolated; None: of frames flagged so.
     deinterlace: bool | None = False
 
@@ -145,7 +144,7 @@ class FrameSource:
             is_last, first = path == self.videos[-1], max(0, self.span.first - start)
             count = sys.maxsize if is_last else self._counts[path]
             if first < (stop := min(end - start, count)):
-                frames = VideoFile(path).frames(first, stop, self.span.seek, not is_last, self.span.shown)
+                frames = VideoFile(path).frames(first, stop, not is_last, self.span.shown)
                 for number, (image, is_interlaced) in enumerate(frames, start + first):
                     yield path, f"frame_{number:06d}", image, is_interlaced
             start += count
@@ -174,7 +173,7 @@ def frame_source(path: Path, span: Span = Span()) -> FrameSource:
 
 def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
     """The frames of a file or folder that settings choose, deinterlaced as they say, or else by flags and looks."""
-    source = frame_source(path, Span(settings.first, settings.last, settings.seek, settings.deinterlace))
+    source = frame_source(path, Span(settings.first, settings.last, settings.deinterlace))
     if settings.deinterlace is not None:
         return source
     stored, flags = replace(source, span=replace(source.span, deinterlace=False)), list[bool]()

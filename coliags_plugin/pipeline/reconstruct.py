@@ -74,7 +74,7 @@ def reconstruct(
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
-        video = frame_source(source, Span(frames.first, frames.last, frames.seek))
+        video = frame_source(source, Span(frames.first, frames.last))
         log.info("%s", forecast(video, settings))
         is_long = video.expected > frames.segment * frames.every
     else:
@@ -136,7 +136,7 @@ def _segments(context: StageContext, record: Record, overwrite: bool, is_long: b
     video, survey = figures_as(record.stages, "survey", Video, out), Survey.read(out)
     found = []
     for segment in sorted(video.segments, key=lambda own: -survey.part(own.first, own.last).followed.sum()):
-        span = {"first": segment.first, "last": segment.last, "seek": video.seek, "deinterlace": video.deinterlace}
+        span = {"first": segment.first, "last": segment.last, "deinterlace": video.deinterlace}
         own = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
         found.append((replace(context, out=out / segment.name, segment=segment.name, settings=own), segment.count))
     return found

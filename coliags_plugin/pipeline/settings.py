@@ -22,11 +22,6 @@ class FrameSettings(Settings):
 
     first: int = Field(default=0, ge=0, description="Number of the first frame in the video, counted from 0.")
     last: int | None = Field(default=None, ge=0, description="Number of the last frame; None: of the video.")
-    seek: bool = Field(
-        default=True,
-        description="Whether the first frame is sought in the video's file. false: all before it are decoded, for "
-        "files in which frames are not found by their number.",
-    )
     deinterlace: bool | None = Field(
         default=None,
         description="Whether of every frame one field is kept, and the rows of the other interpolated. None: where the "

@@ -103,7 +103,7 @@ def identity_of(path: Path) -> Mapping[str, Any]:
 def make_frames(context: StageContext) -> StageOutcome:
     """Write the frames of use, and their mask, by the survey of the video."""
     settings = context.settings.frames
-    span = Span(settings.first, settings.last, settings.seek, settings.deinterlace)
+    span = Span(settings.first, settings.last, settings.deinterlace)
     source, survey = frame_source(context.source, span), Survey.read(context.root).part(span.first, span.last)
     summary = write_frames(source, survey, context.frames, settings, context.mask, context.progress)
     made = {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
-from zlib import crc32
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt32
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
@@ -29,7 +27,7 @@ log = logging.getLogger(__name__)
 
 #: Name of the file in the reconstruction's folder.
 SURVEY_FILE = "survey.npz"
-_ARRAYS = ("sharpness", "followed", "motion", "checksums")
+_ARRAYS = ("sharpness", "followed", "motion")
 #: Brightness of all pixels below which frames show nothing, of 255: that of 12 bits in 16.
 _DARK = 16
 #: Fewest frames of which something is believed to rest: in a few, moving things are alike by chance.
@@ -46,7 +44,6 @@ class Survey:
         sharpness: Root mean square of the Laplacian over the mean brightness; 0 without any texture. [N]
         followed: Share of corners that were followed from the frame before. [N]
         motion: Their median displacement, as a share of the larger side; infinity where too few were followed. [N]
-        checksums: Of the pixels, to know a frame again. [N]
         size: Height and width of the frames, pixels.
         mask: False outside of the lens's image and on overlays; None where all counts. [H, W]
         first: Number of the first frame.
@@ -56,7 +53,6 @@ class Survey:
     sharpness: Float[np.ndarray, "N"]
     followed: Float32[np.ndarray, "N"]
     motion: Float32[np.ndarray, "N"]
-    checksums: UInt32[np.ndarray, "N"]
     size: tuple[int, int]
     mask: Bool[np.ndarray, "H W"] | None
     first: int = 0
@@ -138,11 +134,6 @@ class FrameSurvey:
         return None if mask.all() or len(self._sizes) > 1 else mask
 
 
-def checksum(gray: UInt8[np.ndarray, "h w"]) -> int:
-    """Checksum of a reduced frame."""
-    return crc32(gray.tobytes())
-
-
 def survey_video(source: FrameSource, progress: Progress | None = None) -> Survey:
     """Look at every frame of a video once, two of them at a time.
 
@@ -150,21 +141,18 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
         InputError: It has no frame that can be decoded, or frames of several sizes.
     """
     whole = FrameSurvey(source.path)
-    followed, motions, checksums, last = list[float](), list[float](), list[int](), None
+    followed, motions, last = list[float](), list[float](), None
     for _, image in watched(source, "look at frames", progress):
         whole.add(image)
         gray = reduced(image)
         moved, share = (np.inf, 0.0) if last is None else motion_and_survival(last, gray)
         motions.append(moved)
         followed.append(share)
-        checksums.append(checksum(gray))
         last = gray
-    mask, single, first = whole.mask(), np.float32, source.span.first
+    first, sharpness, single = source.span.first, np.array(whole.sharpnesses), np.float32
     times = source.times[first : first + len(motions)] if source.is_variable and source.times is not None else None
-    return Survey(
-        np.array(whole.sharpnesses), np.array(followed, single), np.array(motions, single),
-        np.array(checksums, np.uint32), whole.size, mask, first, times,
-    )  # fmt: skip
+    shares, motion_shares = np.array(followed, single), np.array(motions, single)
+    return Survey(sharpness, shares, motion_shares, whole.size, whole.mask(), first, times)
 
 
 #: Share of corners below which a frame shows nothing of the one before: wall contact, blur, wash, or a cut.
@@ -215,7 +203,6 @@ class Video(BaseModel):
     frames: Annotated[int, Field(gt=0, lt=_MOST_FRAMES)]  # that were looked at
     size: tuple[int, int] | None = None  # width and height, pixels
     first: Annotated[int, Field(ge=0, lt=_MOST_FRAMES)] = 0  # that was looked at
-    seek: bool = True  # whether frames are found by their number
     deinterlace: bool | None = False  # whether they were read so; None: those that are flagged
     segments: tuple[Segment, ...]
     skipped: tuple[Skipped, ...] = ()
@@ -252,23 +239,11 @@ def survey_and_cut(
         frames=len(survey),
         size=(width, height),
         first=span.first,
-        seek=span.seek and (least is None or are_found(source, survey, [each.first for each in segments])),
         deinterlace=span.deinterlace,
         segments=tuple(segments),
         skipped=tuple(skipped),
     )
     return survey, video
-
-
-def are_found(source: FrameSource, survey: Survey, numbers: Sequence[int]) -> bool:
-    """Whether frames that are sought by their number are those that came in order."""
-    for number in numbers:
-        one = replace(source, span=replace(source.span, first=number, last=number))
-        image = next((image for _, image in one), None)
-        if image is None or checksum(reduced(image)) != survey.checksums[number - source.span.first]:
-            log.warning("%s: frames are not found by their number, and decoded in order for every segment", source.path)
-            return False
-    return True
 
 
 def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segment], list[Skipped]]:

@@ -168,7 +168,7 @@ class VideoFile:
         return self.path.absolute(), status.st_size, status.st_mtime_ns
 
     def frames(
-        self, first: int, stop: int, seek: bool, is_filled: bool, shown: Callable[[np.ndarray, bool], np.ndarray]
+        self, first: int, stop: int, is_filled: bool, shown: Callable[[np.ndarray, bool], np.ndarray]
     ) -> Iterator[tuple[UInt8[np.ndarray, "H W 3"], bool]]:
         """Images from one on as far as there are, and whether each is flagged as interlaced.
 
@@ -177,7 +177,7 @@ class VideoFile:
         square and images are turned as the file says.
         """
         done, concealed = 0, 0
-        for number, frame in self._numbered(first, seek):
+        for number, frame in self._numbered(first):
             image, behind = self._picture(frame, shown), min(number, stop)
             if behind > first + done:
                 log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + done, number - 1)
@@ -193,7 +193,7 @@ class VideoFile:
         if concealed:
             log.warning("%s: damaged frames, %d, are shown as far as they can be decoded", self.path, concealed)
         if is_filled and done < stop - first:
-            shape = image.shape if done else next(self.frames(0, 1, False, False, shown))[0].shape
+            shape = image.shape if done else next(self.frames(0, 1, False, shown))[0].shape
             yield from ((np.zeros(shape, np.uint8), False) for _ in range(first + done, stop))
         elif done == 0 and first > 0:
             raise InputError(f"{self.path} has no frame {first}", f"one of about {self.expected} frames")
@@ -234,9 +234,9 @@ class VideoFile:
             image = image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
         return np.ascontiguousarray(image)
 
-    def _numbered(self, first: int, seek: bool) -> Iterator[tuple[int, VideoFrame]]:
+    def _numbered(self, first: int) -> Iterator[tuple[int, VideoFrame]]:
         """Numbers and frames from one on; behind frames that cannot be decoded, numbers are those by time."""
-        number, frames = self._sought(first) if seek and first > 0 else (0, self.decoded())
+        number, frames = self._sought(first) if first > 0 else (0, self.decoded())
         for frame in frames:
             if frame is None:
                 # Of a file whose first frame cannot be decoded, FFmpeg may take packets of gigabytes for others.

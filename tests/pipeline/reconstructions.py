@@ -164,7 +164,7 @@ def write_long(out: Path, **changes) -> Path:
 def write_survey(out: Path, frames: int = FRAMES) -> None:
     followed = np.linspace(0.0, 1.0, frames, dtype=np.float32)
     motion = np.where(followed < 0.1, np.inf, 0.01).astype(np.float32)
-    Survey(followed * 0.02, followed, motion, np.arange(frames, dtype=np.uint32), (32, 40), None).write(out)
+    Survey(followed * 0.02, followed, motion, (32, 40), None).write(out)
 
 
 def write_short(out: Path) -> Path:

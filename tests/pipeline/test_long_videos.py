@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,11 +19,11 @@ from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.contents import read_contents
-from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
-from coliags_plugin.pipeline.survey import OVERLAP, Survey, are_found, cut, survey_video
+from coliags_plugin.pipeline.survey import OVERLAP, Survey, cut, survey_video
 from tests import commands
 from tests.faults import largest_file
 from tests.pipeline.conftest import TRAINING, write_atlas
@@ -37,7 +36,7 @@ def surveyed(followed, sharpness=1.0):
     followed = np.array(followed, np.float32)
     count = len(followed)
     sharp = np.broadcast_to(np.float32(sharpness), count)
-    return Survey(sharp, followed, np.zeros(count, np.float32), np.arange(count, dtype=np.uint32), (40, 50), None)
+    return Survey(sharp, followed, np.zeros(count, np.float32), (40, 50), None)
 
 
 def test_a_survey_sees_every_frame_once_and_is_read_back(tmp_path):
@@ -49,7 +48,7 @@ def test_a_survey_sees_every_frame_once_and_is_read_back(tmp_path):
     assert np.isfinite(survey.motion[1:30]).all() and (survey.sharpness > 0).all()
     survey.write(tmp_path)
     again = Survey.read(tmp_path)
-    for name in ("sharpness", "followed", "motion", "checksums"):
+    for name in ("sharpness", "followed", "motion"):
         np.testing.assert_array_equal(getattr(survey, name), getattr(again, name))
     assert again.size == survey.size and (again.mask is None) == (survey.mask is None)
 
@@ -280,7 +279,7 @@ def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
     workers()
     made = cp.reconstruct(tmp_path / "damaged.mp4", tmp_path / "out", settings={**OPTIONS, **KNOWN})
     video = read_contents(tmp_path / "out", made).video
-    assert video.seek and video.frames == 150 and black
+    assert video.frames == 150 and black
     for segment in video.segments:
         name = segment.name
         written = {path.stem: read_rgb(path) for path in (tmp_path / "out" / name / "frames" / "images").iterdir()}
@@ -310,11 +309,3 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
     with pytest.raises(InputError, match=r"does not see long\.mp4"):
         cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     assert not any((tmp_path / "out").glob("[!.]*"))
-
-
-def test_frames_that_are_not_found_by_number_are_decoded_in_order(long_video, tmp_path, caplog):
-    survey = survey_video(frame_source(long_video))
-    assert are_found(frame_source(long_video), survey, [0, 55, 120])
-    other = replace(survey, checksums=survey.checksums + 1)
-    assert not are_found(frame_source(long_video), other, [55]) and "decoded in order" in caplog.text
-    assert len(list(frame_source(long_video, Span(140, None, seek=False)))) == 10
