@@ -26,7 +26,7 @@ class DataManager(ABC, Generic[SettingsT]):
 
     @classmethod
     def refuse_nearly(cls, path: Path) -> None:
-        """Raise InputError about a folder that has nearly this format, and which no other recognises: what is wrong."""
+        """Raise InputError, saying what is wrong, if a folder that no format recognises nearly has this one."""
 
     def at_stored_size(self) -> DataManager:
         """The data manager, with the same options, that reads images at their stored size, each when it is used.

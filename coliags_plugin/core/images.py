@@ -80,7 +80,7 @@ def read_8_bit(path: Path) -> UInt8[np.ndarray, "H W C"]:
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether an image file has an alpha channel, or a colour that stands for transparency, by its header."""
+    """Return True if an image file has an alpha channel or a transparent colour, by its header alone."""
     import PIL.Image
 
     with suppress(Exception), warnings.catch_warnings():  # the decoder says what is wrong with a damaged file

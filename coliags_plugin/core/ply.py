@@ -56,9 +56,9 @@ def vertex_colors(path: Path, columns: Mapping[str, np.ndarray]) -> UInt8[np.nda
 
 
 def eight_bits(stored: Shaped[np.ndarray, "N C"]) -> tuple[UInt8[np.ndarray, "N C"], int]:
-    """Colours of 8 bits, and the number that stands for full light: what PLY and OBJ leave open, their numbers tell.
+    """Convert colours of any type to 8 bits; also return the value that was taken for full intensity.
 
-    1 of floating-point numbers with a mean up to 1, else 255 of numbers up to that, else 65535.
+    PLY and OBJ do not define it: it is 1 for floats with a mean up to 1, else 255 for values up to that, else 65535.
     """
     if stored.dtype == np.uint8:
         return stored, 255

@@ -21,7 +21,7 @@ def encoding_of(start: bytes) -> str:
 
 
 def _stand_in(start: bytes) -> str:
-    """Words for what begins so in the place of a file, and what to do about it; none if it may be the file itself."""
+    """Describe a Git LFS pointer or web page that is there instead of a file, by its first bytes; empty if neither."""
     start = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     if start.startswith(b"version https://git-lfs"):
         return "it is a pointer of Git LFS, in the place of the file, which `git lfs pull` fetches"
@@ -31,7 +31,7 @@ def _stand_in(start: bytes) -> str:
 
 
 def unreadable(path: Path, seen: str, expected: str, do: str = "") -> InputError:
-    """The error about a file that its reader does not understand: ``seen``, unless it is something in its place."""
+    """Error for a file that cannot be parsed: ``seen``, or that it is a Git LFS pointer or a web page."""
     try:
         with path.open("rb") as file:
             found = _stand_in(file.read(_START_BYTES))

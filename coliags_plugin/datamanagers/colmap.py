@@ -217,7 +217,7 @@ class ColmapDataManager(RecordedDataManager):
 
     @classmethod
     def refuse_nearly(cls, path: Path) -> None:
-        """See :class:`DataManager`: a model without one of its parts."""
+        """Raise InputError for a COLMAP model that lacks cameras, images or points3D."""
         for part in _PARTS:
             for folder in find_models(path, tuple(other for other in _PARTS if other != part)):
                 read_model(folder)

@@ -274,7 +274,7 @@ class NerfstudioDataManager(RecordedDataManager):
 
     @classmethod
     def refuse_nearly(cls, path: Path) -> None:
-        """See :class:`DataManager`: Blender's layout."""
+        """Raise InputError for the layout of Blender's NeRF scenes: transforms_train.json, transforms_test.json."""
         if parts := [part for part in ("train", "val", "test") if (path / f"transforms_{part}.json").is_file()]:
             raise InputError(
                 f"{path} is of the layout of Blender's NeRF scenes: {', '.join(f'transforms_{p}.json' for p in parts)}",

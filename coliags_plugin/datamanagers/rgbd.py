@@ -107,7 +107,7 @@ class RGBDDataManager(RecordedDataManager):
 
     @classmethod
     def refuse_nearly(cls, path: Path) -> None:
-        """See :class:`DataManager`: images beside a text that is no TUM trajectory, by name."""
+        """Raise InputError for a folder of images beside a text file that is nearly a TUM trajectory."""
         if any((path / name).is_dir() for name in IMAGE_FOLDERS):
             for file in _trajectories(path)[:1]:
                 tum.read(file)

@@ -93,7 +93,7 @@ def sampled_depth_limits(trained: TrainedRun, views: Sequence[Frame | Camera], d
 
 
 def error_limit_of(trained: TrainedRun) -> float:
-    """Depth error of the last colour, scene units: 2 mm at the size at which the run was trained."""
+    """Largest depth error of the colour scale, scene units: 2 mm at the size at which the run was trained."""
     return DEPTH_ERROR_LIMIT_MM / trained.model.scale
 
 

@@ -175,7 +175,7 @@ class EvaluatedSet:
 
 
 def shows_nothing(alpha: Float[Tensor, "H W"], frame: Frame) -> bool:
-    """Whether hardly anything was drawn within the mask of a frame, which is not empty."""
+    """Return True if a view is blank: its mean alpha within the frame's mask is below :data:`BLANK_ALPHA`."""
     return bool(frame.valid.any() and alpha[frame.valid].mean() < BLANK_ALPHA)
 
 

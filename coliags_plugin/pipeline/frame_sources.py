@@ -47,7 +47,7 @@ class Span:
         return max(1, (of if self.last is None else min(of, self.last + 1)) - self.first)
 
     def shown(self, image: UInt8[np.ndarray, "H W 3"], is_interlaced: bool) -> UInt8[np.ndarray, "H W 3"]:
-        """A frame as it is read, by whether it is flagged as interlaced."""
+        """Deinterlace a frame if ``deinterlace``, or else the frame's own flag, says so."""
         return one_field(image) if (is_interlaced if self.deinterlace is None else self.deinterlace) else image
 
 
@@ -93,7 +93,7 @@ class FrameSource:
 
     @property
     def is_variable(self) -> bool:
-        """Whether some frame is half a frame or more away from its place by the rate."""
+        """Return True if the frame rate varies: a frame is half a frame or more from its time at a constant rate."""
         return self.times is not None and self.rate is not None and _is_variable(self.times, self.rate)
 
     @cached_property

@@ -51,7 +51,7 @@ class Key(NamedTuple):
     before: int  # decoding time of the key frame before: packets behind the place sought may have wrong times
 
     def is_in(self, packet: Packet) -> bool:
-        """Whether a packet holds it."""
+        """Return True if a packet holds this key frame."""
         return bool(packet.is_keyframe) and (packet.pts, packet.size) == (self.time, self.size)
 
 
@@ -73,14 +73,14 @@ class VideoIndex:
 
     @property
     def room(self) -> int:
-        """Number of frames that fit between the first and the last, if nearly all follow each other evenly; else N."""
+        """Number of frames for which there is time in the file if its rate is nearly constant; else N."""
         steps = np.diff(self.times, append=2 * self.times[-1] - self.times[-2:][0])
         step = np.median(steps)
         is_even = np.mean(np.abs(steps - step) <= max(0.1 * step, 1)) > _EVEN
         return round(steps.sum() / step) if is_even and step else len(self.times)
 
     def key_before(self, number: int) -> Key | None:
-        """The last key frame up to a frame; None where it is the first."""
+        """The last key frame at or before a frame, by its number; None if that is the first key frame."""
         place = int(np.searchsorted(self.keys[:, 0], self.times[: number + 1][-1], side="right")) - 1
         if place < 1:
             return None
@@ -118,7 +118,7 @@ class VideoFile:
             yield container, max(known, key=lambda stream: stream.width * stream.height)
 
     def check(self) -> None:
-        """Refuse what cannot be opened; say, once, what of the file is used where it leaves a choice."""
+        """Raise InputError if the file cannot be opened; warn, once, of several streams and of pixels not square."""
         _check(*self._identity)
 
     @cached_property
@@ -170,7 +170,7 @@ class VideoFile:
     def frames(
         self, first: int, stop: int, is_filled: bool, shown: Callable[[np.ndarray, bool], np.ndarray]
     ) -> Iterator[tuple[UInt8[np.ndarray, "H W 3"], bool]]:
-        """Images from one on as far as there are, and whether each is flagged as interlaced.
+        """Images from frame ``first`` up to ``stop``, and whether each is flagged as interlaced.
 
         Where the file is damaged and goes on behind that, the frames between are black, and, with ``is_filled``, those
         before ``stop`` that it lacks. ``shown`` is applied to images and flags as they are stored, before pixels become
@@ -210,7 +210,7 @@ class VideoFile:
     def _picture(
         self, frame: VideoFrame, shown: Callable[[np.ndarray, bool], np.ndarray]
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """The image of a frame, with square pixels: rows stay, as those of an interlaced one are of two moments."""
+        """Convert a frame to RGB with square pixels, turned as the file says; columns alone are resampled."""
         import cv2
 
         try:
@@ -235,7 +235,7 @@ class VideoFile:
         return np.ascontiguousarray(image)
 
     def _numbered(self, first: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Numbers and frames from one on; behind frames that cannot be decoded, numbers are those by time."""
+        """Numbers and frames from ``first`` on; behind damaged frames, numbers follow from presentation times."""
         number, frames = self._sought(first) if first > 0 else (0, self.decoded())
         for frame in frames:
             if frame is None:
@@ -248,7 +248,7 @@ class VideoFile:
             number += 1
 
     def _sought(self, first: int) -> tuple[int, Iterator[VideoFrame | None]]:
-        """Frames from one on, which is found by its time, or else from the start; and the number of their first."""
+        """Seek frame ``first`` by its time, or else start from 0: the number of the first frame, and frames."""
         index = self.index
         if index is not None and first >= len(index.times):
             return first, iter(())
@@ -263,7 +263,7 @@ class VideoFile:
         return 0, self.decoded()
 
     def _behind_damage(self, first: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Numbers and frames from one on, decoded by one thread: several lose frames along with damaged ones.
+        """Numbers and frames from ``first`` on, decoded by one thread, as several lose frames beside damaged ones.
 
         Where packets do not tell times, what cannot be decoded has no number.
         """
@@ -278,7 +278,7 @@ class VideoFile:
             number += 1
 
     def decoded(self, key: Key | None = None, threads: int = 0) -> Iterator[VideoFrame | None]:
-        """All frames, or those from a key frame on; for a damaged one None, and then those from the next key frame on.
+        """Decode all frames, or those from a key frame on; None stands for what is damaged up to the next key frame.
 
         A stream may begin between key frames: what cannot be decoded before the first of them is no frame.
         """
@@ -382,7 +382,7 @@ def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None
 
 
 def _is_right(file: VideoFile, index: VideoIndex, key: Key | None) -> bool:
-    """Whether frames from a key frame on have the times that the index says, up to one that is damaged."""
+    """Return True if frames decoded from a key frame on have the index's times, up to the first damaged one."""
     whole = (frame.pts for frame in takewhile(lambda frame: frame is not None, file.decoded(key)) if frame is not None)
     decoded = [time for time in islice(whole, _COMPARED) if time is not None and (key is None or time >= key.time)]
     place = np.searchsorted(index.times, decoded[0]) if decoded else 0

@@ -151,7 +151,7 @@ class InverseDepth(DepthSteps):
     offset: float = 0.0
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`; float32, 0 where unknown."""
+        """Read z-depth in units of the model, float32, 0 where it is unknown. [H, W]"""
         stored = super().read(path)
         with np.errstate(over="ignore"):
             inverse = self.scale * (stored / 65536.0) + self.offset
@@ -179,7 +179,7 @@ class DepthArray(DepthSteps):
 
 
 def depth_format(path: Path, size: float) -> DepthFormat:
-    """Format of an array or image, by suffix: steps, or real numbers; ``size`` in scene units per stored unit."""
+    """Format of a depth file, PNG, TIFF or .npy, whose stored unit is ``size`` scene units."""
     if path.suffix.lower() in (".npz", ".exr"):
         raise InputError(f"{path}: depth in {path.suffix}", "16-bit PNG or TIFF, TIFF of floats, or .npy", "Convert it")
     return DepthArray(size)

@@ -429,7 +429,7 @@ _SUSPICIOUS_DEG, _CLEARLY_BETTER = 15.0, 0.3
 
 
 def better_reading(estimate: Trajectory, reference: Trajectory, result: Alignment) -> str:
-    """Another reading of one of two trajectories that leaves little of their rotation error; empty if there is none."""
+    """Name another pose convention of one trajectory that explains the rotation error; empty if there is none."""
     errors: dict[str, float] = {}
     for name, change in _READINGS.items() if result.rotation_deg.rmse > _SUSPICIOUS_DEG else ():
         for which, pair in (

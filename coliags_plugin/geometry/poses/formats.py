@@ -181,5 +181,5 @@ def _is_comment(words: list[str]) -> bool:
 
 
 def _are_names(words: list[str]) -> bool:
-    """Whether words are names of columns: no number is among them, nor anything that is meant as such."""
+    """Return True if the words of a line are names of columns: none is a number or begins like one."""
     return not any(_LIKE_NUMBER.match(word) for word in words)

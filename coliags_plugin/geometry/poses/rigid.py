@@ -95,7 +95,7 @@ def wxyz_from_rotations(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarr
 
 
 def w_first(matrices: Float[np.ndarray, "N 4 4"], is_first: bool = True) -> Float[np.ndarray, "N 4 4"]:
-    """Rigid transforms whose quaternions were read with w last, read again with w first; or the reverse. [N, 4, 4]"""
+    """Reorder the quaternions of rigid transforms: read with w last, they are read with w first, or the reverse."""
     stored = Rotation.from_matrix(matrices[:, :3, :3]).as_quat(scalar_first=not is_first)
     return rigid(Rotation.from_quat(stored, scalar_first=is_first).as_matrix(), matrices[:, :3, 3])
 

@@ -54,7 +54,7 @@ def read(path: Path) -> Trajectory:
 
 
 def _seem_w_first(centers: Float[np.ndarray, "N 3"], quats: Float[np.ndarray, "N 4"]) -> bool:
-    """Whether quaternions, as stored, are likely to have w first, given camera centres.
+    """Return True if the path of the camera suggests that stored quaternions have w first.
 
     Angles between cameras are the same in either order. What tells is a first camera at the origin, ``1 0 0 0``, the
     identity in one order only; or a path with bends along which a camera moves along one axis of its own, forward for
