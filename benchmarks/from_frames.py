@@ -21,8 +21,8 @@ from coliags_plugin.geometry.meshes.truth import compare_meshes, read_true_surfa
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import FrameMatches, align
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.video import write_video
 from coliags_plugin.reconstruction.structure.image_files import list_images
+from coliags_plugin.reporting.video import write_video
 
 
 def write_film(phantom: Path, film: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.outputs.charts import Series, line_chart
+from coliags_plugin.reporting.charts import Series, line_chart
 
 #: What is drawn: key of a row, axis label, whether the axis is logarithmic.
 PANELS = (

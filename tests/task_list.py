@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from coliags_plugin.execution.tasks import Executor, Task, TaskOutcome
+from coliags_plugin.engine.tasks import Executor, Task, TaskOutcome
 
 
 class TaskList(Executor):

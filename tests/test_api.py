@@ -20,9 +20,9 @@ import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.engine import queue
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.execution import queue
-from coliags_plugin.outputs.image_files import read_depth_tiff
+from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
 from tests.engine.test_progress import Shown

@@ -18,14 +18,13 @@ ROOT = PACKAGE.name
 LAYERS = (
     {"_version"},
     {"core"},
-    {"config", "lighting"},
+    {"config"},
     {"contracts", "geometry"},
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
-    {"outputs"},
     {"reporting"},
     {"results"},
     {"engine", "phantom", "reconstruction"},
-    {"surface", "execution"},
+    {"surface"},
     {"export"},
     {"checks", "comparison"},
     {"pipeline"},
@@ -128,7 +127,7 @@ def test_the_key_of_the_code_covers_all_that_the_engine_imports():
             found.add(name)
             todo += imports(SOURCES[name]) | targets(SOURCES[name])
     left_out = {name for name in found if SOURCES[name] not in code_files().values()}
-    assert {package_of(name) for name in left_out} <= {"_version", "outputs", "phantom", "reporting", "results"}
+    assert {package_of(name) for name in left_out} <= {"_version", "phantom", "reporting", "results"}
     assert "coliags_plugin.results.profiles" not in left_out and "coliags_plugin.metrics.depth" not in left_out
 
 

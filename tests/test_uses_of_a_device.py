@@ -13,7 +13,7 @@ from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
-from coliags_plugin.execution.tasks import ExecutionOptions
+from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.live import Viewer
 from coliags_plugin.geometry.meshes.files import read_mesh

@@ -32,7 +32,7 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
     """
     from coliags_plugin.comparison.compare import carry_out, make_request
     from coliags_plugin.comparison.folder import ComparisonFolder
-    from coliags_plugin.execution.tasks import ExecutionOptions
+    from coliags_plugin.engine.tasks import ExecutionOptions
 
     names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
     execution = ExecutionOptions(**{name: getattr(options, name) for name in names})

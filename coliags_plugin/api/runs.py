@@ -271,14 +271,14 @@ class Run:
         """The run under another lamp, for rendering; it shares the parameters.
 
         Args:
-            lamp: Options of :class:`~coliags_plugin.lighting.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
+            lamp: Options of :class:`~coliags_plugin.core.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
 
         Raises:
             InputError: See :meth:`load`; an option is unknown or invalid, or the field does not model the lamp.
         """
+        from coliags_plugin.core.lamps import Lamp
         from coliags_plugin.core.settings import validated
         from coliags_plugin.engine.held_light import relight
-        from coliags_plugin.lighting.lamps import Lamp
 
         made = validated(Lamp, lamp, "lamp option")
         return self._relit(relight(self.load(), made))

@@ -106,7 +106,7 @@ def reconstruct(options: ReconstructOptions) -> Record:
     from coliags_plugin.config.assignments import settings_of
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.progress import progress_callback
-    from coliags_plugin.execution.tasks import ExecutionOptions
+    from coliags_plugin.engine.tasks import ExecutionOptions
     from coliags_plugin.pipeline.reconstruct import reconstruct as run
     from coliags_plugin.pipeline.settings import ReconstructionSettings
 

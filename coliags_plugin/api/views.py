@@ -17,8 +17,8 @@ from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
-from coliags_plugin.outputs.image_files import as_array, eight_bit, encode_png
+from coliags_plugin.reporting.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
+from coliags_plugin.reporting.image_files import as_array, eight_bit, encode_png
 
 #: Smallest width of an image in a notebook, px on the screen.
 _SHOWN_WIDTH = 200

@@ -23,8 +23,8 @@ from coliags_plugin.core.errors import InputError, InterruptedRunError, check_na
 from coliags_plugin.core.files import user_path
 from coliags_plugin.datamanagers.scene_settings import Split
 from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.execution.queue import Job, JobQueue, make_executor
-from coliags_plugin.execution.tasks import Ending, ExecutionOptions, Executor
+from coliags_plugin.engine.task_queue import Job, JobQueue, make_executor
+from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor
 from coliags_plugin.reporting.model import Column, Value
 from coliags_plugin.reporting.text_formats import DisplayTable
 from coliags_plugin.results.reading import read_result

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.execution.tasks import Task, TaskOutcome, attempt, run_worker
+from coliags_plugin.engine.tasks import Task, TaskOutcome, attempt, run_worker
 
 if TYPE_CHECKING:
     import torch

@@ -16,9 +16,9 @@ from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings, SettingsT
-from coliags_plugin.lighting.lamps import HeldLight, Lamp
 
 
 class Field(nn.Module, ABC, Generic[SettingsT]):

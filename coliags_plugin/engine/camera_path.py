@@ -15,7 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import Settings, invalid_reported
-from coliags_plugin.outputs.video import check_rate
+from coliags_plugin.reporting.video import check_rate
 
 _EXPECTED = "a camera path as `coliags view` saves it (docs/viewer.md 6)"
 #: How far the rows of a rotation may be from orthonormal.

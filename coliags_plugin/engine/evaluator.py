@@ -23,14 +23,14 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.scoring import EvaluatedSet, Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth, match_truth
-from coliags_plugin.outputs.colormaps import (
+from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
     colorize_depth_error,
     common_limits,
 )
-from coliags_plugin.outputs.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
+from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
 from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, write_result
 from coliags_plugin.results.record import (

@@ -11,10 +11,10 @@ from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import GaussianField, LitField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, check_name
+from coliags_plugin.core.lamps import FlattenedLight, HeldLight, Lamp, LightOfCamera
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.lighting.lamps import FlattenedLight, HeldLight, Lamp, LightOfCamera
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
 #: Approximate number of training cameras, evenly spaced, that the flattened light is the median of.

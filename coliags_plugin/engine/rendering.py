@@ -21,7 +21,7 @@ from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.colormaps import (
+from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
@@ -29,8 +29,8 @@ from coliags_plugin.outputs.colormaps import (
     colorize_rgb_error,
     depth_limits,
 )
-from coliags_plugin.outputs.image_files import as_array, eight_bit, write_depth_tiff, write_png
-from coliags_plugin.outputs.video import write_video
+from coliags_plugin.reporting.image_files import as_array, eight_bit, write_depth_tiff, write_png
+from coliags_plugin.reporting.video import write_video
 
 #: Upper limit of the colour error images, as a share of the colour range.
 RGB_ERROR_LIMIT = 0.2

@@ -12,13 +12,13 @@ import torch
 
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.data_formats import load_scene, recorded_scale
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.lighting.lamps import HeldLight, Lamp
 from coliags_plugin.renderers.choice import choose_renderer
 
 

@@ -17,6 +17,7 @@ from coliags_plugin.contracts import GaussianField, HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
@@ -25,7 +26,6 @@ from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 from coliags_plugin.fields.rows import unique_rows
-from coliags_plugin.lighting.lamps import HeldLight
 
 logger = logging.getLogger(__name__)
 

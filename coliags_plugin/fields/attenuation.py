@@ -15,11 +15,11 @@ from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead, HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tables import fit_kernels, tables
-from coliags_plugin.lighting.lamps import HeldLight
-from coliags_plugin.lighting.photometry import fit_light
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
 MAX_OFFSET = 20.0

@@ -17,6 +17,7 @@ from coliags_plugin.contracts import LitField, Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
@@ -25,7 +26,6 @@ from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specu
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.mlp import Precision, linear_layers, reduced_dtype
 from coliags_plugin.fields.rows import unique_rows
-from coliags_plugin.lighting.lamps import HeldLight, Lamp
 
 logger = logging.getLogger(__name__)
 

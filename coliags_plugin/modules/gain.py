@@ -16,10 +16,10 @@ from typing_extensions import Self
 
 from coliags_plugin.contracts import GainModule
 from coliags_plugin.core.json_files import JsonObject
+from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.lighting.photometry import fit_light
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Frames on either side of those that the response is fitted on, at least.

@@ -23,8 +23,8 @@ from coliags_plugin.core.errors import (
     ReportedError,
 )
 from coliags_plugin.core.locks import locked
-from coliags_plugin.execution.queue import Job, JobQueue
-from coliags_plugin.execution.tasks import Ending, ExecutionOptions, Executor, Task, TaskOutcome, attempt, run_worker
+from coliags_plugin.engine.task_queue import Job, JobQueue
+from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, TaskOutcome, attempt, run_worker
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.page import write_page

@@ -16,8 +16,8 @@ from coliags_plugin.core.files import refuse_overlap
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
-from coliags_plugin.execution.queue import make_executor
-from coliags_plugin.execution.tasks import ExecutionOptions
+from coliags_plugin.engine.task_queue import make_executor
+from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.pipeline.contents import figures_as
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, chosen_frames, frame_source, opened_recording

@@ -309,7 +309,7 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
     from coliags_plugin.comparison.report.views import evenly
     from coliags_plugin.engine.held_light import flatten
     from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
-    from coliags_plugin.outputs.image_files import eight_bit, write_png
+    from coliags_plugin.reporting.image_files import eight_bit, write_png
 
     flat = flatten(trained) if trained.model.field.knows_lamp else None
     depth, video, scale = "depth_expected", trained.scene.video, ""

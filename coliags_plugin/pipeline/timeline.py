@@ -17,12 +17,12 @@ from jaxtyping import Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.charts import COLORS
-from coliags_plugin.outputs.image_files import encode_jpeg
 from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
 from coliags_plugin.pipeline.stages import PAGE_FILE
+from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.reporting.charts import COLORS
+from coliags_plugin.reporting.image_files import encode_jpeg
 from coliags_plugin.reporting.model import EncodedImage, Template
 from coliags_plugin.reporting.numbers import counted
 

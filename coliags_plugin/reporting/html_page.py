@@ -20,7 +20,7 @@ from markupsafe import Markup, escape
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.outputs.charts import color_bar_svg, line_chart, style_classes
+from coliags_plugin.reporting.charts import color_bar_svg, line_chart, style_classes
 from coliags_plugin.reporting.model import Block, Chart, ColorBar, EncodedImage, Figure, Image, Page, Template
 from coliags_plugin.reporting.numbers import DASH, counted, sentence, unit_text
 

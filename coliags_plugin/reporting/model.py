@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from jaxtyping import UInt8
     from torch import Tensor
 
-    from coliags_plugin.outputs.charts import Series
-    from coliags_plugin.outputs.colormaps import ColorMap
+    from coliags_plugin.reporting.charts import Series
+    from coliags_plugin.reporting.colormaps import ColorMap
 
 #: What a table may hold besides cells; None is shown as a dash.
 Value = str | int | float | None
@@ -169,7 +169,7 @@ class EncodedImage:
     @classmethod
     def png(cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> EncodedImage:
         """Colours as a PNG."""
-        from coliags_plugin.outputs.image_files import encode_png
+        from coliags_plugin.reporting.image_files import encode_png
 
         return cls(encode_png(rgb), "image/png", rgb.shape[1], rgb.shape[0])
 
@@ -185,7 +185,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Chart:
-    """A line chart (:func:`coliags_plugin.outputs.charts.line_chart`)."""
+    """A line chart (:func:`coliags_plugin.reporting.charts.line_chart`)."""
 
     series: Sequence[Series]  # lines over one x axis
     x_label: str  # quantity and unit of the x axis

@@ -20,7 +20,7 @@ _IGNORED = ("description", "protocol")
 _IGNORED_WITHIN = {"datamanager": ("outside_files",), "schedule": ("log_every", "checkpoint_every")}
 #: Code that determines training and evaluation: all packages that the engine imports but presentation, and profiles.
 _CODE = (
-    *("core", "config", "lighting", "contracts", "geometry", "datamanagers", "fields", "renderers", "modules"),
+    *("core", "config", "contracts", "geometry", "datamanagers", "fields", "renderers", "modules"),
     *("strategies", "losses", "metrics", "engine", "results/profiles.py"),
 )
 

@@ -17,7 +17,7 @@ import numpy as np
 from results_page import ASSUMED, PAGE, REFERENCE, comparison, planned_cells
 
 import coliags_plugin
-from coliags_plugin.outputs.colormaps import color_bar, colorize_depth, common_limits, side_by_side, stacked
+from coliags_plugin.reporting.colormaps import color_bar, colorize_depth, common_limits, side_by_side, stacked
 from coliags_plugin.results.record import Result
 
 PICTURE = PAGE.parent / "looks" / "phantoms-12.jpg"

@@ -19,8 +19,8 @@ import pytest
 from coliags_plugin import load_run
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.outputs.colormaps import hatch
-from coliags_plugin.outputs.image_files import read_depth_tiff
+from coliags_plugin.reporting.colormaps import hatch
+from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import refused, run
 from tests.scenes import SMALL, write_wall
 

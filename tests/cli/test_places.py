@@ -91,7 +91,7 @@ def test_of_messages(tmp_path):
 
 
 def test_pictures_hold_nothing_but_pixels(tmp_path):
-    from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
+    from coliags_plugin.reporting.image_files import write_depth_tiff, write_png
 
     write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
     data, at, chunks = (tmp_path / "a.png").read_bytes(), 8, set()

@@ -17,8 +17,8 @@ from coliags_plugin.datamanagers.scene_settings import read_unit
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reporting.image_files import write_png
 from tests.commands import refused, run
 from tests.scenes import SMALL
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube

@@ -17,7 +17,7 @@ from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.config.options import CompareOptions
-from coliags_plugin.execution.tasks import ExecutionOptions, TaskOutcome
+from coliags_plugin.engine.tasks import ExecutionOptions, TaskOutcome
 from tests.task_list import TaskList
 
 #: Overrides that make the anchor methods small, whose steps then take some milliseconds.

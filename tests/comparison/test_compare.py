@@ -18,8 +18,8 @@ from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.engine.evaluator import evaluate
+from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.execution.tasks import TaskOutcome
 from coliags_plugin.results.reading import NewerResultError, read_result
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor, compare_inline, hashes

@@ -17,10 +17,10 @@ import pytest
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine import ray_executor
+from coliags_plugin.engine.ray_executor import RayExecutor
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.execution import ray_executor
-from coliags_plugin.execution.ray_executor import RayExecutor
-from coliags_plugin.execution.tasks import Task
+from coliags_plugin.engine.tasks import Task
 from tests.commands import refused
 from tests.comparison.small import (
     OFTEN,

@@ -13,7 +13,7 @@ import pytest
 
 from coliags_plugin.comparison.worker import CellTask, work
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.execution.tasks import LocalExecutor, TaskOutcome
+from coliags_plugin.engine.tasks import LocalExecutor, TaskOutcome
 
 
 @pytest.fixture

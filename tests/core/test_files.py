@@ -21,7 +21,7 @@ from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.video import write_video
+from coliags_plugin.reporting.video import write_video
 from tests.faults import broken_disk, content, fault, killed, largest_file, no_space
 
 OLD, NEW = b"old" * 5000, b"new!" * 7000

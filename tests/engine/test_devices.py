@@ -6,7 +6,7 @@ import torch
 from coliags_plugin.comparison.compare import make_executor
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.devices import choose_device, find_device
-from coliags_plugin.execution.tasks import ExecutionOptions
+from coliags_plugin.engine.tasks import ExecutionOptions
 from tests.commands import refused
 
 CPU = torch.device("cpu")

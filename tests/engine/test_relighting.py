@@ -14,10 +14,10 @@ import coliags_plugin
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.lighting.lamps import Lamp
 from tests.commands import refused, run
 from tests.scenes import camera_at, write_wall
 

@@ -24,7 +24,7 @@ from coliags_plugin.engine.training import TrainingRequest, open_training
 from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
 from coliags_plugin.export.splats.files import read_splats, write_splat_ply
-from coliags_plugin.outputs.image_files import read_depth_tiff
+from coliags_plugin.reporting.image_files import read_depth_tiff
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.views import MeshSettings

@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
 from coliags_plugin.fields.cook_torrance import Cosines, facet_density, fresnel, lambert, specular
 from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, DiffuseNetwork
-from coliags_plugin.lighting.lamps import Lamp
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
 from tests.scenes import camera_at, wall_scene

@@ -18,7 +18,7 @@ from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.poses.formats import write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.video import write_video
+from coliags_plugin.reporting.video import write_video
 from tests.comparison.small import TINY
 from tests.datamanagers.kinds import KINDS, write_kind
 from tests.export.splats.clouds import random_cloud

@@ -12,11 +12,11 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
-from coliags_plugin.outputs.video import write_video
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
 from coliags_plugin.pipeline.jobs import PartTask, work
 from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film
 from tests.reconstruction.seen_points import frame_model
 from tests.task_list import TaskList

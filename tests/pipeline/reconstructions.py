@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.pipeline.steps import PICTURES, SCENE
 from coliags_plugin.pipeline.survey import Survey
+from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.results.reading import write_result
 from tests.pipeline.conftest import COUNTS, write_atlas
 from tests.results.made import made_result, made_set

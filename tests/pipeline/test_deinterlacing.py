@@ -15,12 +15,12 @@ from hypothesis.extra.numpy import arrays
 
 import coliags_plugin as cp
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.frame_selection import looks_interlaced, motion_and_survival, one_field, reduced
 from coliags_plugin.pipeline.frame_sources import chosen_frames, frame_source, image_files
 from coliags_plugin.pipeline.frames import write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import survey_video
+from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import WIDTH, film, write_images
 
 RNG = np.random.default_rng(0)

@@ -10,8 +10,8 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
-from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline.frame_sources import Span, every_of, frame_at, frame_source
+from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film, write_film, write_images
 
 

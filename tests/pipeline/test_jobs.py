@@ -14,7 +14,7 @@ import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.execution.tasks import TaskOutcome
+from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.jobs import PartJob, Reconstruction

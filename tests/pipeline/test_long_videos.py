@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.execution.tasks import TaskOutcome
-from coliags_plugin.outputs.video import write_video
+from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.contents import read_contents
 from coliags_plugin.pipeline.frame_sources import frame_source
@@ -24,6 +23,7 @@ from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import Record, StageOutcome
 from coliags_plugin.pipeline.survey import OVERLAP, Survey, cut, survey_video
+from coliags_plugin.reporting.video import write_video
 from tests import commands
 from tests.faults import largest_file
 from tests.pipeline.conftest import TRAINING, write_atlas

@@ -18,11 +18,11 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.reconstruct import forecast
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.steps import identity_of
+from coliags_plugin.reporting.video import write_video
 from coliags_plugin.results.reading import read_result
 from tests import commands
 from tests.pipeline.conftest import CAPTURE, TRAINING

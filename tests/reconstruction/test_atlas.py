@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb, write_image
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure import adjustment, joining, sfm
 from coliags_plugin.reconstruction.structure.adjustment import (
     TEST_EVERY,
@@ -40,6 +39,7 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     tracked_starts,
 )
 from coliags_plugin.reconstruction.structure.video import read_video
+from coliags_plugin.reporting.image_files import write_png
 from tests.reconstruction.seen_points import COMMON, COUNT, GAP, frame_points, seen_points
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
 from coliags_plugin.reconstruction.structure.matching import (
     alike_pairs,
@@ -25,6 +24,7 @@ from coliags_plugin.reconstruction.structure.point_tracks import epipolar_inlier
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
 from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, cut_where_lost
+from coliags_plugin.reporting.image_files import write_png
 from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
 
 #: Error, ratio and distance that leave the decision to the geometry.

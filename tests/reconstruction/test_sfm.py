@@ -20,7 +20,6 @@ from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align, associate
 from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
@@ -34,6 +33,7 @@ from coliags_plugin.reconstruction.structure.sfm import (
     scaled,
 )
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, distortion
+from coliags_plugin.reporting.image_files import write_png
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 KNOWN = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS))

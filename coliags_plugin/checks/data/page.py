@@ -13,10 +13,10 @@ from coliags_plugin.checks.data.findings import Finding, angle_across
 from coliags_plugin.checks.data.hypotheses import LEAST_CONFIDENCE, warp_image
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.outputs.charts import Series
-from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
-from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.reporting import model
+from coliags_plugin.reporting.charts import Series
+from coliags_plugin.reporting.colormaps import colorize_depth, colorize_rgb_error
+from coliags_plugin.reporting.image_files import eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
 #: Number of pairs shown.

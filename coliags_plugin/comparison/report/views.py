@@ -17,8 +17,8 @@ from coliags_plugin.comparison.report.metric_tables import metric_title
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
-from coliags_plugin.outputs.colormaps import (
+from coliags_plugin.reporting.axis_ticks import linear_ticks, round_up
+from coliags_plugin.reporting.colormaps import (
     colorize_depth,
     colorize_error,
     common_limits,
@@ -26,7 +26,7 @@ from coliags_plugin.outputs.colormaps import (
     hatch,
     rgb_error,
 )
-from coliags_plugin.outputs.image_files import encode_jpeg, encode_webp, read_depth_tiff
+from coliags_plugin.reporting.image_files import encode_jpeg, encode_webp, read_depth_tiff
 from coliags_plugin.reporting.model import ColorBar, EncodedImage, Paragraph, Section, Template
 from coliags_plugin.reporting.numbers import column_decimals, number_text, unit_text
 

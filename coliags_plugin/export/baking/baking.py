@@ -14,6 +14,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
@@ -23,7 +24,6 @@ from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field
 from coliags_plugin.export.splats.files import THICKNESS_SHARE
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
-from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
 #: A Gaussian is kept whose blending weights add up to so many pixels over the views, and which is on average at least

@@ -14,6 +14,7 @@ from torch import Tensor
 from coliags_plugin.contracts import log_linear
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import NotFiniteError
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import mean_camera, render_held, splatting_of
@@ -23,7 +24,6 @@ from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.samplers import generators
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
-from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.renderers.choice import choose_renderer
 
 #: Steps, one view each, that are taken where the time allows.

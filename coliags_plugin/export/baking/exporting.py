@@ -15,6 +15,7 @@ from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_folder, refuse_existing, write_json
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.devices import software
@@ -29,7 +30,6 @@ from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud, load_cloud
 from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
-from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.reporting.numbers import counted
 
 log = logging.getLogger(__name__)

@@ -33,7 +33,7 @@ from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.page import look_distance, mesh_files
 from coliags_plugin.export.viewer.serving import has_display, start_server, stop_server
 from coliags_plugin.geometry.meshes.files import encode_mesh, read_mesh
-from coliags_plugin.outputs.image_files import as_array, eight_bit
+from coliags_plugin.reporting.image_files import as_array, eight_bit
 
 logger = logging.getLogger(__name__)
 

@@ -37,9 +37,9 @@ from coliags_plugin.export.splats.files import read_splat_spz, write_spz
 from coliags_plugin.fields.explicit_gaussians import FARTHEST, AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.outputs.image_files import as_array, encode_jpeg
 from coliags_plugin.renderers.splatting import SplattingRenderer
 from coliags_plugin.reporting.html_page import environment, refuse_folder
+from coliags_plugin.reporting.image_files import as_array, encode_jpeg
 from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.surface.coverage.visibility import MAP_LEGEND
 

@@ -15,11 +15,11 @@ from coliags_plugin.core.images import decode_image, read_8_bit, write_image, wr
 from coliags_plugin.datamanagers.atlas import ATLAS_FILE
 from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
-from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.colormaps import INK, draw_text, text_width
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
+from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.reporting.colormaps import INK, draw_text, text_width
+from coliags_plugin.reporting.image_files import write_png
 
 #: Name of the picture of the sub-maps.
 RIBBON_FILE = "atlas.png"

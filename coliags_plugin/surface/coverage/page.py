@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.colormaps import INK, draw_text, side_by_side, stacked, text_width
+from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.reporting.colormaps import INK, draw_text, side_by_side, stacked, text_width
 from coliags_plugin.reporting.model import (
     Block,
     EncodedImage,

@@ -18,8 +18,8 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
 from coliags_plugin.surface.coverage.page import (
     RESEARCH_USE,

@@ -30,7 +30,7 @@ from coliags_plugin.geometry.meshes.truth import (
     find_true_surface,
     read_true_surface,
 )
-from coliags_plugin.outputs.image_files import eight_bit, write_png
+from coliags_plugin.reporting.image_files import eight_bit, write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
 from coliags_plugin.surface.meshing.colors import best_colors, best_texture
 from coliags_plugin.surface.meshing.mending import close_holes, smoothed

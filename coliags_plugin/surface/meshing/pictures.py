@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface
-from coliags_plugin.outputs.colormaps import (
+from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     UNKNOWN_GREY,
     color_bar,

@@ -12,7 +12,7 @@ import numpy as np
 
 from coliags_plugin.comparison.plan_file import Decision
 from coliags_plugin.comparison.report.study import Study
-from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
+from coliags_plugin.reporting.image_files import write_depth_tiff, write_png
 from coliags_plugin.results.reading import write_result
 from coliags_plugin.results.record import (
     CostRecord,

@@ -18,8 +18,8 @@ from coliags_plugin.comparison.report.report import write_report
 from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.colormaps import color_table, hatch
-from coliags_plugin.outputs.image_files import encode_png, write_depth_tiff
+from coliags_plugin.reporting.colormaps import color_table, hatch
+from coliags_plugin.reporting.image_files import encode_png, write_depth_tiff
 from tests.comparison.report.made import (
     FRAMES,
     HEIGHT,

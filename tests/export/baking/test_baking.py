@@ -10,12 +10,12 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.engine.held_light import mean_camera
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
 from coliags_plugin.fields.spherical_harmonics import basis, colors
-from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.scenes import camera_at
 

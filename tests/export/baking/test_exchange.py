@@ -14,6 +14,7 @@ import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.engine.rendering import render_view
@@ -23,7 +24,6 @@ from coliags_plugin.export.baking.exporting import export_cost
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.export.splats.files import read_splats, write_splat_ply, write_splats
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
-from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from tests.commands import refused, run
 from tests.export.splats.clouds import PARTS, random_cloud
 

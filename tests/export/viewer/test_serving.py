@@ -26,7 +26,7 @@ from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_
 from coliags_plugin.export.viewer import live, serving
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.outputs.image_files import as_array, eight_bit
+from coliags_plugin.reporting.image_files import as_array, eight_bit
 from tests.commands import refused
 from tests.engine.test_trainer import EARLY_GROWTH, assert_same, final_state, make_trainer
 from tests.scenes import SMALL

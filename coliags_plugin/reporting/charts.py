@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from coliags_plugin.outputs.axis_ticks import linear_ticks, log_ticks, tick_label
-from coliags_plugin.outputs.colormaps import ColorMap, color_table
+from coliags_plugin.reporting.axis_ticks import linear_ticks, log_ticks, tick_label
+from coliags_plugin.reporting.colormaps import ColorMap, color_table
 
 COLORS = 8
 

@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.outputs.image_files import (
+from coliags_plugin.reporting.image_files import (
     encode_jpeg,
     encode_png,
     encode_webp,

@@ -20,7 +20,7 @@ from typing import Any
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.execution.tasks import STOPPING, Executor, LocalWorker, Task, TaskOutcome
+from coliags_plugin.engine.tasks import STOPPING, Executor, LocalWorker, Task, TaskOutcome
 
 log = logging.getLogger(__name__)
 

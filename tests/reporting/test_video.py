@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs import video
-from coliags_plugin.outputs.video import write_video
+from coliags_plugin.reporting import video
+from coliags_plugin.reporting.video import write_video
 
 
 def ramp(count, height, width):

@@ -14,8 +14,8 @@ from typing import Literal, get_args
 from coliags_plugin.core.errors import InputError, check_name, check_number
 from coliags_plugin.engine.devices import find_device
 from coliags_plugin.engine.progress import ProgressReport, log_console
-from coliags_plugin.execution.ray_executor import RayExecutor
-from coliags_plugin.execution.tasks import Ending, ExecutionOptions, Executor, LocalExecutor, Task, TaskOutcome
+from coliags_plugin.engine.ray_executor import RayExecutor
+from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, LocalExecutor, Task, TaskOutcome
 
 log = logging.getLogger(__name__)
 

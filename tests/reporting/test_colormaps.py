@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.outputs.colormaps import (
+from coliags_plugin.reporting.colormaps import (
     HATCH_GREYS,
     UNKNOWN_GREY,
     color_bar,

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.reporting.image_files import as_array
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.outputs.axis_ticks import linear_ticks, log_ticks, round_up, tick_label
-from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart, style_classes
-from coliags_plugin.outputs.colormaps import color_table
+from coliags_plugin.reporting.axis_ticks import linear_ticks, log_ticks, round_up, tick_label
+from coliags_plugin.reporting.charts import Series, color_bar_svg, line_chart, style_classes
+from coliags_plugin.reporting.colormaps import color_table
 
 
 def texts(svg):

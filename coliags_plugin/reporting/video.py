@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_path
-from coliags_plugin.outputs.image_files import checked_rgb
+from coliags_plugin.reporting.image_files import checked_rgb
 
 if TYPE_CHECKING:
     from av.container import OutputContainer

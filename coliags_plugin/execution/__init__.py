@@ -1,1 +1,0 @@
-"""Work in worker processes: tasks, where they run, and the queue that retries them."""

@@ -1,1 +1,0 @@
-"""Light: lamps, photometry and interreflection."""

@@ -1,1 +1,0 @@
-"""Image files, colour-mapped images, charts, video and HTML pages."""
