@@ -188,7 +188,7 @@ class Run:
         from coliags_plugin.surface.meshing.views import MeshSettings
 
         given: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
-        given |= parse_assignments(options.settings, "--set", "KEY=VALUE, for instance depth=median")
+        given |= parse_assignments(options.settings, "KEY=VALUE, for instance depth=median")
         if options.voxel is not None:
             given["voxel_size"] = options.voxel
         chosen, folder = validated(MeshSettings, given, "mesh option"), options.output or self.path / "mesh"

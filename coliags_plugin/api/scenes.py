@@ -72,7 +72,7 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
 
     if options.mesh is None or options.output is None:
         raise InputError(
-            f"{data} is not a run folder", "a run folder, or a scene's folder with --mesh FILE and --output FOLDER"
+            f"{data} is not a run folder", "a run folder, or a scene's folder with `mesh=FILE` and `output=FOLDER`"
         )
     chosen = coverage_settings(options)
     refuse_existing(options.output, options.overwrite)
@@ -85,7 +85,7 @@ def coverage_settings(options: CoverageOptions) -> CoverageSettings:
     from coliags_plugin.core.settings import validated
     from coliags_plugin.surface.coverage.visibility import CoverageSettings
 
-    given = parse_assignments(options.settings, "--set", "KEY=VALUE, for instance region_diameter=10")
+    given = parse_assignments(options.settings, "KEY=VALUE, for instance region_diameter=10")
     return validated(CoverageSettings, given, "coverage option")
 
 

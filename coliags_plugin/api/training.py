@@ -40,7 +40,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     from coliags_plugin.engine.training import IfExists, TrainingRequest, open_training
 
     if options.resume and options.overwrite:
-        raise InputError("--resume and --overwrite together", "one of them")
+        raise InputError("`resume=True` and `overwrite=True` together", "one of them")
     on = choose_device(options.device)
     named = {"schedule.steps": options.steps, "renderer.name": options.renderer}
     chosen = {key: value for key, value in named.items() if value is not None}

@@ -44,9 +44,9 @@ LIBRARIES = {
 
 _NO_CUDA = (
     "no device: everything runs on the CPU. Where there is one, its renderers are tried here: errors against the "
-    "definition, and frames per second; with --device cpu, those of the CPU"
+    "definition, and frames per second; with `device=cpu`, those of the CPU"
 )
-_HINT = "Until that is mended, --set renderer=torch or --device cpu do without it"
+_HINT = "Until that is mended, `renderer=torch` or `device=cpu` do without it"
 
 
 def check_installation(device: str = "auto") -> list[CheckResult]:
@@ -129,7 +129,7 @@ def _renderer(name: str, device: torch.device, tried: torch.device | None) -> Ch
     except Exception as error:  # of a driver, a compiler or a kernel: the reason in every case
         first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
         told = f"{type(error).__name__}: {first[:300]}".rstrip(" .:")
-        detail = f"{told}. {_HINT}; the traceback is in doctor --json"
+        detail = f"{told}. {_HINT}; the traceback is in `coliags doctor --json`"
         return CheckResult(title, "failed", detail, traceback=traceback.format_exc())
 
 

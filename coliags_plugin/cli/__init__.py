@@ -6,14 +6,15 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, get_args, get_type_hints
+from collections.abc import Sequence
+from typing import Annotated
 
 import tyro
 
 from coliags_plugin._version import __version__
 from coliags_plugin.cli.arguments import Runnable
 from coliags_plugin.cli.comparing import AblateCommand, CompareCommand, ReportCommand, ResultsCommand
+from coliags_plugin.cli.flags import hint, in_flags, translate_for
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, DoctorCommand, ListCommand, WeightsCommand
 from coliags_plugin.cli.poses import PosesCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
@@ -29,7 +30,7 @@ from coliags_plugin.cli.runs import (
 )
 from coliags_plugin.cli.scenes import DataCommand, DepthCommand, PhantomCommand
 from coliags_plugin.core.decoder_messages import separate_stderr
-from coliags_plugin.core.errors import ReportedError, did_you_mean
+from coliags_plugin.core.errors import ReportedError
 
 Command = (
     Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
@@ -96,13 +97,14 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run_command(command: Runnable) -> int:
     """Execute a command; reported errors become one line on stderr and an exit status."""
-    from coliags_plugin.cli.log_lines import LogLines
+    from coliags_plugin.engine.progress import LogLines
 
-    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[LogLines(sys.stderr)])
+    translate_for(command)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[LogLines(sys.stderr, in_flags)])
     try:
         command.run()
     except ReportedError as error:
-        print(f"coliags: {error}", file=sys.stderr)
+        print(f"coliags: {in_flags(str(error))}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         print("coliags: interrupted", file=sys.stderr)
@@ -111,30 +113,3 @@ def run_command(command: Runnable) -> int:
         sys.stderr.close()
         return 1
     return 0
-
-
-def hint(argv: Sequence[str], commands: Any) -> str:
-    """The command that an unknown one resembles most, or else the option of its command; empty without one.
-
-    ``commands`` is the union of the commands.
-    """
-    if not argv:
-        return ""
-    kinds = {name.name: kind for kind, name in map(get_args, get_args(commands))}
-    if argv[0] not in kinds:
-        return did_you_mean(argv[0], kinds)
-    kind = kinds[argv[0]]
-    fields = get_type_hints(kind, include_extras=True)
-    if (inner := fields.get("subcommand")) is not None:
-        return hint(argv[1:], get_args(inner)[0])
-    known = {option for field in fields.items() for option in _options(*field)}
-    unknown = (word.partition("=")[0] for word in argv if word.startswith("--"))
-    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
-
-
-def _options(field: str, kind: Any) -> Iterator[str]:
-    """The spellings of a field of a command as an option; none of a positional argument."""
-    metadata = getattr(kind, "__metadata__", ())
-    if tyro.conf.Positional not in metadata:
-        names = [name for each in metadata if (name := getattr(each, "name", None))] or [field.replace("_", "-")]
-        yield from (f"--{prefix}{name}" for name in names for prefix in ("", "no-"))

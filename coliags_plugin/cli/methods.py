@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from coliags_plugin.cli.flags import in_flags
 from coliags_plugin.cli.summaries import print_summary
 from coliags_plugin.config import options
 
@@ -72,7 +73,7 @@ class ConfigCommand:
         from coliags_plugin.config.method_config import load_method
 
         loaded = load_method(self.method, self.set)
-        print(loaded.with_origins() if self.origin else loaded.config.to_yaml(), end="")
+        print(in_flags(loaded.with_origins()) if self.origin else loaded.config.to_yaml(), end="")
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class CheckCommand:
     """Print the whole traceback of every exception."""
     set: options.Assignments = ()
     """Change a value of the method config, as for train."""
-    format: options.DataFormat = None
+    data_format: options.DataFormat = None
     data: options.OptionalPath = None
     """A scene's folder; default: a small phantom."""
     json: options.AsJson = False
@@ -115,10 +116,10 @@ class CheckCommand:
 
         encoding, width = sys.stdout.encoding or "ascii", max(len(check.name) for check in CHECKS)
         results = []
-        for result in check_method(self.method, folder, self.set, self.data, self.format, self.steps):
+        for result in check_method(self.method, folder, self.set, self.data, self.data_format, self.steps):
             results.append(result)
             if not self.json:
-                print(line(result, width, encoding), flush=True)
+                print(in_flags(line(result, width, encoding)), flush=True)
         text = summary(results)
         if self.traceback:
             text += "\n" + "".join(tracebacks(results, encoding))

@@ -79,7 +79,7 @@ class DataCommand:
     """Also write an HTML page with images and the trajectory."""
     set: options.Assignments = ()
     """An option of the data manager, for instance split=block."""
-    format: options.DataFormat = None
+    data_format: options.DataFormat = None
     json: options.AsJson = False
 
     def run(self) -> None:
@@ -92,14 +92,14 @@ class DataCommand:
         from coliags_plugin.reporting.text_formats import page_text
 
         with progress_callback() as progress:
-            scene = open_scene(self.scene, self.format, self.set, progress)
+            scene = open_scene(self.scene, self.data_format, self.set, progress)
             at_stored_size = partial(open_scene, self.scene, scene.provenance["dataset"], self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
         page = check_page(check)
         if self.html is not None:
             write_html(page, self.html)
         chosen = [f"datamanager.{key.removeprefix('datamanager.')}" for key in self.set]
-        chosen += [] if self.format is None else [f"datamanager.name={self.format}"]
+        chosen += [] if self.data_format is None else [f"datamanager.name={self.data_format}"]
         is_ready = check.facts["depth"] is not None and not check.findings
         print_summary(
             f"{page_text(page)}\n\n{verdict(check)}",
@@ -135,7 +135,7 @@ class DepthCommand:
     """Number of threads; default: one for each core."""
     set: options.Assignments = ()
     """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
-    format: options.DataFormat = None
+    data_format: options.DataFormat = None
     overwrite: options.Overwrite = False
     json: options.AsJson = False
 
@@ -156,7 +156,7 @@ class DepthCommand:
         with progress_callback() as progress:
             # Images are read when they are needed, so that memory does not grow with the video.
             reading = ["initial_points=none", "keep_pixels=false", *options]
-            scene = open_scene(self.scene, self.format, reading, progress)
+            scene = open_scene(self.scene, self.data_format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
             estimated = estimate_scene(scene, self.output, request, self.overwrite, progress)

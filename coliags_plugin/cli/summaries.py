@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from coliags_plugin.cli.flags import in_flags
+
 #: The method for scenes with estimated depth, as `coliags reconstruct` trains it.
 ESTIMATED_DEPTH_METHOD = "coliags-in-vivo"
 
@@ -29,7 +31,7 @@ def print_summary(
         summary = {**told, "written": [str(path) for path in written], "next": list(then)}
         print(json.dumps(summary, indent=2, allow_nan=False, default=str))
         return
-    lines = [text] if text else []
+    lines = [in_flags(text)] if text else []
     lines += [f"written: {path}" for path in written]
     lines += [f"next:    {command}" for command in then]
     if lines:

@@ -270,7 +270,7 @@ def make_request(methods: str | Variant | Sequence[str | Variant], options: Comp
     if twice:
         raise InputError(f"more than one method is named {', '.join(twice)}", "methods of different names")
     if not options.scenes:
-        raise InputError("no scene", "at least one", "--scenes phantoms-8 needs no dataset")
+        raise InputError("no scene", "at least one", "`scenes=phantoms-8` needs no dataset")
     check_number("seeds", options.seeds)
     check_number("steps", options.steps)
     for split in options.splits:
@@ -282,7 +282,7 @@ def make_request(methods: str | Variant | Sequence[str | Variant], options: Comp
 def _check_decision(methods: Sequence[str], protocol: str, reference: str | None, primary: Sequence[str]) -> None:
     """Refuse a reference without primary metrics, and the reverse, and names that are not there."""
     if (reference is None) == bool(primary):
-        given, lacking = ("--primary", "--reference") if reference is None else ("--reference", "--primary")
+        given, lacking = ("`primary`", "`reference`") if reference is None else ("`reference`", "`primary`")
         raise InputError(f"{given} without {lacking}", "both: what is decided before the first run")
     if reference is not None:
         check_name("method", reference, methods)

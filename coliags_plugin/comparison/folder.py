@@ -75,7 +75,7 @@ class ComparisonFolder:
     def check(self) -> None:
         """Refuse a folder that holds something else than comparisons."""
         if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"{self.path} is a file", "a folder", "Choose another --output")
+            raise InputError(f"{self.path} is a file", "a folder", "Choose another `output`")
         if self.path.is_dir() and not (self.path / PLAN_FILE).is_file():
             names = sorted(path.name for path in self.path.iterdir() if not path.name.startswith("."))
             # Results alone may have been brought here from elsewhere.
@@ -83,7 +83,7 @@ class ComparisonFolder:
                 raise InputError(
                     f"{self.path} is not the folder of a comparison: it holds {', '.join(names[:4])}",
                     f"a new folder, or one with {PLAN_FILE}",
-                    "Choose another --output",
+                    "Choose another `output`",
                 )
 
     def plan(self) -> ComparisonPlan:
@@ -101,21 +101,21 @@ class ComparisonFolder:
         if is_begun and options.reference is not None and now != (decided and (decided.reference, decided.primary)):
             earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
             raise InputError(
-                f"--reference {options.reference} --primary {' '.join(options.primary)}, where {self.path} had decided "
-                f"{earlier} when it was begun",
+                f"`reference={options.reference}` and `primary={' '.join(options.primary)}`, where {self.path} had "
+                f"decided {earlier} when it was begun",
                 "no other decision after the first run",
-                "Leave both out, or choose another --output",
+                "Leave both out, or choose another `output`",
             )
         if before is None:
             return
-        lengths = [f"--steps {each.steps}" if each.steps else "each method's own steps" for each in (before, options)]
+        lengths = [f"`steps={each.steps}`" if each.steps else "each method's own steps" for each in (before, options)]
         sets = (before.overrides, options.settings)
-        changes = [" ".join(f"--set {change}" for change in each) or "no --set" for each in sets]
+        changes = [" ".join(f"`{change}`" for change in each) or "no settings" for each in sets]
         values = [list(parse_assignments(each).items()) for each in sets]  # 1e-3 is 0.001
         for (earlier, later), is_same in ((lengths, before.steps == options.steps), (changes, values[0] == values[1])):
             if not is_same:
                 raise InputError(
-                    f"{self.path} compares runs with {earlier}, not {later}", "the same, or another --output"
+                    f"{self.path} compares runs with {earlier}, not {later}", "the same, or another `output`"
                 )
 
     def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:

@@ -70,7 +70,7 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
             sources.append(_folder(name))
     if data is not None and len(benchmarks) != 1:
         many = ", ".join(sorted(benchmarks)) or "none"
-        raise InputError(f"--data {data} with these benchmarks: {many}", "one benchmark, whose scenes are there")
+        raise InputError(f"`data={data}` with these benchmarks: {many}", "one benchmark, whose scenes are there")
     twice = [name for name, count in Counter(source.name for source in sources).items() if count > 1]
     if twice:
         raise InputError(f"more than one scene is named {', '.join(twice)}", "scenes of different names")
@@ -143,7 +143,7 @@ def _check_there(sources: Sequence[SceneSource]) -> None:
         raise InputError(
             f"{len(missing)} of {len(sources)} scenes are not there: {', '.join(source.name for source in missing)}",
             f"a folder for each in {folders}",
-            "Get the dataset (docs/data.md), or name its folder with --data",
+            "Get the dataset (docs/data.md), or name its folder with `data`",
         )
     for source in sources:
         if source.is_there and source.phantom is not None:
@@ -168,5 +168,5 @@ def _check_same_phantom(source: SceneSource) -> None:
         raise InputError(
             f"{source.path} is another phantom than the benchmark's: {differences}",
             "the benchmark's phantom as this version makes it, or no folder",
-            "Remove it, so that it is made again, or choose another --data",
+            "Remove it, so that it is made again, or choose another `data`",
         )

@@ -14,16 +14,16 @@ from coliags_plugin.core.settings import Settings, invalid_reported
 EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
 
 
-def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str = EXAMPLE) -> dict[str, object]:
+def parse_assignments(texts: Iterable[str], expected: str = EXAMPLE) -> dict[str, object]:
     """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place.
 
-    ``option`` and ``expected`` are for messages.
+    ``expected`` is for messages.
     """
     values: dict[str, object] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
-            raise InputError(f"{option} {text}", expected)
+            raise InputError(f"setting '{text}'", expected)
         values.pop(key.strip(), None)
         values[key.strip()] = parse_value(value)
     return values
@@ -64,7 +64,7 @@ S = TypeVar("S", bound=Settings)
 def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
     """Settings from their defaults and ``key.path=value`` assignments; messages put the prefix before keys."""
     tree = override_all(Node({}, "options"), assignments)
-    with invalid_reported(f"--set {prefix}"):
+    with invalid_reported(f"setting {prefix}"):
         # Merged with the defaults, as a nested part's defaults may differ from its class's.
         return kind.model_validate(deep_merge(kind().model_dump(), tree.plain()))
 

@@ -159,7 +159,7 @@ def _with_data_format(tree: Node, data_format: str) -> Node:
     """The tree with another name of the data manager, whose options stay."""
     manager = tree.find(["datamanager"])
     options = manager.value if manager.is_mapping else {}
-    name = Node(data_format, "recognised from the data, or --format")
+    name = Node(data_format, "recognised from the data, or `data_format`")
     return Node({**tree.value, "datamanager": Node({**options, "name": name}, manager.origin)}, tree.origin)
 
 

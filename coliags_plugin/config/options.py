@@ -28,7 +28,7 @@ OptionalPath = Annotated[Path | None, _flag("PATH")]
 OptionalText = Annotated[str | None, _flag("TEXT")]
 OptionalInt = Annotated[int | None, _flag("INT")]
 OptionalFloat = Annotated[float | None, _flag("MM")]
-#: What is done by default: ``--no-NAME``, which its help describes, leaves it out.
+#: What is done by default, and left out by the flag ``--no-NAME``, which its help describes.
 DoneByDefault = Annotated[bool, _flag()]
 #: Texts separated by commas.
 Names = Annotated[
@@ -266,7 +266,7 @@ class PageOptions(Options):
     @property
     def largest(self) -> int:
         """The size, bytes."""
-        return bytes_of(str(self.size), "--size")
+        return bytes_of(str(self.size))
 
 
 @dataclass(frozen=True)
@@ -406,10 +406,10 @@ class ReconstructOptions(Options):
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
 
 
-def bytes_of(text: str, option: str) -> int:
+def bytes_of(text: str) -> int:
     """A size such as ``20MB`` in bytes; units are powers of 1000."""
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
     unit = found and found[2].lower()
     if found is None or unit not in _UNITS:
-        raise InputError(f"{option} {text}", "a size in bytes, kB, MB or GB, for instance 20MB")
+        raise InputError(f"`size={text}`", "a size in bytes, kB, MB or GB, for instance 20MB")
     return int(float(found[1]) * _UNITS[unit])

@@ -111,7 +111,7 @@ def parse_tree(text: str, source: str) -> Node:
 
 
 def parse_value(text: str) -> object:
-    """The value of ``--set key=VALUE``, read as YAML."""
+    """The value of an assignment ``key.path=value``, read as YAML."""
     try:
         return tuples(yaml.load(text, _Loader))
     except (yaml.YAMLError, ValueError, RecursionError):
@@ -168,8 +168,8 @@ def parse_assignment(assignment: str) -> Node:
     path, equals, text = assignment.partition("=")
     keys = _KEY.findall(path.strip())
     if not equals or ".".join(keys) != path.strip():
-        raise InputError(f"--set {assignment}", "key.path=value, for instance field.geometry_head.frequencies=8")
-    origin = f"--set {assignment}"
+        raise InputError(f"setting '{assignment}'", "key.path=value, for instance field.geometry_head.frequencies=8")
+    origin = f"`{assignment}`"
     node = _nodes(parse_value(text), origin)
     for key in reversed(keys):
         node = Node({key.strip('"'): node}, origin)

@@ -13,7 +13,7 @@ class Schedule:
     """Length of a run, and the run length for which the step numbers in its config were written.
 
     The one rule for every method (docs/configs.md): step numbers and intervals in a config keep their share of the run,
-    so ``--steps`` moves them, and a shorter run has as many events.
+    so a run of more or fewer steps moves them, and a shorter run has as many events.
 
     Attributes:
         steps: Steps of this run.

@@ -72,7 +72,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def check_number(option: str, number: int | None, least: int = 1) -> None:
     """Refuse a number of an option that is too small; None is none."""
     if number is not None and number < least:
-        raise InputError(f"--{option} {number}", f"at least {least}")
+        raise InputError(f"`{option}={number}`", f"at least {least}")
 
 
 def check_name(noun: str, name: str, known: Collection[str]) -> None:

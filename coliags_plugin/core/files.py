@@ -47,14 +47,14 @@ def refuse_overlap(output: Path, source: Path) -> None:
     made, read = output.resolve(), source.resolve()
     if made == read or made in read.parents or read in made.parents:
         raise InputError(
-            f"--output {output}, and the input is {source}", "a folder apart from the input", "Choose another"
+            f"`output={output}`, and the input is {source}", "a folder apart from the input", "Choose another"
         )
 
 
 def refuse_existing(target: Path, overwrite: bool, expected: str = "a new or empty folder") -> None:
     """Refuse an output that is there, unless it is an empty folder or may be overwritten."""
     if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target} already exists", expected, "Choose another, or pass --overwrite")
+        raise InputError(f"{target} already exists", expected, "Choose another, or pass `overwrite=True`")
 
 
 @contextmanager

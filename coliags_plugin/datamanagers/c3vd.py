@@ -278,7 +278,7 @@ def _unclear(path: Path, seen: str) -> InputError:
     return InputError(
         f"{path} is ambiguous or implausible: {seen}",
         f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
-        "Rewrite it in this format, or --set datamanager.lens=v2 (an unverified candidate), or v1 (C3VD's own)",
+        "Rewrite it in this format, or `datamanager.lens=v2` (an unverified candidate), or v1 (C3VD's own)",
     )
 
 

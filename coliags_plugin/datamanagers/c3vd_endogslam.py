@@ -90,7 +90,7 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
         raise InputError(
             f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
             "EndoGSLAM's result, for option poses: slam",
-            "Name it with --set datamanager.params_file=FILE, or --set datamanager.poses=ground-truth",
+            "Name it with `datamanager.params_file=FILE`, or `datamanager.poses=ground-truth`",
         )
     tracked = 0 if indices is None else len(indices)
     if file is None and tracked != count:

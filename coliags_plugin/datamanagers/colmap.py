@@ -110,7 +110,7 @@ def read_model(folder: Path) -> SparseModel:
         raise InputError(
             f"{folder} holds no COLMAP model" + (f", but {reading.inventory(folder)}" if folder.is_dir() else ""),
             "a folder with cameras, images and points3D, all .bin or all .txt",
-            "Restore what is missing, or give another model's folder with --set datamanager.model=FOLDER",
+            "Restore what is missing, or give another model's folder with `datamanager.model=FOLDER`",
         )
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
     registered = colmap_poses.ordered_images(files[1])
@@ -305,12 +305,12 @@ class ColmapDataManager(RecordedDataManager):
                 f"{path} holds no COLMAP model",
                 "cameras, images and points3D, all .bin or all .txt, in sparse/0, sparse, colmap/sparse/0, "
                 "colmap/sparse or the folder itself",
-                "Check the path, or choose one with --set datamanager.model=FOLDER",
+                "Check the path, or choose one with `datamanager.model=FOLDER`",
             )
         if len(found) > 1:
             others = ", ".join(folder.relative_to(path).as_posix() for folder in found[1:])
             log.warning(
-                "reading %s; there are further models, which --set datamanager.model=FOLDER chooses: %s",
+                "reading %s; there are further models, which `datamanager.model=FOLDER` chooses: %s",
                 found[0],
                 others,
             )
@@ -333,11 +333,11 @@ class ColmapDataManager(RecordedDataManager):
             raise InputError(
                 f"{path} has depths/, but the model's unit of length and the value of a step of depth are not given",
                 f"the option depth_unit, scene lengths per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
-                "For millimetres in a model in metres --set datamanager.depth_unit=0.001, or unit.txt with m, "
+                "For millimetres in a model in metres `datamanager.depth_unit=0.001`, or unit.txt with m, "
                 "which means the same; move depths/ away if it is relative",
             )
         if depth_unit is None and any(depths):
-            log.info("%s/depths is read at 1 mm a step; --set datamanager.depth_unit=MM changes that", path)
+            log.info("%s/depths is read at 1 mm a step; `datamanager.depth_unit=MM` changes that", path)
         size = (depth_unit or 1.0) / FACTORS[unit]
         return [None if depth is None else depth_format(depth, size) for depth in depths]
 
@@ -377,7 +377,7 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
         raise InputError(
             f"no folder {folder}",
             "the images that the model was made from",
-            "Name it with --set datamanager.images_folder=FOLDER",
+            "Name it with `datamanager.images_folder=FOLDER`",
         )
     paths = [reading.named_file(folder, image.name, str(model.folder), outside) for image in model.images]
     missing = [path for path in paths if not path.is_file()]
@@ -386,7 +386,7 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
         raise InputError(
             f"{len(missing)} of the {len(paths)} images of {model.folder} are not in {folder}: {named}",
             "every registered image, under the name the model has for it",
-            "Restore them, or --set datamanager.images_folder=FOLDER",
+            "Restore them, or `datamanager.images_folder=FOLDER`",
         )
     return paths
 

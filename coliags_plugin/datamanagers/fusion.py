@@ -38,7 +38,7 @@ def fuse_depth(
         raise InputError(
             f"none of the {len(frames)} training frames has a valid depth",
             "depth files with known depth in them",
-            "Check the depth files, or --set datamanager.initial_points=file",
+            "Check the depth files, or `datamanager.initial_points=file`",
         )
     taken = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
     # Sorted to keep the pixel order; the choice is already random.

@@ -364,7 +364,7 @@ class NerfstudioDataManager(RecordedDataManager):
         if step is None and file is not None:
             log.warning(
                 "%s has no depth_unit_scale_factor: depth is read as %g units a step, the format's default. If that is "
-                "wrong: --set datamanager.depth_unit_scale_factor=UNITS, or --set datamanager.unit=mm of a world in mm",
+                "wrong: `datamanager.depth_unit_scale_factor=UNITS`, or `datamanager.unit=mm` of a world in mm",
                 file,
                 _DEPTH_STEP,
             )

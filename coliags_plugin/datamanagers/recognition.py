@@ -40,12 +40,12 @@ def find_format(path: Path) -> str:
         raise InputError(
             f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
             "a scene's own folder",
-            "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Images "
+            "docs/data.md lists what each looks like; `data_format=NAME` chooses one and says what it misses. Images "
             "without poses become a scene by coliags poses sfm; beside depth, rgbd reads them with a TUM trajectory",
         )
     if len(found) > 1:
         seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
-        raise InputError(f"{path} may be of several formats ({seen})", "one of them", "Choose with --format NAME")
+        raise InputError(f"{path} may be of several formats ({seen})", "one of them", "Choose with `data_format=NAME`")
     ((name, reason),) = found.items()
     log.info("%s: format %s (%s)", path, name, reason)
     return name

@@ -162,7 +162,7 @@ class RecordedDataManager(DataManager):
         stored = sizes_text((each.lens.width, each.lens.height) for each in rectifications)
         used = sizes_text((each.width, each.height) for each in rectifications)
         if used != stored and self.settings.size is None:
-            change = "--set datamanager.width=W --set datamanager.height=H sets another size"
+            change = "`datamanager.width=W` and `datamanager.height=H` set another size"
             log.info("%s: images stored at %s are used at %s; %s", path, stored, used, change)
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
         self._tell_masks(recording.shots, path)
@@ -237,7 +237,7 @@ class RecordedDataManager(DataManager):
             return points, self._described_points("depth of the training frames", points, path)
         if own is None or source is None:
             missing = POINTS_FILE if source is None else source.name
-            from_file = "--set datamanager.initial_points=file --set datamanager.points_file=FILE"
+            from_file = "`datamanager.initial_points=file` and `datamanager.points_file=FILE`"
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",

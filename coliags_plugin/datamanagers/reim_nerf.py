@@ -182,7 +182,7 @@ class ReimNerfDataManager(RecordedDataManager):
 
 def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
     """Valid stored pixels: the mask file is white where a pixel is ignored."""
-    do = "Restore it, or --set datamanager.mask=false"
+    do = "Restore it, or `datamanager.mask=false`"
     ignored = read_mask(reading.required_file(mask, "the mask of pixels outside the lens's image circle", do))
     if ignored.shape != (height, width):
         raise InputError(f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the images' size, {width} x {height}")

@@ -211,7 +211,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
                 "timestamps of one clock in names and trajectory, in seconds, not nanoseconds",
-                "Shift the trajectory's timestamps, or --set datamanager.association=order if line n is image n's",
+                "Shift the trajectory's timestamps, or `datamanager.association=order` if line n is image n's",
             )
         deep = np.zeros(len(posed), np.int64)
         if depths:
@@ -221,7 +221,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"no depth file within {tolerance:g} of an image that has a pose",
                 "depth files named by timestamps of the images' clock",
-                "Rename them, or --set datamanager.depth=none",
+                "Rename them, or `datamanager.depth=none`",
             )
         without = {"without_pose": len(images) - len(posed), "without_depth": len(posed) - len(kept)}
         if any(without.values()):
@@ -243,7 +243,7 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"{file} has {len(trajectory)} poses for {len(numbered)} images",
                 "a pose for every image, in order",
-                "Restore the missing ones, or --set datamanager.association=time if its timestamps name images",
+                "Restore the missing ones, or `datamanager.association=time` if its timestamps name images",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
         if deep and deep.keys() != numbered.keys():
@@ -252,7 +252,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"{file.parent} has {len(numbered)} images and {len(deep)} depth files; frame "
                 f"{' '.join(map(str, lone))} has only one of the two",
                 "a depth file for every image, or none at all",
-                "Restore the missing files, or --set datamanager.depth=none",
+                "Restore the missing files, or `datamanager.depth=none`",
             )
         rows: list[_Row] = [(image, deep.get(key), pose) for pose, (key, image) in enumerate(numbered.items())]
         return rows, {"by": "order"}
@@ -271,7 +271,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"{file}: pose {index} has timestamp {trajectory.timestamps[index]:g}, but image {index} is "
                 f"{list(numbered.values())[index].name}",
                 "line n for image n, or timestamps equal to the image names",
-                "--set datamanager.association=time if the names are timestamps, or order if these mean nothing",
+                "`datamanager.association=time` if the names are timestamps, or order if these mean nothing",
             )
 
     def _depth_scale(self, said: float | None, file: Path) -> float:
@@ -289,7 +289,7 @@ class RGBDDataManager(RecordedDataManager):
                 f"{file.parent} has depth files, but their number of steps per unit of the trajectory is not given",
                 '"depth_scale" in camera.json, <depth_scale> in a calibration file, or the option depth_scale; TUM\'s '
                 "files have 5000 steps per metre",
-                "For instance --set datamanager.depth_scale=5000; or --set datamanager.depth=none if it is relative",
+                "For instance `datamanager.depth_scale=5000`; or `datamanager.depth=none` if it is relative",
             )
         return scale
 
@@ -361,7 +361,7 @@ def _find_trajectory(folder: Path, named: str | None) -> Path:
         raise InputError(
             f"{folder} has the trajectories {', '.join(path.name for path in trajectories)}",
             "one trajectory",
-            f"Choose with the option trajectory, for instance --set datamanager.trajectory={trajectories[0].name}",
+            f"Choose with the option trajectory, for instance `datamanager.trajectory={trajectories[0].name}`",
         )
     return trajectories[0]
 

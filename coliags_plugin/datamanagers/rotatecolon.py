@@ -62,7 +62,7 @@ class ExrDepth(DepthFormat):
 _ALONE = Lock()
 
 
-_CHANNEL = "Choose the one that holds depth with --set datamanager.depth_channel=NAME"
+_CHANNEL = "Choose the one that holds depth with `datamanager.depth_channel=NAME`"
 
 
 def read_exr_channel(path: Path, channel: str, do: str = _CHANNEL) -> Float32[np.ndarray, "H W"]:
@@ -158,7 +158,7 @@ class RotateColonDataManager(RecordedDataManager):
                 raise InputError(
                     f"{path} has {TEST} but no folder {self.settings.test_folder}",
                     "the images of the test views",
-                    "Name the folder they are in with --set datamanager.test_folder=FOLDER",
+                    "Name the folder they are in with `datamanager.test_folder=FOLDER`",
                 )
             parts.append(self._views(test, images, None, "test-"))
         (shots, facts), *others = parts

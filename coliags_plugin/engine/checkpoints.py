@@ -96,7 +96,7 @@ def save_tensors(tensors: Mapping[str, Tensor], file: Path) -> None:
         raise InputError(
             f"cannot write to {final_place(file.parent)}: {error}",
             "a disk with space left",
-            "Free some; --resume goes on",
+            "Free some; `resume=True` goes on",
         ) from error
 
 
@@ -212,5 +212,5 @@ def _damaged(path: Path, reason: str) -> DamagedCheckpointError:
     before = [
         other.name for other in checkpoints_in_order(path.parent) if checkpoint_step(other) < checkpoint_step(path)
     ]
-    way = f"`--resume` sets it aside and goes on from {before[-1] if before else 'the start'}"
+    way = f"`resume=True` sets it aside and goes on from {before[-1] if before else 'the start'}"
     return DamagedCheckpointError(f"checkpoint {path} is damaged: {reason}", "an intact checkpoint", way)

@@ -39,7 +39,7 @@ def _check_strategy(config: MethodConfig) -> None:
             f"strategy '{config.strategy.name}' changes {', '.join(sorted(serves))}, and field '{config.field.name}' "
             f"has {elements}",
             "a strategy for this field",
-            "Choose another, or --set strategy=none",
+            "Choose another, or `strategy=none`",
         )
 
 
@@ -50,7 +50,7 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
         raise InputError(
             f"sampler '{config.sampler.name}' with renderer '{chosen.name}', which draws whole images",
             "a renderer of radiance fields",
-            "Set --set sampler=frames",
+            "Set `sampler=frames`",
         )
     whole = [(f"loss term '{key}'", "losses of", f"losses.{key}") for key, loss in losses.items() if loss.whole_image]
     whole += [
@@ -62,7 +62,7 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
         raise InputError(
             f"{what} needs whole images, and sampler '{config.sampler.name}' gives single pixels",
             f"{others} single pixels",
-            f"Remove it with --set {option}=null, or set --set sampler=frames",
+            f"Remove it with `{option}=null`, or set `sampler=frames`",
         )
 
 
@@ -72,7 +72,7 @@ def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:
             raise InputError(
                 f"loss term '{key}' is about Gaussians, and field '{config.field.name}' has none",
                 "a field of Gaussians",
-                f"Remove it with --set losses.{key}=null",
+                f"Remove it with `losses.{key}=null`",
             )
 
 
@@ -89,7 +89,7 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
                 f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
                 f"'{scene.name}' has any",
                 f"frames with {_DATA.get(missing, missing)}, or no such term",
-                f"Remove it with --set losses.{key}=null{instead}",
+                f"Remove it with `losses.{key}=null`{instead}",
             )
 
 
@@ -108,7 +108,7 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     raise InputError(
         f"{seen}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
-        "`coliags data check` looks into poses, depth and units; small units on purpose need --set near_plane=LENGTH",
+        "`coliags data check` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
     )
 
 

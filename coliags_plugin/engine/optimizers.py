@@ -129,11 +129,11 @@ def _check_groups(there: set[str], named: set[str]) -> None:
             f"optimizers lacks the parameter groups {', '.join(missing)}",
             f"rates for each of {', '.join(sorted(there))}",
             f"Add {missing[0]}: {{lr: ...}} under optimizers of the method config, or "
-            f"--set 'optimizers.\"{missing[0]}\"={{lr: 0.001}}'",
+            f'`optimizers."{missing[0]}"={{lr: 0.001}}`',
         )
     if unknown := sorted(named - there):
         raise InputError(
             f"optimizers names {', '.join(unknown)}, which the model does not have",
             f"exactly its parameter groups: {', '.join(sorted(there))}",
-            f"Remove it with --set 'optimizers.\"{unknown[0]}\"=null'",
+            f'Remove it with `optimizers."{unknown[0]}"=null`',
         )

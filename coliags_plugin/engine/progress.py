@@ -1,4 +1,4 @@
-"""Progress reports of long jobs: a bar on a terminal, one line in a notebook, plain lines elsewhere."""
+"""Progress of long jobs, a bar on a terminal, one line in a notebook, plain lines elsewhere; and the log beside it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
-from rich.console import Console
+from rich.console import Console, ConsoleRenderable
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.traceback import Traceback
 
 from coliags_plugin.reporting.numbers import duration
 
@@ -123,6 +124,29 @@ def progress_callback(after: float = 0.0) -> Iterator[Callable[[str, int, int], 
             current[-1].update(done)
 
         yield report
+
+
+class LogLines(RichHandler):
+    """One line per message, above a progress bar: not broken to the width, so that paths and commands can be copied.
+
+    Args:
+        stream: Where the lines go.
+        worded: Puts a message into the words of its reader.
+    """
+
+    def __init__(self, stream: TextIO, worded: Callable[[str], str]) -> None:
+        super().__init__(console=Console(file=stream, soft_wrap=True), highlighter=None)
+        self._worded = worded
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The message in its reader's words."""
+        return self._worded(super().format(record))
+
+    def render(
+        self, *, record: logging.LogRecord, traceback: Traceback | None, message_renderable: ConsoleRenderable
+    ) -> ConsoleRenderable:
+        """The message alone."""
+        return message_renderable
 
 
 def log_console() -> Console | None:

@@ -52,7 +52,7 @@ class RayExecutor(Executor):
     def __init__(self, address: str | None, slots: int | None, threads: int, device: str) -> None:
         if device not in ("auto", "cpu", "cuda"):
             raise InputError(
-                f"--device {device} with --executor ray", "auto, cpu or cuda", "Ray gives each run its GPU"
+                f"`device={device}` with `executor=ray`", "auto, cpu or cuda", "Ray gives each run its GPU"
             )
         self._ray = _library()
         self._connect(address)
@@ -166,7 +166,7 @@ def _fault_of_node(version: str, file: str, inputs: Sequence[str]) -> _Fault | N
     except OSError as problem:
         return (
             f"does not see {path.parent}, or cannot write there: {problem.strerror or problem}",
-            "an --output on storage that all machines share, under the same path",
+            "an `output` on storage that all machines share, under the same path",
             "Choose a folder on a network file system",
         )
     missing = [each for each in inputs if not Path(each).exists()]
@@ -198,7 +198,7 @@ def _library() -> Any:
         import ray
     except ImportError as error:
         raise InputError(
-            "--executor ray, but Ray is not installed",
+            "`executor=ray`, but Ray is not installed",
             "the package with its extra 'sweep'",
             'pip install "coliags_plugin[sweep]"',
         ) from error

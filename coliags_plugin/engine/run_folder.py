@@ -116,7 +116,7 @@ class RunFolder:
         parent = Path("runs") / scene / method
         found = sorted(path for path in parent.glob("*") if (path / "config.yaml").is_file())
         if not found:
-            raise InputError(f"no run under {parent}", "one to resume", "Name it with --output RUN")
+            raise InputError(f"no run under {parent}", "one to resume", "Name it with `output=RUN`")
         return cls(found[-1])
 
     @classmethod
@@ -149,10 +149,10 @@ class RunFolder:
             raise InputError(
                 f"{self.path} already exists",
                 "a new folder",
-                "Choose another --output, or pass --resume or --overwrite",
+                "Choose another `output`, or pass `resume=True` or `overwrite=True`",
             )
         if not self.config_file.is_file():
-            raise InputError(f"{self.path} is not a run folder", "a run to overwrite", "Choose another --output")
+            raise InputError(f"{self.path} is not a run folder", "a run to overwrite", "Choose another `output`")
 
     def relative(self, path: str | Path) -> str:
         """A path from the folder, so that run and data can be moved together and nothing says where they were."""
@@ -219,7 +219,7 @@ class RunFolder:
         """Write a schedule that differs from the run's own into its config; change and plan into its provenance."""
         before, now = self.method().config.schedule, config.schedule
         if now.steps < step:
-            raise InputError(f"{self.path} has taken {step} steps already", f"--steps {step} or more, not {now.steps}")
+            raise InputError(f"{self.path} has taken {step} steps already", f"`steps={step}` or more, not {now.steps}")
         if now == before:
             return
         provenance = self.provenance()

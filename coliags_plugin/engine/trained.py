@@ -71,7 +71,7 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     scene = load_scene(config, folder).with_near_plane(config.near_plane / scale)
     if scene.provenance.get("fingerprint") != identity.fingerprint:
         raise InputError(
-            f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
+            f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass `data=SCENE`"
         )
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
     model = restore_model(saved, config, scene, renderer, scale).to(device).eval()

@@ -43,7 +43,7 @@ MAX_BLANK_VIEWS = 10
 #: What takes less memory on a device.
 LESS = (
     "Fewer initial points (--set datamanager.points_count=50000), slower growth (a higher strategy.gradient_threshold) "
-    "or smaller images (datamanager.width and height) take less; --device cpu has the computer's memory"
+    "or smaller images (datamanager.width and height) take less; `device=cpu` has the computer's memory"
 )
 #: So that the PSNR of a perfect view stays a number, dB.
 MAX_PSNR = 100.0

@@ -74,7 +74,7 @@ def open_training(
         seed, scale = int(provenance["seed"]), recorded_scale(provenance["scene"]["provenance"])
         if request.seed not in (None, seed):
             begun = f"{folder.path}, which was started with seed {seed}"
-            raise InputError(f"--seed {request.seed} for {begun}", "no --seed, or that one")
+            raise InputError(f"`seed={request.seed}` for {begun}", "no `seed`, or that one")
     else:
         folder.check_free(if_exists == "overwrite")
         method = load_method_for(request.data, request.method, request.overrides, request.data_format)

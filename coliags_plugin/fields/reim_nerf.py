@@ -263,7 +263,7 @@ class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
             raise InputError(
                 f"{len(scene.train)} training frame of scene '{scene.name}'",
                 "at least two, which show the tissue and its shading from different places",
-                "Give more frames, or another split: --set datamanager.split=...",
+                "Give more frames, or another split: `datamanager.split=...`",
             )
         field = cls(settings, generator)
         field.normalisation = SceneNormalisation.from_scene(scene)

@@ -256,7 +256,7 @@ def _known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H 
         raise InputError(
             f"frame '{target.name}' has no depth",
             "depth for every training frame, since the losses include one of depth",
-            "Remove that term, for instance with --set losses.depth=null",
+            "Remove that term, for instance with `losses.depth=null`",
         )
     return target.depth, torch.isfinite(target.depth) & target.valid
 

@@ -89,7 +89,7 @@ def install(nets: Sequence[str], folder: Path | None, origin: Path | None) -> li
     that are missing are in it.
     """
     if origin is not None and not origin.is_dir():
-        raise InputError(f"--from {origin} is not a folder", "a folder with LPIPS weights")
+        raise InputError(f"`from_folder={origin}` is not a folder", "a folder with LPIPS weights")
     missing = _missing(nets, folder)
     target = folder or default_folder()
     written = _download(missing, target) if origin is None else _copy(missing, origin, target)
@@ -126,7 +126,7 @@ def _download(missing: Sequence[tuple[str, int]], target: Path) -> list[Path]:
     fetch = pooch.HTTPDownloader(timeout=_TIMEOUT, headers={"User-Agent": f"coliags_plugin/{__version__}"})
     for number, file in enumerate(files):
         urls = ", ".join(left.url for left in files[number:])
-        otherwise = f"On a machine with a connection download {urls}, and pass --from FOLDER with them here"
+        otherwise = f"On a machine with a connection download {urls}, and pass `from_folder=FOLDER` with them here"
         _log.info("download %s", file.url)
         with atomic_path(target / file.path) as path:
             try:
@@ -144,7 +144,7 @@ def _copy(missing: Sequence[tuple[str, int]], origin: Path, target: Path) -> lis
         raise InputError(
             f"{origin} has no {', '.join(published.path for published in lacking)}",
             "",
-            f"Download {', '.join(published.url for published in lacking)} into it, or choose another --net",
+            f"Download {', '.join(published.url for published in lacking)} into it, or choose another `net`",
         )
     copies = [
         (file, target / published.check(file, file, f"Download {published.url} again"))

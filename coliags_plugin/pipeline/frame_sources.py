@@ -211,13 +211,13 @@ def every_of(source: FrameSource, rate: float) -> int:
         InputError: ``rate`` is no positive number, or the source does not tell how many frames a second it has.
     """
     if not 0.0 < rate < FASTEST:
-        raise InputError(f"--frames-per-second {rate:g}", f"a number between 0 and {FASTEST:g}")
+        raise InputError(f"`frames_per_second={rate:g}`", f"a number between 0 and {FASTEST:g}")
     own = source.rate
     if own is None:
         raise InputError(
-            f"--frames-per-second {rate:g}, and {source.path} does not tell how many frames a second it has",
+            f"`frames_per_second={rate:g}`, and {source.path} does not tell how many frames a second it has",
             "a video whose header does",
-            "Use one of every n frames: --every N",
+            "Use one of every n frames: `every=N`",
         )
     every = max(1, round(own / rate))
     if source.is_variable:
@@ -248,7 +248,7 @@ def frame_at(source: FrameSource, time: str) -> int:
         raise InputError(
             f"the time {time}, and {source.path} does not tell how many frames a second it has",
             "a video whose header does",
-            "Give numbers of frames: --set frames.first=100 --set frames.last=400",
+            "Give numbers of frames: `frames.first=100` and `frames.last=400`",
         )
     seconds, times = sum(part * 60.0**power for power, part in enumerate(reversed(parts))), source.times
     if times is None:
@@ -301,10 +301,10 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
     if camera.model is None:
         calibration = find_calibration(path)
         if calibration is None and videos:
-            log.warning("%s has no calibration file: its camera is estimated. --camera NAME.xml gives one", path)
+            log.warning("%s has no calibration file: its camera is estimated. `camera=NAME.xml` gives one", path)
     elif camera.model.lower().endswith(SUFFIX):
         if camera.params is not None:
-            raise InputError(f"--params, and --camera {camera.model}", "one of them", "Drop --params")
+            raise InputError(f"`params`, and `camera={camera.model}`", "one of them", "Drop `params`")
         calibration = read_calibration(user_path(camera.model))
     else:
         calibration = None

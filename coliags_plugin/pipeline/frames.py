@@ -33,7 +33,7 @@ from coliags_plugin.pipeline.survey import Survey
 IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
 #: Name of a frame's file without its suffix, within its folder.
 FrameName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
-_KEEP_MORE = ", or keep more frames with --every, --set frames.least_motion=0 or --set frames.least_sharpness=0"
+_KEEP_MORE = ", or keep more frames with `every`, `frames.least_motion=0` or `frames.least_sharpness=0`"
 
 
 class _Part(BaseModel):

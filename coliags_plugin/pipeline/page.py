@@ -80,7 +80,7 @@ _BRACKETS = "Brackets are segments, dashed where they failed. "
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
     "more frames (--every), a part of the video without cuts, a mask of what does not move with the wall (--mask), or "
-    "the calibration of the camera (--camera, --params)."
+    "the calibration of the camera (`camera`, `params`)."
 )
 
 

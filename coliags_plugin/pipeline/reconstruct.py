@@ -68,7 +68,7 @@ def reconstruct(
     refuse_overlap(out, source)
     if mask is not None and not mask.is_file():
         seen = f"{mask} is a folder" if mask.is_dir() else f"no file {mask}"
-        raise InputError(seen, "an image, black where pixels are ignored", "Check --mask")
+        raise InputError(seen, "an image, black where pixels are ignored", "Check `mask`")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
     frames, is_long = settings.frames, False
     if data_format is None:

@@ -76,7 +76,7 @@ class Record:
                 raise InputError(
                     f"{folder} already exists and is no reconstruction",
                     "a new or empty folder, or one that `coliags reconstruct` made",
-                    "Choose another --output",
+                    "Choose another `output`",
                 )
         return record
 
@@ -169,12 +169,12 @@ def _read(file: Path) -> dict[str, StageRecord]:
             raise InputError(
                 f"{file} is of version {content.get('version', 'unknown')} of coliags_plugin",
                 f"format {FORMAT}, of version {__version__}",
-                "Choose another --output, or go on with that version",
+                "Choose another `output`, or go on with that version",
             )
-        with invalid_reported(f"cannot read {file}: ", MADE, "Choose another --output"):
+        with invalid_reported(f"cannot read {file}: ", MADE, "Choose another `output`"):
             return _RECORDED.validate_python(content["stages"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {file}: {error}", MADE, "Choose another --output") from error
+        raise InputError(f"cannot read {file}: {error}", MADE, "Choose another `output`") from error
 
 
 def _is_ours(path: Path) -> bool:
@@ -260,7 +260,7 @@ def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> N
             raise InputError(
                 f"{record.folder}: stage {stage.name} was made with {differences}",
                 "the options that it was begun with",
-                f"Choose another --output, or pass --overwrite to repeat {stage.name} and what follows it",
+                f"Choose another `output`, or pass `overwrite=True` to repeat {stage.name} and what follows it",
             )
         later = [other for other in stages[number:] if stage.part in (None, other.part)]
         record.forget([other.name for other in later], [output for other in later for output in other.outputs])

@@ -335,7 +335,7 @@ def _check(path: Path, size: int, modified: int) -> None:
             what = "%s has %d video streams: number %d is used, of %d x %d"
             log.warning(what, path, count, stream.index, width, height)
         if (square := round(width * aspect)) != width:
-            what = "%s has pixels that are not square (%s) and is read as %d x %d: --params and --mask are of that size"
+            what = "%s has pixels that are not square (%s) and is read as %d x %d: `params` and `mask` are of that size"
             log.warning(what, path, aspect, square, height)
 
 

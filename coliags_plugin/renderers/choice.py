@@ -54,4 +54,4 @@ def _others(primitive: str, device: torch.device) -> str:
     """Hint that names the renderers of a primitive on a device; empty without any."""
     classes = {name: registry.renderers.get(name) for name in candidates("renderers")}
     able = [name for name, found in classes.items() if primitive in found.primitives and device.type in found.devices]
-    return f"Set --set renderer=NAME, NAME being {' or '.join(able)}" if able else ""
+    return f"Set `renderer=NAME`, NAME being {' or '.join(able)}" if able else ""

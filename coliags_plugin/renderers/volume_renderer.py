@@ -202,7 +202,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         far = self.settings.far_plane
         if near_plane > 0.0 and far is not None:
             return near_plane, far
-        bounds, to_do = field.ray_bounds, "Set them with --set near_plane=... --set renderer.far_plane=..."
+        bounds, to_do = field.ray_bounds, "Set them with `near_plane=...` and `renderer.far_plane=...`"
         if self.settings.spacing == "depth":
             raise InputError("near_plane 0 with spacing 'depth'", "one above 0: a field's own is a distance", to_do)
         if bounds is None:

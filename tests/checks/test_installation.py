@@ -79,7 +79,7 @@ def test_a_wrong_renderer_fails(small, monkeypatch, spoiled, told):
     right = cpu_renderer.render_gaussians
     monkeypatch.setattr(cpu_renderer, "render_gaussians", lambda *args: spoiled(right(*args)))
     result = checked("cpu")["renderer cpu"]
-    assert result.status == "failed" and "--set renderer=torch" in result.detail
+    assert result.status == "failed" and "`renderer=torch`" in result.detail
     assert all(f"{told} {primitive} by " in result.detail for primitive in ("gaussians3d", "surfels"))
 
 

@@ -271,7 +271,7 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
         (("--set", "camera.field_of_view=[90, 20]"), "two ascending angles"),
         (("--camera", "PINHOLES"), "camera model PINHOLES"),
         (("--camera", "PINHOLE", "--params", "1,2"), "2 parameters for PINHOLE"),
-        (("--params", "1,two"), "--set camera.params"),
+        (("--params", "1,two"), "setting camera.params"),
         (("--params", "1,2"), "parameters (--params) without their camera model (--camera)"),
         (("--set", "overlapp=3"), "unknown key 'overlapp'"),
         (("--every", "0"), "--every 0"),

@@ -13,6 +13,7 @@ import tyro
 
 from coliags_plugin._version import __version__
 from coliags_plugin.cli import Command, hint
+from coliags_plugin.cli.flags import in_flags, translate_for
 from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 
@@ -79,6 +80,21 @@ def test_the_nearest_command_or_option_is_named(argv, meant, capsys):
 def test_nothing_is_suggested_where_nothing_is_near():
     for argv in ("", "xylophone", "train coliags", "train coliags --zzzzzz", "poses"):
         assert hint(argv.split(), Command) == ""
+
+
+@pytest.mark.parametrize(
+    ("message", "typed"),
+    [
+        ("Pass `resume=True`, or another `output`", "Pass --resume, or another --output"),
+        ("`steps=3` and `data_format=c3vd`", "--steps 3 and --format c3vd"),
+        ("Remove it with `losses.depth=null`", "Remove it with --set losses.depth=null"),
+        ('`optimizers."field.x"={lr: 0.001}`', "--set 'optimizers.\"field.x\"={lr: 0.001}'"),
+        ("no key `wants`; see `coliags eval RUN` and `method`", "no key `wants`; see `coliags eval RUN` and `method`"),
+    ],
+)
+def test_options_that_a_message_quotes_are_flags_of_the_command(message, typed):
+    translate_for(commands()["TrainCommand"]("coliags", Path("scene")))
+    assert in_flags(message) == typed
 
 
 def test_the_version(capsys):

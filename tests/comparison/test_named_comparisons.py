@@ -182,8 +182,8 @@ def test_folders_and_scenes_of_a_file(tmp_path, written):
         (["nowhere"], None, "no scene 'nowhere'.*a benchmark: c3vd, c3vd-endogslam"),
         (["c3vd/cecum"], None, "benchmark 'c3vd' has no scene 'cecum'.*Did you mean"),
         (["{tmp}/wall", "{tmp}/other/wall"], None, "more than one scene is named wall"),
-        (["{tmp}/wall"], "x", "--data x with these benchmarks: none"),
-        (["c3vd", "rotatecolon"], "x", "--data x with these benchmarks: c3vd, rotatecolon"),
+        (["{tmp}/wall"], "x", "`data=x` with these benchmarks: none"),
+        (["c3vd", "rotatecolon"], "x", "`data=x` with these benchmarks: c3vd, rotatecolon"),
     ],
 )
 def test_scenes_that_cannot_be_meant(tmp_path, names, data, told):

@@ -152,7 +152,7 @@ def test_null_removes_a_loss():
 
 def test_origins_name_file_and_line_or_the_option():
     text = load_method("coliags", ["field.geometry_head.frequencies=8"]).with_origins()
-    for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# --set field.geometry_head.frequencies=8"):
+    for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# `field.geometry_head.frequencies=8`"):
         assert part in text
     assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 8
 
@@ -218,7 +218,7 @@ def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen,
     with pytest.raises(InputError) as caught:
         load_method("coliags", [assignment])
     assert str(caught.value) == (
-        f"--set {assignment}: {assignment.split('=')[0]}: {seen}: a logarithmic schedule cannot reach or leave 0; give "
+        f"`{assignment}`: {assignment.split('=')[0]}: {seen}: a logarithmic schedule cannot reach or leave 0; give "
         f"both above 0, or leave {end} out (null) for a constant {start}."
     )
 
@@ -226,7 +226,7 @@ def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen,
 @pytest.mark.parametrize(
     ("name", "assignments", "message"),
     [
-        *(("coliags", [text], "--set") for text in ("steps", "=3", "schedule..steps=3", "schedule.stepz=3")),
+        *(("coliags", [text], text) for text in ("steps", "=3", "schedule..steps=3", "schedule.stepz=3")),
         ("colliags", [], "Did you mean 'coliags'"),
         *(("coliags", [f"optimizers.features.lr={text}"], "finite") for text in (".inf", "1e400")),
         *(("coliags", [f"losses.l1.weight={text}"], "finite") for text in (".nan", "1e400")),
@@ -336,5 +336,5 @@ def test_other_things_are_refused(settings, message):
 
 
 def test_a_text_without_a_value_is_refused_by_its_option():
-    with pytest.raises(InputError, match=r"--light power\. Expected power=10"):
-        parse_assignments(["power"], "--light", "power=10")
+    with pytest.raises(InputError, match=r"setting 'power'. Expected power=10"):
+        parse_assignments(["power"], "power=10")

@@ -654,7 +654,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         ),
         (
             remove("params.npz"),
-            r"data has no params.npz.*params_file=FILE, or --set datamanager.poses=ground-truth",
+            r"data has no params.npz.*params_file=FILE, or `datamanager.poses=ground-truth`",
         ),
         (remove("pose.txt"), "rotation has images, but it has no pose.txt|C3VD's release there"),
         (remove("rotation/pose.txt"), "rotation has images, but it has no pose.txt"),

@@ -539,6 +539,6 @@ def test_smaller_images_are_told_once_where_no_size_is_set(copied, caplog):
             load(folder, "rgbd", **options)
         return [record.getMessage() for record in caplog.records if "stored at" in record.getMessage()]
 
-    change = "--set datamanager.width=W --set datamanager.height=H sets another size"
+    change = "`datamanager.width=W` and `datamanager.height=H` set another size"
     assert told() == [f"{folder}: images stored at 400 x 320 are used at 338 x 270; {change}"]
     assert told(width=200, height=150) == []

@@ -237,7 +237,7 @@ def test_gaussian_pancakes_folder(pancakes):
     assert scene.points.positions.tolist() == [[1.0, 2.0, 40.0], [-1.5, 0.0, 41.0]]
     assert scene.points.colors.tolist() == [[255, 128, 0], [0, 0, 255]]
     assert scene.provenance["points"]["source"] == "mesh.obj"
-    with pytest.raises(InputError, match=r"or --set datamanager.depth=none if it is relative"):
+    with pytest.raises(InputError, match=r"or `datamanager.depth=none` if it is relative"):
         load(pancakes)
     frame = load(pancakes, depth_scale=SCALE).train[0]
     assert np.abs(frame.depth.numpy() - expected_from(frame, poses(FRAMES)[1])[0]).max() < 0.0011

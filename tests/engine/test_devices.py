@@ -85,5 +85,5 @@ def test_a_comparison_uses_every_gpu_or_the_named_one(cards, monkeypatch, visibl
 
 
 def test_a_cluster_chooses_the_gpus_itself():
-    with pytest.raises(InputError, match=r"cuda:1 with --executor ray.*Ray gives each run its GPU"):
+    with pytest.raises(InputError, match=r"cuda:1` with `executor=ray.*Ray gives each run its GPU"):
         make_executor(ExecutionOptions(device="cuda:1", executor="ray"))

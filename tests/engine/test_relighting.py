@@ -135,7 +135,7 @@ def test_render_under_another_lamp_says_which(trained, tmp_path):
     ("options", "words"),
     [
         (["--light", "pwoer=3"], "unknown key 'pwoer'.*Did you mean 'power'"),
-        (["--light", "power"], "--light power. Expected KEY=VALUE"),
+        (["--light", "power"], "setting 'power'. Expected KEY=VALUE"),
         (["--light", "power=-1"], r"lamp option power: .*greater than or equal to 0 \(got -1\)"),
         (["--light", "intensity=bright"], r"lamp option intensity: .*\(got 'bright'\)"),
         (["--light", "offset=3"], r"lamp option offset: .*tuple \(got 3\)"),

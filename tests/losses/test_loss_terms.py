@@ -127,7 +127,7 @@ def test_no_gaussians_cost_nothing(name, evaluate):
 def test_a_frame_without_depth_says_how_to_go_on(name, image, rgb, depth):
     loss = make(name)
     output = make_output(rgb, **dict.fromkeys(loss.loss.wants, depth))
-    with pytest.raises(InputError, match=r"'0007' has no depth.*--set losses\.depth=null"):
+    with pytest.raises(InputError, match=r"'0007' has no depth.*`losses\.depth=null`"):
         loss(output, make_frame(image))
 
 

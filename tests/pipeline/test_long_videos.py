@@ -187,7 +187,7 @@ def test_a_long_video_is_reconstructed_segment_by_segment_and_what_is_done_is_no
     before, executor = list(done), workers()
     cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     assert executor.tasks == [] and done == before
-    with pytest.raises(InputError, match="Choose another --output"):
+    with pytest.raises(InputError, match="Choose another `output`"):
         cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
     workers()
     again = cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 110}, overwrite=True)

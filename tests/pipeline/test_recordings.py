@@ -68,7 +68,7 @@ def test_a_calibration_file_is_named_as_the_camera(recording, tmp_path, given):
     assert settings == opened_recording(recording, SfmSettings())[1]
     other = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(9.0, 9.0, 8.0, 8.0)))
     assert opened_recording(recording, other)[1] == other
-    with pytest.raises(InputError, match=r"--params, and --camera .*endoscope\.xml"):
+    with pytest.raises(InputError, match=r"`params`, and `camera=.*endoscope\.xml"):
         opened_recording(source, SfmSettings(camera=named.model_copy(update={"params": (1.0,)})))
     with pytest.raises(InputError, match=r"cannot read .*gone\.xml"):
         opened_recording(source, SfmSettings(camera=CameraSettings(model="gone.xml")))

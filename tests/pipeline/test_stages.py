@@ -83,7 +83,7 @@ def test_a_killed_run_goes_on(tmp_path, name):
 def test_other_options_are_refused_or_repeat_what_depends_on_them(tmp_path):
     shop = Workshop(tmp_path)
     shop.run()
-    with pytest.raises(InputError, match=r"stage second was made with value 0, not 5.*--overwrite to repeat second"):
+    with pytest.raises(InputError, match=r"stage second was made with value 0, not 5.*`overwrite=True` to repeat"):
         shop.run(second=5)
     assert shop.run() == []
     (tmp_path / "third.txt").write_text("old")
@@ -114,7 +114,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 
 def test_records_of_other_versions_are_refused(tmp_path):
     (tmp_path / RECORD_FILE).write_text('{"format": 1, "version": "0.0.1", "stages": {}}')
-    with pytest.raises(InputError, match=rf"{RECORD_FILE} is of version 0\.0\.1 .*Choose another --output"):
+    with pytest.raises(InputError, match=rf"{RECORD_FILE} is of version 0\.0\.1 .*Choose another `output`"):
         Record.of(tmp_path)
 
 

@@ -261,7 +261,7 @@ def test_known_cameras_have_one_start_and_are_kept(options, refined, count):
 
 
 def test_crops_are_refused():
-    with pytest.raises(InputError, match=r"--camera c3vd, and images of 800 x 800. Expected the whole frame"):
+    with pytest.raises(InputError, match=r"`camera=c3vd`, and images of 800 x 800. Expected the whole frame"):
         starting_cameras(CameraSettings(model="c3vd"), [], [(800, 800)], Start("c3vd", 1.0))
 
 

@@ -368,7 +368,7 @@ def test_auto_chooses_cpu_on_the_cpu_falls_back_to_torch_and_says_why(monkeypatc
     ("renderer", "message"),
     [
         ("torch", r"draws gaussians3d, surfels, the field is made of radiance"),
-        ("auto", r"no renderer can serve.*--set renderer=NAME, NAME being volume"),
+        ("auto", r"no renderer can serve.*`renderer=NAME`, NAME being volume"),
         ({"name": "auto", "prefer": ("volum",)}, r"renderer auto, prefer: .*Did you mean 'volume'"),
     ],
 )

@@ -231,7 +231,7 @@ RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str, str, str]]] = {
             lambda depth: depth["metric"] and depth["median"] < 1.0,
             "depth looks like metres",
             "median {median:.4g} mm; renderers clip at a near plane of 0.2 mm",
-            "State the unit of the files: --set datamanager.unit=m, or unit.txt with m",
+            "State the unit of the files: `datamanager.unit=m`, or unit.txt with m",
         ),
         (
             lambda depth: depth["metric"] and depth["median"] > 1000.0,
@@ -421,7 +421,7 @@ def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
             "poses may be right or wrong",
             f"{given.count} matches lie {given.error:.2g} px from their epipolar lines, but the camera moves them by "
             f"{given.parallax:.2g} px only (median), beside its rotation",
-            "Look at frames further apart, --set datamanager.frame_step=N, or at a part of the video with more motion",
+            "Look at frames further apart, `datamanager.frame_step=N`, or at a part of the video with more motion",
         )
 
 

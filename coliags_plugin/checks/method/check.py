@@ -171,7 +171,7 @@ def every_term_counts(context: CheckContext) -> str:
     first, losses = _first_steps(context), context.trainer.losses
     written_for = context.loaded.config.schedule.written_for
     idle = [
-        f"'{key}' (after step {losses[key].settings.from_step} of {written_for}); see from_step, or check more --steps"
+        f"'{key}' (after step {losses[key].settings.from_step} of {written_for}); see from_step, or check more `steps`"
         for key, step in first.items()
         if step is None
     ]
@@ -220,7 +220,7 @@ def gradients_arrive(context: CheckContext) -> str:
     if idle and None not in _first_steps(context).values():
         raise CheckFailedError(
             f"no gradient but 0 in {context.steps} steps: {', '.join(idle)}; nothing that the losses see depends on "
-            "it, or its part is detached or begins later (then check more --steps)"
+            "it, or its part is detached or begins later (then check more `steps`)"
         )
     remarks = [f"{', '.join(names)} {what}" for names, what in ((frozen, "frozen"), (idle, "not yet active")) if names]
     return "; ".join([f"{len(adams) - len(without)} of {len(adams)} groups", *remarks])
@@ -642,9 +642,9 @@ def check_method(
     """
     method_tree(method, overrides)
     if steps < MIN_STEPS:
-        raise InputError(f"--steps {steps}", f"{MIN_STEPS} or more")
+        raise InputError(f"`steps={steps}`", f"{MIN_STEPS} or more")
     if data is not None and not data.exists():
-        raise InputError(f"no folder {data}", "a scene", "Check the path, or leave --data out")
+        raise InputError(f"no folder {data}", "a scene", "Check the path, or leave `data` out")
     scene = data or write_phantom(method, overrides, folder)
     context = CheckContext(method, tuple(overrides), scene, data_format, steps, folder)
     passed: set[str] = set()

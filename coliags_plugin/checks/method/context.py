@@ -192,7 +192,7 @@ def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
     layout = named if named in registry.phantom_layouts else _layout_for_losses(method, overrides)
     reads_others = named in registry.datamanagers and registry.datamanagers.source(named) == "built in"
     if reads_others and named not in ("auto", layout):
-        raise InputError(f"no phantom is made for the data manager '{named}'", do="Name a scene with --data")
+        raise InputError(f"no phantom is made for the data manager '{named}'", do="Name a scene with `data`")
     return shutil.copytree(_phantom(layout).name, folder / "phantom", dirs_exist_ok=True)
 
 

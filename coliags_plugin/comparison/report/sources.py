@@ -115,7 +115,7 @@ def _read_comparison(
         raise InputError(
             f"{folder} has results of protocol {', '.join(sorted(protocols))} only",
             f"some of '{protocol}'",
-            f"Pass --protocol {min(protocols)}",
+            f"Pass `protocol={min(protocols)}`",
         )
     return found, missing
 

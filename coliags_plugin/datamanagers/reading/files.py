@@ -171,7 +171,7 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
         raise InputError(
             f"{said} names {name[:200]}, which is outside of {folder}",
             "files in the scene's own folder",
-            "If you trust it: --set datamanager.outside_files=true",
+            "If you trust it: `datamanager.outside_files=true`",
         )
     try:
         path.lstat()

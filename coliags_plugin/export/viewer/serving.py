@@ -67,12 +67,12 @@ def stop_server(server: Any) -> None:
 
 def _check_address(host: str, port: int) -> None:
     if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}", "a number from 0 (any free port) to 65535")
+        raise InputError(f"`port={port}`", "a number from 0 (any free port) to 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise InputError(
-            f"--host {host}: {error.strerror or error}", "a name or address of this machine, for instance 127.0.0.1"
+            f"`host={host}`: {error.strerror or error}", "a name or address of this machine, for instance 127.0.0.1"
         ) from error
     with socket.socket(family, kind, protocol) as probe:
         # As the server does: a port whose last connections are being closed is free.
@@ -81,16 +81,16 @@ def _check_address(host: str, port: int) -> None:
             probe.bind(address)
             probe.listen(1)
         except PermissionError as error:
-            raise InputError(f"--port {port}: {error.strerror}", "a port above 1023") from error
+            raise InputError(f"`port={port}`: {error.strerror}", "a port above 1023") from error
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise _taken(host, port) from error
             raise InputError(
-                f"--host {host}: {error.strerror}", "a name or address of this machine, for instance 127.0.0.1"
+                f"`host={host}`: {error.strerror}", "a name or address of this machine, for instance 127.0.0.1"
             ) from error
 
 
 def _taken(host: str, port: int) -> InputError:
     return InputError(
-        f"--port {port} is in use on {host}", "a free port", f"Pass another, for instance --port {port + 1}"
+        f"`port={port}` is in use on {host}", "a free port", f"Pass another, for instance `port={port + 1}`"
     )

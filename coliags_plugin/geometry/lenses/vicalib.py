@@ -78,7 +78,7 @@ def _read_model(path: Path, model: ElementTree.Element) -> Calibration:
         raise InputError(
             f"{path}: the camera model {model.get('type')!r}",
             TYPE,
-            "Give another lens by --camera and --params (docs/poses.md 9.1)",
+            "Give another lens by `camera` and `params` (docs/poses.md 9.1)",
         )
     size = [_numbers(path, model, tag, 1)[0] for tag in ("width", "height")]
     if not all(number == int(number) and 0 < number <= bounds.IMAGE_SIDE for number in size):

@@ -69,7 +69,7 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
     raise InputError(
         f"frames cannot be matched ({'; '.join(tried)})",
         f"at least {FEWEST_MATCHES} matching frames",
-        "The counts are those of EndoGSLAM's training frames: pass --match endogslam-train"
+        "The counts are those of EndoGSLAM's training frames: pass `match=endogslam-train`"
         if fits_training
         else "Give trajectories of the same frames, or formats that keep names or timestamps",
     )
@@ -218,7 +218,7 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
             raise InputError(
                 "a scale cannot be estimated: the camera of one trajectory does not move",
                 "two cameras that move",
-                "Align without --scale",
+                "Align without `scale`",
             )
         scale = float((values * (1.0, 1.0, sign)).sum() / (centered**2).sum(axis=1).mean())
     spread = float(np.sqrt(max(values[1] + sign * values[2], 0.0) / values[0])) if axis.any() else 0.0
@@ -395,7 +395,7 @@ def align(
         raise InputError(
             f"a relative error over {delta} frames, and {len(matches)} matched frames",
             f"1 to {len(matches) - 1} frames",
-            "Choose --delta accordingly",
+            "Choose `delta` accordingly",
         )
     estimated, true = estimate.camera_to_world[matches.first], reference.camera_to_world[matches.second]
     transform = umeyama(estimated[:, :3, 3], true[:, :3, 3], with_scale)

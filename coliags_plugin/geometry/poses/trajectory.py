@@ -85,7 +85,7 @@ class Trajectory:
                 f"no intrinsics for {path}"
                 + ("" if self.cameras is None else ", but cameras that are not one pinhole"),
                 f"{holder} to hold the camera's intrinsics and image size",
-                "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
+                "Pass `intrinsics=fx,fy,cx,cy` and `size=WIDTHxHEIGHT`",
             )
         return self.intrinsics
 

@@ -53,7 +53,7 @@ class DepthRange:
 def given_range(near: float, far: float, count: int) -> DepthRange:
     """The range that a user states; frames' medians are its geometric mean."""
     if not 0.0 < near < far:
-        raise InputError(f"--near {near:g} --far {far:g}", "0 < near < far")
+        raise InputError(f"`near={near:g}` and `far={far:g}`", "0 < near < far")
     return DepthRange(near, far, (float(np.sqrt(near * far)),) * count)
 
 
@@ -150,7 +150,7 @@ def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> D
         raise InputError(
             f"the depth range is unknown: {len(every)} {what}",
             f"at least {_FEWEST}: sharp, overlapping frames of a camera that moves, with correct poses",
-            "Check the poses (coliags data check), use frames farther apart, or give --near and --far",
+            "Check the poses (coliags data check), use frames farther apart, or give `near` and `far`",
         )
     near, far = (factor * float(np.percentile(every, part)) for part, factor in (_NEAREST, _FARTHEST))
     measured = [index for index, depths in enumerate(depths_by_frame) if len(depths) >= _FEWEST_OF_FRAME]

@@ -231,7 +231,7 @@ def check_video(frames: Sequence[Frame], sources: Sequence[int]) -> None:
         raise InputError(
             f"images of {sizes_text(sizes)} pixels",
             "images of one size",
-            f"--set datamanager.width={sizes[0][0]} --set datamanager.height={sizes[0][1]} makes them so, or estimate "
+            f"`datamanager.width={sizes[0][0]}` and `datamanager.height={sizes[0][1]}` make them so, or estimate "
             "each camera's frames apart",
         )
 

@@ -98,12 +98,12 @@ class FilePrior:
     def of(cls, folder: Path, frames: Sequence[Frame]) -> FilePrior:
         """The prior of a folder with one map of each frame, named as the frame, of its aspect ratio."""
         if not folder.is_dir():
-            raise InputError(f"--prior {folder}: no such folder", "a folder of depth maps named as the images")
+            raise InputError(f"`prior={folder}`: no such folder", "a folder of depth maps named as the images")
         files = {path.stem: path for path in files_in(folder, _SUFFIXES)}
         missing = [frame.name for frame in frames if frame.name not in files]
         if missing:
             raise InputError(
-                f"--prior {folder}: {len(missing)} of {len(frames)} frames have no depth map: {first_few(missing)}",
+                f"`prior={folder}`: {len(missing)} of {len(frames)} frames have no depth map: {first_few(missing)}",
                 f"NAME{', NAME'.join(_SUFFIXES)} for every frame",
                 "Name the maps as the images",
             )

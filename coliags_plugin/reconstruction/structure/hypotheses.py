@@ -133,8 +133,8 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
         raise InputError(
             f"implausible focal lengths ({'; '.join(one.described() for one in hypotheses)})",
             f"a nominal field of view of {plausible[0]:g} to {plausible[1]:g} degrees",
-            "Give the camera's calibration (--camera and --params, or a known --camera), fix the focal length at a "
-            "multiple of the larger side (--set camera.refine=false --set camera.focal_factors=[0.6]), or state the "
+            "Give the camera's calibration (`camera` and `params`, or a known `camera`), fix the focal length at a "
+            "multiple of the larger side (`camera.refine=false` and `camera.focal_factors=[0.6]`), or state the "
             "range (--set camera.field_of_view=[20, 150])",
         )
     return best(left)
@@ -228,7 +228,7 @@ def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | 
     if is_ambiguous(hypotheses, chosen, plausible):
         log.warning(
             "the images hardly determine the focal length, and a wrong one distorts path and surface: give the "
-            "camera's calibration (--camera, --params) if there is one"
+            "camera's calibration (`camera`, `params`) if there is one"
         )
     camera = next(iter(chosen.model.cameras.values()))
     return Start(chosen.camera_model, float(camera.mean_focal_length() / max(camera.width, camera.height)))
@@ -305,7 +305,7 @@ def find_tracked_camera(
     if most > _OTHER_FOCAL_LENGTH * least:
         log.warning(
             "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
-            "and surface: give the camera's calibration (--camera, --params) if there is one",
+            "and surface: give the camera's calibration (`camera`, `params`) if there is one",
             *(least, most),
         )
     return left[0]

@@ -453,7 +453,7 @@ def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
     beside = distances_beside(reconstruction.camera_to_world[:, :3, 3], points)
     if len(beside) < _FEWEST_BESIDE:
         raise InputError(
-            f"--diameter {diameter:g}, and {len(beside)} of {len(points)} points lie beside the camera's path",
+            f"`diameter={diameter:g}`, and {len(beside)} of {len(points)} points lie beside the camera's path",
             f"at least {_FEWEST_BESIDE}",
             "Take a longer part of the video, or give the distance of two cameras (--distance), or neither",
         )
@@ -467,11 +467,11 @@ def from_distance(reconstruction: Reconstruction, first: str, second: str, dista
         rows[reconstruction.images[index].stem] = rows[reconstruction.images[index].name] = row
     for name in (first, second):
         if name not in rows:
-            raise InputError(f"--distance: no image '{name}' with a pose", "two of the registered images, by name")
+            raise InputError(f"`distance`: no image '{name}' with a pose", "two of the registered images, by name")
     centers = reconstruction.camera_to_world[[rows[first], rows[second]], :3, 3]
     units = float(np.linalg.norm(centers[1] - centers[0]))
     if not units > 0.0:
-        raise InputError(f"--distance: the cameras of {first} and {second} coincide", "two positions")
+        raise InputError(f"`distance`: the cameras of {first} and {second} coincide", "two positions")
     return distance / units
 
 

@@ -222,8 +222,8 @@ def camera_of_lens(whole: Lens, said: str, width: int, height: int) -> tuple[str
         raise InputError(
             f"{said}, and images of {width} x {height}",
             f"the whole frame, {whole.width} x {whole.height} or scaled from it",
-            "For cropped images, subtract the crop's corner from the principal point and pass --camera OPENCV_FISHEYE "
-            "and --params",
+            "For cropped images, subtract the crop's corner from the principal point and pass `camera=OPENCV_FISHEYE` "
+            "and `params`",
         )
     lens = whole.resized(width, height)
     k = lens.pinhole
@@ -243,12 +243,12 @@ def starting_cameras(
     if start.model not in known | set(CALIBRATED):
         raise InputError(f"camera model {start.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(known))}")
     if start.model in CALIBRATED and settings.params is not None:
-        raise InputError(f"--params, and --camera {start.model}", "--params with a model of COLMAP", "Drop --params")
+        raise InputError(f"`params`, and `camera={start.model}`", "`params` with a model of COLMAP", "Drop `params`")
     cameras = []
     for width, height in dict.fromkeys(sizes):
         model, params = start.model, settings.params
         if model in CALIBRATED:
-            model, params = camera_of_lens(LENSES[CALIBRATED[model]], f"--camera {model}", width, height)
+            model, params = camera_of_lens(LENSES[CALIBRATED[model]], f"`camera={model}`", width, height)
         focal_length = start.focal_factor * max(width, height)
         camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, width, height)
         if start.radial is not None:

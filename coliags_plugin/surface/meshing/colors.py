@@ -68,7 +68,7 @@ def best_texture(
         raise InputError(
             f"{broken} edges of the mesh have more than two triangles",
             "a surface",
-            "Try another --voxel, or no texture",
+            "Try another `voxel`, or no texture",
         )
     parts = 1 + len(mesh) // _AT_ONCE
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):

@@ -169,7 +169,7 @@ def _same_world(scene: Scene, truth: Path) -> Scene:
         raise InputError(
             f"scene '{scene.name}' is of unknown scale, {truth} in mm",
             "the folder of a scene with the same poses, and with a true surface",
-            "Pass --truth SCENE, or give the scene its scale first (docs/poses.md)",
+            "Pass `truth=SCENE`, or give the scene its scale first (docs/poses.md)",
         )
     return match_truth(scene, open_scene(truth)).scene
 

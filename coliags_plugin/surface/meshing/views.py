@@ -56,7 +56,7 @@ def voxel_size_of(settings: MeshSettings, scene: Scene) -> float:
         return settings.voxel_size
     if not len(scene.points):
         raise InputError(
-            f"scene '{scene.name}' has no points to choose the size of the voxels by", "--voxel SIZE, in scene units"
+            f"scene '{scene.name}' has no points to choose the size of the voxels by", "`voxel=SIZE`, in scene units"
         )
     return settings.voxel_pixels * scene.pixel_footprint
 

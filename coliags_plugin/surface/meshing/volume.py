@@ -52,7 +52,7 @@ class Volume:
             raise InputError(
                 f"voxels of {voxel_size:.3g} scene units need more than {_MAX_BLOCKS:,} blocks of {_BLOCK}^3 voxels",
                 "larger voxels",
-                f"Try --voxel {2 * voxel_size:.2g}",
+                f"Try `voxel={2 * voxel_size:.2g}`",
             )
         self._blocks = np.stack(np.unravel_index(found, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE
         size = len(found) * _VOXELS

@@ -60,13 +60,13 @@ def test_a_small_page_has_the_most_visible_gaussians(anchors):
     ("text", "size"), [("20MB", 20_000_000), ("1.5 mb", 1_500_000), ("800kB", 800_000), ("5000", 5000), ("7b", 7)]
 )
 def test_sizes(text, size):
-    assert bytes_of(text, "--size") == size
+    assert bytes_of(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "MB", "-5MB", "5 MiB", "five"])
 def test_what_is_no_size(text):
     with pytest.raises(InputError, match="a size in bytes, kB, MB or GB"):
-        bytes_of(text, "--size")
+        bytes_of(text)
 
 
 def test_what_cannot_be_saved(anchors, tmp_path, capsys):

@@ -262,7 +262,7 @@ def test_a_port_in_use_is_one_clear_error(anchors, wall, tmp_path, capsys):
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        message = f"--port {port} is in use.*--port {port + 1}"
+        message = f"`port={port}` is in use.*`port={port + 1}`"
         with pytest.raises(InputError, match=message):
             anchors.view(port=port)
         assert f"--port {port} is in use" in refused(capsys, "view", anchors.path, "--port", port, "--no-open")
@@ -272,7 +272,7 @@ def test_a_port_in_use_is_one_clear_error(anchors, wall, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("host", "port", "message"), [("127.0.0.1", 70000, "--port 70000"), ("no.such.host.invalid", 0, "--host")]
+    ("host", "port", "message"), [("127.0.0.1", 70000, "`port=70000`"), ("no.such.host.invalid", 0, "`host=")]
 )
 def test_addresses_that_are_not_possible(anchors, host, port, message):
     with pytest.raises(InputError, match=message):

@@ -325,7 +325,7 @@ def test_endogslams_training_frames():
 @pytest.mark.parametrize(
     ("first", "second", "how", "message"),
     [
-        (winding(18), winding(20), (), r"18 and 20 poses.*pass --match endogslam-train"),
+        (winding(18), winding(20), (), r"18 and 20 poses.*pass `match=endogslam-train`"),
         (winding(17), winding(20), ("endogslam-train",), "17 poses are not the training frames of 20"),
         (named("abc"), named("wxyz"), (), r"by name: no name in common; by index: 3 and 4 poses"),
         (named("abc"), winding(3), ("name",), "by name: not both have names"),

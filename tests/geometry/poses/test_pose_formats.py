@@ -116,7 +116,7 @@ TWICE = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
     [
         ("endogslam-truth", winding(), "format 'endogslam-truth' is read-only"),
         *(
-            (name, winding(), r"no intrinsics.*--intrinsics fx,fy,cx,cy --size")
+            (name, winding(), r"no intrinsics.*`intrinsics=fx,fy,cx,cy` and `size=")
             for name in ("colmap", "colmap-text", "endogslam")
         ),
         *((name, TWICE, r"'a\.png' is repeated \(poses 0 and 2\)") for name in ("colmap", "colmap-text", "nerfstudio")),

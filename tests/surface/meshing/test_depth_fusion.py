@@ -185,7 +185,7 @@ def test_defaults_follow_the_scene():
     assert max_depth_of(settings, scene) == pytest.approx(WALL - 0.5, abs=1e-4)
     empty = replace(scene, points=PointCloud(torch.zeros(0, 3)))
     assert max_depth_of(settings, empty) == float("inf")
-    with pytest.raises(InputError, match="--voxel"):
+    with pytest.raises(InputError, match="`voxel`"):
         voxel_size_of(settings, empty)
 
 

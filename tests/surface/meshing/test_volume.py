@@ -100,7 +100,7 @@ def test_places_on_which_views_disagree_are_left_out():
 
 def test_voxels_too_small_for_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr("coliags_plugin.surface.meshing.volume._MAX_BLOCKS", 1000)
-    with pytest.raises(InputError, match=r"larger voxels\. Try --voxel 0.2"):
+    with pytest.raises(InputError, match=r"larger voxels\. Try `voxel=0.2"):
         Volume([view_of(turned(0.0), torch.full((90, 120), 20.0))], 0.1, 4.0)
 
 
