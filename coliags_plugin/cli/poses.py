@@ -244,7 +244,7 @@ class PosesAlignCommand:
 
     def run(self) -> None:
         """Align, and print a table of the errors."""
-        from coliags_plugin.geometry.poses.alignment import align, associate, better_reading
+        from coliags_plugin.geometry.poses.alignment import align, associate
 
         _, estimate = read_and_log(self.estimate, self.estimate_format)
         kind, reference = read_and_log(self.reference, self.reference_format)
@@ -259,11 +259,6 @@ class PosesAlignCommand:
         )
         if result.ate_share is not None:
             text += f"\nATE rmse: {100.0 * result.ate_share:.3g} % of the path, {result.path_length:.4g} {unit}"
-        if better := better_reading(estimate, reference, result):
-            _LOG.warning("the rotation error is %.3g deg; if %s", result.rotation_deg.rmse, better)
-        worlds = result.world_rotation
-        if worlds.reason:
-            _LOG.warning("%s: for the rotation error, the rotation is that by %s", worlds.reason, worlds.by)
         print_summary(text, result.to_json(unit), as_json=self.json)
 
 
@@ -288,7 +283,6 @@ def _table(result: Alignment, unit: str) -> str:
         [name, kind, *vars(spread).values()]
         for name, kind, spread in (
             ("ATE", unit, result.ate),
-            ("rotation", "deg", result.rotation_deg),
             (f"RPE over {step}", unit, result.rpe_translation),
             (f"RPE over {step}", "deg", result.rpe_rotation_deg),
         )

@@ -143,22 +143,6 @@ def test_align_prints_errors(estimate, truth, capsys):
     assert without_scale["ate"]["rmse"] > told["ate"]["rmse"]
 
 
-def test_align_warns_where_positions_determine_no_rotation(tmp_path, capsys, caplog):
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 2, 3] = np.arange(5.0)
-    write_trajectory(tmp_path / "line", Trajectory(poses), "c3vd")
-    turned = poses.copy()
-    turned[:, :3, :3] = Rotation.from_euler("z", 178, degrees=True).as_matrix()
-    write_trajectory(tmp_path / "turned", Trajectory(turned), "c3vd")
-    argv = ("poses", "align", tmp_path / "turned", tmp_path / "line")
-    assert run(*argv) == 0
-    assert "the positions lie on a line" in caplog.text
-    assert "the rotation is that by orientations about the path" in caplog.text
-    assert "ATE rmse: 0 % of the path, 4 mm" in capsys.readouterr().out
-    assert run(*argv, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["rotation_deg"]["max"] < 1e-9
-
-
 @pytest.mark.parametrize(
     ("argv", "message"),
     [

@@ -17,10 +17,11 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
 from coliags_plugin.reconstruction.structure.matching import (
     alike_pairs,
+    epipolar_inliers,
     epipolar_matches,
     mutual_matches,
 )
-from coliags_plugin.reconstruction.structure.point_tracks import epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.point_tracks import shared_tracks, track_between, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
 from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, cut_where_lost
@@ -191,13 +192,16 @@ def write_video(folder, images):
 
 def moved(frames, first, second):
     """Displacements of the points that two frames have in common."""
-    one, other = frames[first], frames[second]
-    _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
-    return other.pixels[b] - one.pixels[a]
+    rows = shared_tracks(frames[first], frames[second])
+    return frames[second].pixels[rows[:, 1]] - frames[first].pixels[rows[:, 0]]
 
 
 def test_points_move_as_the_image_does(tmp_path):
-    frames = track_points(write_video(tmp_path / "video", [wall(k * SHIFT) for k in range(COUNT)]), FEW)
+    images = [wall(k * SHIFT) for k in range(COUNT)]
+    frames = track_points(write_video(tmp_path / "video", images), FEW)
+    first, last = track_between(images, [None] * COUNT, FEW)
+    assert len(first) > 60
+    np.testing.assert_allclose(last - first, moved(frames, 0, COUNT - 1)[: len(first)], atol=1e-4)
     assert [frame.followed > 80 for frame in frames] == [False] + [True] * (COUNT - 1)
     shifts = moved(frames, 0, COUNT - 1)
     assert len(shifts) > 60

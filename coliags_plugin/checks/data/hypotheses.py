@@ -16,8 +16,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.poses.rigid import w_first
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
 from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
-from coliags_plugin.reconstruction.structure.point_tracks import PointTracker
-from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
+from coliags_plugin.reconstruction.structure.point_tracks import track_between
 
 Change = Callable[[Float[Tensor, "4 4"]], Float[Tensor, "4 4"]]
 
@@ -272,14 +271,8 @@ def follow(stretches: Sequence[Sequence[Frame]], progress: Progress | None = Non
     for stretch in with_progress(stretches, "follow points", progress):
         if len({frame.image.shape for frame in stretch}) > 1:
             continue
-        # Bridges would find points again after a gap, of which most are not needed.
-        tracker = PointTracker(TrackSettings(bridge_below=0))
-        points = [tracker.advance(frame.image.numpy(), frame.valid.numpy()) for frame in stretch]
-        _, here, there = np.intersect1d(points[0].ids, points[-1].ids, assume_unique=True, return_indices=True)
-        pixels, pixels_there = (
-            of.pixels[rows].astype(np.float64) for of, rows in ((points[0], here), (points[-1], there))
-        )
-        matches += _explained(stretch[0], stretch[-1], pixels, pixels_there)
+        images, masks = [frame.image.numpy() for frame in stretch], [frame.valid.numpy() for frame in stretch]
+        matches += _explained(stretch[0], stretch[-1], *track_between(images, masks))
     return matches
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 from coliags_plugin.reconstruction.structure.mapping import solve_bundle
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, shared_tracks
 
 if TYPE_CHECKING:
     import pycolmap
@@ -274,9 +274,7 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
         pairs = [(first, first + apart) for first in frames if first + apart in directions]
         values = []
         for first, second in pairs[:: 1 + len(pairs) // _MOST_PAIRS]:
-            _, one, other = np.intersect1d(
-                tracks[first].ids, tracks[second].ids, assume_unique=True, return_indices=True
-            )
+            one, other = shared_tracks(tracks[first], tracks[second]).T
             value = _residual(directions[first][one], directions[second][other])
             values += [] if value is None else [value]
         if len(values) >= _FEWEST_PAIRS:

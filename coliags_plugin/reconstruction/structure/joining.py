@@ -102,7 +102,7 @@ def join_models(
         one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
         if one is not other and (sightings := compare.agreeing(one, earlier, other, later)):
             again = _again(sightings, later[0])
-            apart[earlier[-1]] = replace(again, similarity=_rows(sightings[0].similarity))
+            apart[earlier[-1]] = replace(again, similarity=tuple(map(tuple, sightings[0].similarity.matrix.tolist())))
     return video, parts, apart
 
 
@@ -266,12 +266,6 @@ def _again(sightings: Sequence[_Sighting], before: int) -> Again:
     return Again(before, len(sightings), round(float(scales.std()), 4))
 
 
-def _rows(similarity: Similarity) -> tuple[tuple[float, ...], ...]:
-    """The similarity as a matrix of three rows and four columns."""
-    matrix = np.column_stack([similarity.scale * similarity.rotation, similarity.translation])
-    return tuple(tuple(row) for row in matrix.tolist())
-
-
 def _with_sightings(video: MatchedVideo, sightings: Sequence[_Sighting]) -> MatchedVideo:
     """The video with the points that were found again among those of its frames."""
     keypoints, brightness, track_ids = list(video.keypoints), list(video.brightness), list(video.track_ids)
@@ -293,7 +287,7 @@ def _joined(
     """Both models as one, in the frame of the larger; None if it is not as good as they are."""
     import pycolmap
 
-    change = pycolmap.Sim3d(np.array(_rows(sightings[0].similarity)))
+    change = pycolmap.Sim3d(sightings[0].similarity.matrix)
     larger, smaller = one, other
     if len(one.frames) < len(other.frames):
         larger, smaller, change = other, one, change.inverse()

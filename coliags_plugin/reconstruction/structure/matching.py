@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt32
+from jaxtyping import Bool, Float, Float32, Int, UInt32
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
@@ -190,6 +190,42 @@ def _passes_ratio_test(best: np.ndarray, next_best: np.ndarray, max_ratio: float
     """Whether matches with these dot products pass the distance limit and Lowe's ratio test."""
     distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in (best, next_best))
     return np.asarray((distance < max_distance) & (distance < max_ratio * second_best))
+
+
+#: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring
+#: frames its error hardly matters.
+_TYPICAL_FOCAL_FACTOR = 0.6
+#: Fewest matches for an epipolar geometry.
+_FEWEST_MATCHES = 20
+
+
+def epipolar_inliers(
+    first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"], shape: tuple[int, ...], max_error: float
+) -> Bool[np.ndarray, "K"]:
+    """Matches that satisfy one essential matrix of a typical endoscope; none where there are fewer than 20. [K]
+
+    Args:
+        first: Column and row, pixel centres at integers.
+        second: The same points in the other image.
+        shape: Height and width of both images.
+        max_error: RANSAC inlier threshold, pixels.
+    """
+    import pycolmap
+
+    inliers = np.zeros(len(first), bool)
+    if len(first) < _FEWEST_MATCHES:
+        return inliers
+    height, width = shape[:2]
+    camera = pycolmap.Camera.create_from_model_name(
+        0, "SIMPLE_RADIAL_FISHEYE", _TYPICAL_FOCAL_FACTOR * max(width, height), width, height
+    )
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = max_error, 0
+    matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
+    one, other = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(camera, one, camera, other, matches, options)
+    inliers[np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
+    return inliers
 
 
 #: Features of an image that are compared first, those of the largest scale.

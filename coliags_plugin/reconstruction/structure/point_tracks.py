@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
+from coliags_plugin.reconstruction.structure.matching import epipolar_inliers
 from coliags_plugin.reconstruction.structure.sfm_settings import TrackSettings
 from coliags_plugin.reconstruction.structure.texture import correlation_at, fineness, sharpness, wall_textures
 
@@ -52,6 +53,31 @@ class FramePoints:
             pixels=np.concatenate([self.pixels, other.pixels]),
             brightness=np.concatenate([self.brightness, other.brightness]),
         )
+
+
+def shared_tracks(first: FramePoints, second: FramePoints) -> Int64[np.ndarray, "M 2"]:
+    """Rows of the points that two frames have in common, in the order of their tracks."""
+    _, *rows = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    return np.stack(rows, axis=1)
+
+
+def track_between(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]],
+    masks: Sequence[Bool[np.ndarray, "H W"] | None],
+    settings: TrackSettings | None = None,
+) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]:
+    """Pixels, in the first and in the last of consecutive RGB images of one size, of points followed through all.
+
+    Masks are False where a pixel is ignored; pixel centres are at integers + 0.5. Points that are lost on the way are
+    not searched for again.
+    """
+    tracker = PointTracker((settings or TrackSettings()).model_copy(update={"bridge_below": 0}))
+    frames = [tracker.advance(image, mask) for image, mask in zip(images, masks, strict=True)]
+    rows = shared_tracks(frames[0], frames[-1]).T
+    first, last = (
+        frame.pixels[row].astype(np.float64) for frame, row in zip((frames[0], frames[-1]), rows, strict=True)
+    )
+    return first, last
 
 
 def track_points(
@@ -304,39 +330,7 @@ _MAX_RETURN, _MIN_CORRELATION, _CLEAR = 0.7, 0.6, 0.8
 _MAX_ERROR = 2.5
 #: Number of frames in which lost points are searched for.
 _LONGEST_BRIDGE = 4
-#: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring
-#: frames its error hardly matters.
-_TYPICAL_FOCAL_FACTOR = 0.6
 #: Least share of the points found again that satisfy one epipolar geometry.
 _LEAST_SHARE = 0.5
-#: Fewest matches for an epipolar geometry, and of points that are followed.
+#: Fewest points that are followed.
 _FEWEST = 20
-
-
-def epipolar_inliers(
-    first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"], shape: tuple[int, ...], max_error: float
-) -> Bool[np.ndarray, "K"]:
-    """Matches that satisfy one essential matrix of a typical endoscope; none where there are fewer than 20. [K]
-
-    Args:
-        first: Column and row, pixel centres at integers.
-        second: The same points in the other image.
-        shape: Height and width of both images.
-        max_error: RANSAC inlier threshold, pixels.
-    """
-    import pycolmap
-
-    inliers = np.zeros(len(first), bool)
-    if len(first) < _FEWEST:
-        return inliers
-    height, width = shape[:2]
-    camera = pycolmap.Camera.create_from_model_name(
-        0, "SIMPLE_RADIAL_FISHEYE", _TYPICAL_FOCAL_FACTOR * max(width, height), width, height
-    )
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error, options.ransac.random_seed = max_error, 0
-    matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
-    one, other = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
-    geometry = pycolmap.estimate_calibrated_two_view_geometry(camera, one, camera, other, matches, options)
-    inliers[np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
-    return inliers

@@ -22,8 +22,8 @@ from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
-from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
-from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, epipolar_inliers, track_points
+from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, epipolar_inliers, mutual_matches
+from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
     SfmSettings,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,16 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.alignment import (
-    FrameMatches,
-    Similarity,
-    align,
-    associate,
-    better_reading,
-    umeyama,
-    world_rotation,
-)
-from coliags_plugin.geometry.poses.rigid import w_first
+from coliags_plugin.geometry.poses.alignment import FrameMatches, align, associate, umeyama
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.geometry.poses.winding import some_transform, trajectories, winding
 
@@ -57,9 +47,8 @@ def test_a_known_motion_is_recovered(trajectory, seed, scale, with_scale):
     found = umeyama(trajectory.centers, target, with_scale)
     size = max(1.0, float(np.abs(target).max()))
     np.testing.assert_allclose(found.points(trajectory.centers), target, rtol=0, atol=1e-9 * size)
-    if not found.undetermined:
-        assert found.scale == pytest.approx(scale, rel=1e-7)
-        np.testing.assert_allclose(found.rotation, transform[:3, :3], atol=1e-6)
+    assert found.scale == pytest.approx(scale, rel=1e-7)
+    np.testing.assert_allclose(found.rotation, transform[:3, :3], atol=1e-6)
 
 
 @given(seed=SEEDS, count=st.integers(4, 20))
@@ -73,112 +62,25 @@ def test_rotation_is_scipys(seed, count):
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
 
 
-def line(count=10, direction=(1.0, 2.0, -0.5), off_line=0.0):
-    poses = winding(count, 4).camera_to_world.copy()
-    rng = np.random.default_rng(1)
-    along = np.linspace(0.0, 30.0, count)[:, None] * np.array(direction) / np.linalg.norm(direction)
-    poses[:, :3, 3] = along + off_line * rng.normal(size=(count, 3))
-    return Trajectory(poses)
-
-
-@pytest.mark.parametrize("with_scale", [False, True])
-@pytest.mark.parametrize("off_line", [0.0, 0.1])
-def test_on_a_nearly_straight_path_orientations_determine_the_rotation_about_it(with_scale, off_line):
-    reference = line(off_line=off_line)
-    transform = some_transform(3)
-    result = aligned(moved(reference, transform, 2.5 if with_scale else 1.0), reference, with_scale=with_scale)
-    assert result.world_rotation.by == "orientations about the path"
-    assert ("lie on a line" if off_line < 0.1 else "nearly straight") in result.world_rotation.reason
-    assert result.ate.max < 1e-10
-    assert result.rotation_deg.max < 1e-4
-    np.testing.assert_allclose(result.world_rotation.rotation, transform[:3, :3].T, atol=1e-6)
-    assert result.transform.scale == pytest.approx(0.4 if with_scale else 1.0)
-    assert json.loads(json.dumps(result.to_json("mm")))["world_rotation"]["by"] == "orientations about the path"
-
-
-def test_errors_of_positions_do_not_turn_a_nearly_straight_path():
-    """Positions alone give tens of degrees about the path, orientations agree exactly."""
-    reference = line(20, off_line=0.05)
-    poses = reference.camera_to_world.copy()
-    poses[:, :3, 3] += np.random.default_rng(3).normal(0.0, 0.1, (20, 3))
-    result = aligned(moved(Trajectory(poses), some_transform(4)), reference)
-    turned = result.transform.rotation @ some_transform(4)[:3, :3]
-    assert np.rad2deg(Rotation.from_matrix(turned).magnitude()) > 10.0
-    assert result.rotation_deg.rmse < 0.5
-    # The ATE is the usual one, by positions alone.
-    centers = moved(Trajectory(poses), some_transform(4)).centers
-    off = umeyama(centers, reference.centers).points(centers) - reference.centers
-    np.testing.assert_allclose(result.position_errors, np.linalg.norm(off, axis=1))
-
-
-@given(seed=SEEDS)
-@settings(max_examples=20, deadline=None)
-def test_the_rotation_about_the_path_is_that_of_least_chordal_distance(seed):
-    rng = np.random.default_rng(seed)
-    axis = some_transform(seed)[:3, 0]
-    estimated, true = Rotation.random(2 * 7, rng=rng).as_matrix().reshape(2, 7, 3, 3)
-    transform = Similarity(1.0, some_transform(seed + 1)[:3, :3], np.zeros(3), "", axis, 0.01)
-
-    def distance(angle):
-        about = Rotation.from_rotvec(angle * axis).as_matrix() @ transform.rotation
-        return ((about @ estimated - true) ** 2).sum()
-
-    found = world_rotation(estimated, true, transform).rotation
-    assert ((found @ estimated - true) ** 2).sum() <= min(map(distance, np.linspace(0, 2 * np.pi, 400))) + 1e-9
-    np.testing.assert_allclose(found @ transform.rotation.T @ axis, axis, atol=1e-12)
-
-
-@given(seed=SEEDS)
-@settings(max_examples=20, deadline=None)
-def test_without_a_path_the_rotation_is_scipys_mean_of_the_relative_ones(seed):
-    reference = winding(6, seed)
-    poses = shaken(reference, seed, 0.0).camera_to_world
-    poses[:, :3, 3] = 0.0
-    result = aligned(Trajectory(poses), reference)
-    relative = reference.rotations @ poses[:, :3, :3].transpose(0, 2, 1)
-    assert result.world_rotation.by == "orientations"
-    np.testing.assert_allclose(
-        result.world_rotation.rotation, Rotation.from_matrix(relative).mean().as_matrix(), atol=1e-6
-    )
-    assert result.ate_share is not None
-
-
-@given(seed=SEEDS, angle=st.sampled_from([0.0, 1e-9, 1e-4, 1.0, 3.1, 3.14159, np.pi - 1e-9, np.pi]))
-@settings(max_examples=30, deadline=None)
-def test_the_smallest_rotation_at_any_angle(seed, angle):
-    axes = some_transform(seed)[:3, :3]
-    turned = Rotation.from_rotvec(angle * axes[:, 1]).as_matrix() @ axes[:, 0]
-    steps = np.linspace(-1.0, 1.0, 5)[:, None]
-    found = umeyama(steps * axes[:, 0], steps * turned)
-    np.testing.assert_allclose(found.points(steps * axes[:, 0]), steps * turned, atol=1e-12)
-    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
-    assert Rotation.from_matrix(found.rotation).magnitude() == pytest.approx(angle, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("off_line", "undetermined", "by"),
-    [
-        (0.001, True, "orientations about the path"),
-        (0.1, False, "orientations about the path"),
-        (3.0, False, "positions"),
-    ],
-)
-def test_how_far_off_a_line_is_enough(off_line, undetermined, by):
-    result = aligned(line(off_line=off_line), line(off_line=off_line))
-    assert bool(result.transform.undetermined) == undetermined
-    assert result.world_rotation.by == by
-    values = np.linalg.svd(line(off_line=off_line).centers - line(off_line=off_line).centers.mean(axis=0))[1]
-    assert result.transform.spread == pytest.approx(np.hypot(values[1], values[2]) / values[0], abs=1e-9)
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_a_straight_path_has_errors_too(scale):
+    """Any rotation about the line fits its positions."""
+    poses = winding(10, 4).camera_to_world.copy()
+    poses[:, :3, 3] = np.linspace(0.0, 30.0, 10)[:, None] * (0.4, 0.9, -0.2)
+    reference = Trajectory(poses)
+    result = aligned(moved(reference, some_transform(3), scale), reference, with_scale=scale != 1.0)
+    assert result.ate.max < 1e-10 and result.rpe_translation.max < 1e-10 and result.rpe_rotation_deg.max < 1e-5
+    assert result.transform.scale == pytest.approx(1.0 / scale)
+    assert np.linalg.det(result.transform.rotation) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("away", [0.0, 100.0])
-def test_a_camera_that_stays_in_place(away):
+def test_a_camera_that_stays_in_place_has_no_scale(away):
     poses = winding(6, 2).camera_to_world.copy()
     poses[:, :3, 3] = away
     still = Trajectory(poses)
-    result = aligned(still, winding(6))
-    assert "the camera does not move" in result.transform.undetermined
-    np.testing.assert_array_equal(result.transform.rotation, np.eye(3))
+    extent = winding(6).centers - winding(6).centers.mean(axis=0)
+    assert aligned(still, winding(6)).ate.rmse == pytest.approx(np.sqrt((extent**2).sum(axis=1).mean()))
     for pair in ((still, winding(6)), (winding(6), still), (still, still)):
         with pytest.raises(InputError, match="a scale cannot be estimated"):
             aligned(*pair, with_scale=True)
@@ -197,7 +99,6 @@ def test_a_moved_copy_has_no_error_whatever_the_order_of_its_frames(trajectory, 
     assert result.ate.max < 1e-8 * size
     assert result.rpe_translation.max < 1e-8 * size
     assert result.rpe_rotation_deg.max < 1e-5
-    assert result.rotation_deg.max < 1e-4
 
 
 @pytest.mark.parametrize("delta", [1, 3])
@@ -208,45 +109,20 @@ def test_errors_by_their_definitions(delta):
     result = aligned(estimate, reference, delta=delta)
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = result.transform.rotation, result.transform.translation
-    translations, angles, positions, turns = [], [], [], []
+    translations, angles, positions = [], [], []
     for index in range(12):
         true, found = reference.camera_to_world[index], estimate.camera_to_world[index]
         absolute = np.linalg.inv(true) @ transform @ found
         positions.append(np.linalg.norm(absolute[:3, 3]))
-        turns.append(np.rad2deg(np.arccos((np.trace(absolute[:3, :3]) - 1) / 2)))
         if index + delta < 12:
             after, found_after = reference.camera_to_world[index + delta], estimate.camera_to_world[index + delta]
             error = np.linalg.inv(np.linalg.inv(true) @ after) @ (np.linalg.inv(found) @ found_after)
             translations.append(np.linalg.norm(error[:3, 3]))
             angles.append(np.rad2deg(np.arccos((np.trace(error[:3, :3]) - 1) / 2)))
     np.testing.assert_allclose(result.position_errors, positions)
-    np.testing.assert_allclose(result.rotation_errors_deg, turns, rtol=1e-6)
     np.testing.assert_allclose(result.relative_translation_errors, translations)
     np.testing.assert_allclose(result.relative_rotation_errors_deg, angles, rtol=1e-6)
     assert result.ate.rmse == pytest.approx(np.sqrt(np.mean(np.square(positions))))
-
-
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("quaternions with w first", lambda poses: w_first(w_first(w_first(poses)))),
-        ("camera axes y up, z backward", lambda poses: poses @ np.diag([1.0, -1.0, -1.0, 1.0])),
-        ("world-to-camera", np.linalg.inv),
-    ],
-)
-@pytest.mark.parametrize("which", ["estimate", "reference"])
-def test_another_reading_that_explains_the_rotation_error_is_named(name, change, which):
-    true = winding(20)
-    pair = [moved(true, some_transform(1)), true]
-    assert better_reading(*pair, aligned(*pair)) == ""
-    index = ("estimate", "reference").index(which)
-    pair[index] = replace(pair[index], camera_to_world=change(pair[index].camera_to_world))
-    found = better_reading(*pair, aligned(*pair))
-    assert f"read as {name}, the rotation error is" in found
-    # The two cannot tell which of them is of other axes.
-    assert which in found or "axes" in name
-    random = [winding(20, seed) for seed in (1, 2)]
-    assert better_reading(*random, aligned(*random)) == ""
 
 
 @pytest.mark.parametrize("delta", [0, -1, 12, 100])
@@ -261,7 +137,6 @@ def test_figures_are_json():
     assert told["ate"]["rmse"] == result.ate.rmse
     assert told["alignment"] == "Sim(3)"
     assert told["frames"]["position_error"] == result.position_errors.tolist()
-    assert told["world_rotation"]["by"] == "positions"
     assert told["ate_share_of_path"] == pytest.approx(told["ate"]["rmse"] / winding().steps.sum())
 
 
