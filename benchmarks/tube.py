@@ -10,6 +10,7 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 
 RADIUS = 20.0
@@ -39,7 +40,7 @@ def tube_scene(points: int, frames: int = 16, width: int = 338, height: int = 27
     along = (DEPTH_LIMIT + 30.0) * torch.rand(points, generator=generator)
     wall = torch.stack([RADIUS * angle.cos(), RADIUS * angle.sin(), along], dim=1)
     made = [_frame(index, frames, width, height) for index in range(frames)]
-    return Scene("tube", made, {"test": made[:1]}, PointCloud(wall), {"fingerprint": f"tube-{points}-{seed}"})
+    return Scene("tube", made, {"test": made[:1]}, PointCloud(wall), Provenance(fingerprint=f"tube-{points}-{seed}"))
 
 
 def _frame(index: int, frames: int, width: int, height: int) -> Frame:

@@ -12,6 +12,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
@@ -57,7 +58,7 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
     train = [frame for frame in made if frame.index % 8]
     grid = torch.stack(torch.meshgrid(torch.arange(-12.0, 16, 0.5), torch.arange(-10.0, 12, 0.5), indexing="ij"), -1)
     points = torch.cat([grid.reshape(-1, 2), torch.full((grid[..., 0].numel(), 1), 20.0)], dim=1)
-    return Scene("wall", train, {"test": test}, PointCloud(points), {"fingerprint": f"wall-{frames}-{depth}"})
+    return Scene("wall", train, {"test": test}, PointCloud(points), Provenance(fingerprint=f"wall-{frames}-{depth}"))
 
 
 def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24, depth: bool = True) -> Path:

@@ -72,9 +72,8 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
 def _warn_of_suspect_data(scene: Scene) -> None:
     """Warn of what the quick checks of ``coliags data check`` find, in the lengths of the dataset."""
     from coliags_plugin.checks.data.check import check_scene
-    from coliags_plugin.engine.data_formats import recorded_scale
 
-    stored = scene.scaled(1.0 / recorded_scale(scene.provenance))
+    stored = scene.scaled(1.0 / scene.provenance.training_scale)
     for finding in check_scene(stored, match_images=False).findings:
         log.warning("%s", finding)
 

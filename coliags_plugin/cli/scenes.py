@@ -93,7 +93,7 @@ class DataCommand:
 
         with progress_callback() as progress:
             scene = open_scene(self.scene, self.data_format, self.set, progress)
-            at_stored_size = partial(open_scene, self.scene, scene.provenance["dataset"], self.set, stored_size=True)
+            at_stored_size = partial(open_scene, self.scene, scene.provenance.dataset, self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
         page = check_page(check)
         if self.html is not None:

@@ -49,4 +49,4 @@ class DataManager(ABC, Generic[SettingsT]):
 
     def fingerprint(self, path: Path) -> str:
         """Hash of a scene's files, as in the provenance of :meth:`load`; faster where pixels need not be read."""
-        return str(self.load(path).provenance.get("fingerprint", ""))
+        return self.load(path).provenance.fingerprint

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.pixel_ids import pixel_ids
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.transfers import sent
 
 
@@ -222,7 +222,7 @@ class Scene:
         test_sets: Held-out frames by set name; ``"test"`` is the split's own, others (``"rotation"``) come with
             the data.
         points: Initial points.
-        provenance: Origin of the data: dataset, layout, calibration, pose convention, split, fingerprints; no places.
+        provenance: Origin of the data.
         folder: Where it was read from; None: made in memory.
     """
 
@@ -230,7 +230,7 @@ class Scene:
     train: list[Frame]
     test_sets: dict[str, list[Frame]]
     points: PointCloud
-    provenance: JsonObject = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
     folder: Path | None = None
 
     @property
@@ -241,13 +241,12 @@ class Scene:
     @property
     def is_resized(self) -> bool:
         """Whether images are known to be used at another size than they are stored at."""
-        stored = self.provenance.get("stored_size")
-        return stored is not None and stored != self.provenance.get("size")
+        return self.provenance.stored_size not in (None, self.provenance.size)
 
     @property
     def is_metric(self) -> bool:
         """Whether lengths are in mm; False where their unit is unknown."""
-        return bool(self.provenance.get("unit", "mm") == "mm")
+        return self.provenance.unit == "mm"
 
     @property
     def length_unit(self) -> str:
@@ -317,19 +316,6 @@ class Scene:
         for frame in self.train[:: max(1, len(self.train) // 16)]:
             camera = frame.camera.to(points.device, points.dtype)
             yield camera, *camera.sees(points)
-
-
-def held_out_uses(used: Mapping[str, Sequence[str] | None]) -> list[str]:
-    """Sentences on a scene whose provenance has this ``held_out_used``: test frames by what was made from their images.
-
-    None stands for an unknown choice of frames.
-    """
-    return [
-        f"its {what} may come from images of held-out frames, as it is not recorded which it was made from"
-        if names is None
-        else f"its {what} comes from images of {len(names)} held-out frames too, whose scores are too good for that"
-        for what, names in used.items()
-    ]
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:

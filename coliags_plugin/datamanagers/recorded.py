@@ -22,6 +22,7 @@ from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import sizes_text, tell_of_alpha
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.provenance import PointsRecord, Provenance, SplitRecord
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, first_few, parallel_map
@@ -124,34 +125,33 @@ class RecordedDataManager(DataManager):
             others = (frame for name in recording.test_sets for frame in test_sets[name])
             parallel_map(StoredFrame.read, [*video, *others], "read images", progress)
         points, described = self._initial_points(recording, path, train, progress)
-        split = {
-            "name": settings.split,
-            "frame_step": settings.frame_step,
-            "max_frames": settings.max_frames,
-            **({"block": list(settings.block)} if settings.split == "block" else {}),
-            "train": [frame.name for frame in train],
-            "test_sets": {name: [frame.name for frame in frames] for name, frames in test_sets.items()},
-        }
+        split = SplitRecord(
+            name=settings.split,
+            frame_step=settings.frame_step,
+            max_frames=settings.max_frames,
+            **({"block": settings.block} if settings.split == "block" else {}),
+            train=[frame.name for frame in train],
+            test_sets={name: [frame.name for frame in frames] for name, frames in test_sets.items()},
+        )
         unit = recording.facts.get("unit") or self.stated_unit(path)
-        provenance = {
+        counts = {name: len(frames) for name, frames in {"train": train, **test_sets}.items()}
+        used = _held_out_used(recording, test_indices)
+        facts: JsonObject = {
             "dataset": self.name,
             **recording.facts,
             "unit": unit if unit == "unknown" else "mm",
             "fingerprint": recording.fingerprint,
             "split": split,
             "points": described,
-            **_held_out_used(recording, test_indices),
-            "frames": {
-                "in_sequence": len(recording.shots),
-                "train": len(train),
-                **{name: len(frames) for name, frames in test_sets.items()},
-            },
+            **({"held_out_used": used} if used else {}),
+            "frames": {"in_sequence": len(recording.shots), **counts},
             "invalid_depth_share": _invalid_depth_share(video) if settings.keep_pixels else None,
         }
         if self._is_told:
             self._tell(recording, path)
         tests: dict[str, list[Frame]] = {name: [*frames] for name, frames in test_sets.items()}
-        return Scene(path.resolve().name, [*train], tests, points, provenance, path.resolve()).scaled(FACTORS[unit])
+        folder = path.resolve()
+        return Scene(folder.name, [*train], tests, points, Provenance(**facts), folder).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
         """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""
@@ -222,11 +222,11 @@ class RecordedDataManager(DataManager):
 
     def _initial_points(
         self, recording: Recording, path: Path, train: Sequence[Frame], progress: Progress | None
-    ) -> tuple[PointCloud, dict[str, Any]]:
+    ) -> tuple[PointCloud, PointsRecord]:
         settings = self.settings
         generator = np.random.default_rng(settings.seed)
         if settings.initial_points == "none":
-            return PointCloud(torch.zeros(0, 3)), {"source": "none", "count": 0}
+            return PointCloud(torch.zeros(0, 3)), PointsRecord(source="none", count=0)
         has_depth = any(shot.depth is not None for shot in recording.shots)
         own, source = recording.own_points, recording.points_source
         if settings.initial_points == "file":
@@ -247,23 +247,20 @@ class RecordedDataManager(DataManager):
         points = subsampled(own(), settings.points_count, generator, source)
         return points, self._described_points(source, points, path)
 
-    def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> dict[str, Any]:
+    def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> PointsRecord:
         name = portable_name(source, scene) if isinstance(source, Path) else source
-        facts: dict[str, Any] = {"source": name, "count": len(points), "seed": self.settings.seed}
-        if isinstance(source, Path) and source.is_file():
-            facts["sha256"] = file_sha256(source)
-        return facts
+        checksum = {"sha256": file_sha256(source)} if isinstance(source, Path) and source.is_file() else {}
+        return PointsRecord(source=name, count=len(points), seed=self.settings.seed, **checksum)
 
 
-def _held_out_used(recording: Recording, test: Sequence[int]) -> JsonObject:
-    """Provenance ``held_out_used``: by what was estimated from images of test frames, their names; None: unknown."""
+def _held_out_used(recording: Recording, test: Sequence[int]) -> dict[str, list[str] | None]:
+    """Names of the test frames that depth and points were estimated from, see :attr:`Provenance.held_out_used`."""
     sources: dict[str, Any] = {"depth": None} if any(shot.confidence for shot in recording.shots) else {}
     used = {
         what: indices if indices is None else [recording.shots[index].name for index in test if index in indices]
         for what, indices in (sources | dict(recording.made_from)).items()
     }
-    used = {what: names for what, names in used.items() if names is None or names}
-    return {"held_out_used": used} if test and used else {}
+    return {what: names for what, names in used.items() if test and (names is None or names)}
 
 
 def _invalid_depth_share(frames: Sequence[Frame]) -> float | None:

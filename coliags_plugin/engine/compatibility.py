@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Loss, Schedule
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Scene, held_out_uses
+from coliags_plugin.core.provenance import held_out_uses
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.renderers.choice import ChosenRenderer
 
 log = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ def check_components(
     _check_data(scene, losses)
     _check_points_in_view(config, scene)
     _warn_of_trusted_estimates(scene, losses)
-    for use in held_out_uses(scene.provenance.get("held_out_used", {})):
+    for use in held_out_uses(scene.provenance.held_out_used):
         log.warning("scene '%s': %s (docs/data.md 3)", scene.name, use)
     _check_schedule(losses, schedule)
 

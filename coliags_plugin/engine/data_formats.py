@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from coliags_plugin.config.components import Component, is_auto, named_component, resolved
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
@@ -23,8 +22,6 @@ log = logging.getLogger(__name__)
 #: Median depth of scenes of unknown unit in training: with about the depth that colons have in mm, constants in mm
 #: (docs/methods.md 4.4) have about the effect that they have on a colon.
 UNKNOWN_MEDIAN_DEPTH = 30.0
-#: In the provenance of a scene that was trained on: the factor on its lengths.
-SCALE_KEY = "training_scale"
 #: Seconds of reading after which progress is reported.
 READING_IS_LONG = 2.0
 
@@ -68,13 +65,8 @@ def at_scale(scene: Scene, scale: float, near_plane: float) -> Scene:
     """A scene to train or render on, with a near plane; its provenance and the log tell the factor on its lengths."""
     if scale != 1.0:
         log.info("the unit of length of scene '%s' is unknown: used at %.4g times its size", scene.name, scale)
-    provenance = {**scene.provenance, SCALE_KEY: scale}
+    provenance = scene.provenance.model_copy(update={"training_scale": scale})
     return replace(scene.scaled(scale).with_near_plane(near_plane), provenance=provenance)
-
-
-def recorded_scale(provenance: Mapping[str, Any]) -> float:
-    """Factor on the lengths of a scene in training, from its provenance; 1 where none is recorded."""
-    return float(provenance.get(SCALE_KEY, 1.0))
 
 
 def data_manager(component: Component, path: Path) -> DataManager:

@@ -157,13 +157,13 @@ def run_result(
     metrics = scorer.metrics | {name: each for name, each in scorer.further_metrics.items() if name in scored}
     deviations = _deviations(trained.step, config["schedule"]["steps"], provenance)
     if truth is not None:
-        deviations["truth"] = data.provenance.get("fingerprint")
+        deviations["truth"] = data.provenance.fingerprint
     if any(name.endswith(REFINED_SUFFIXES) for name in scored):
         deviations["refined"] = list(REFINED_SUFFIXES)
     return Result(
         key=result_key(
             config,
-            str(trained.scene.provenance.get("fingerprint", "")),
+            trained.scene.provenance.fingerprint,
             trained.seed,
             code_key(),
             protocol.name,
@@ -190,8 +190,8 @@ def run_result(
         provenance={
             "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
             "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
-            "scene": {name: value for name, value in data.provenance.items() if name not in _LEFT_OUT},
-            **({"held_out_used": used} if (used := trained.scene.provenance.get("held_out_used")) else {}),
+            "scene": {name: value for name, value in data.provenance.record().items() if name not in _LEFT_OUT},
+            **({"held_out_used": used} if (used := trained.scene.provenance.held_out_used) else {}),
             **({"learned": learned} if (learned := trained.model.learned) else {}),
             **({} if truth is None else {"truth": _described(truth, trained.scene)}),
         },
@@ -199,18 +199,17 @@ def run_result(
 
 
 def _described(truth: Truth, own: Scene) -> JsonObject:
-    trained_on = {"name": own.name, **{key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")}}
+    trained_on = {"name": own.name, **own.provenance.model_dump(include={"dataset", "unit", "fingerprint"})}
     return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
 
 
 def _scene_record(scene: Scene) -> SceneRecord:
     """The record of a scene that has a test frame."""
-    split = scene.provenance.get("split", "")
     camera = next(frame for frames in scene.test_sets.values() for frame in frames).camera
     return SceneRecord(
         name=scene.name,
-        fingerprint=str(scene.provenance.get("fingerprint", "")),
-        split=str(split.get("name", "") if isinstance(split, Mapping) else split),
+        fingerprint=scene.provenance.fingerprint,
+        split=scene.provenance.split_name,
         train=tuple(frame.name for frame in scene.train),
         size=(camera.width, camera.height),
     )

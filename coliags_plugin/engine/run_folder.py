@@ -21,6 +21,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
 from coliags_plugin.core.json_files import JsonObject, parse_json, read_json, scalars
 from coliags_plugin.core.locks import locked
+from coliags_plugin.core.provenance import Provenance
+from coliags_plugin.core.settings import validated
 from coliags_plugin.results.hashing import code_key
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -44,7 +46,8 @@ class RunIdentity:
     method: str
     scene_name: str
     scene_path: Path  # that it was read from
-    fingerprint: str | None  # of the scene's files
+    fingerprint: str  # of the scene's files
+    scale: float  # factor on the lengths of the scene in training
     seed: int
     steps: int  # of the whole training
 
@@ -179,11 +182,13 @@ class RunFolder:
         found = self.provenance()
         try:
             scene = found["scene"]
+            origin = validated(Provenance, scene["provenance"], f"{self.provenance_file}:")
             return RunIdentity(
                 method=found["method"],
                 scene_name=scene["name"],
                 scene_path=(self.path.resolve() / scene["path"]).resolve(),
-                fingerprint=scene["provenance"].get("fingerprint"),
+                fingerprint=origin.fingerprint,
+                scale=origin.training_scale,
                 seed=int(found["seed"]),
                 steps=int(found["steps"]),
             )
@@ -212,7 +217,7 @@ class RunFolder:
                 "the settings it was started with",
                 f"Compare with {self.config_file}",
             )
-        if self.provenance()["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
+        if self.identity().fingerprint != scene.provenance.fingerprint:
             raise InputError(f"{scene_path} is not the data this run was started on", "unchanged data")
 
     def record_schedule(self, config: MethodConfig, step: int, plan: str) -> None:

@@ -16,7 +16,7 @@ from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
-from coliags_plugin.engine.data_formats import load_scene, recorded_scale
+from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.renderers.choice import choose_renderer
@@ -67,9 +67,9 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     identity, provenance = run.identity(), run.provenance()
     method, folder = identity.method, data or identity.scene_path
     saved = read_checkpoint(run.newest_checkpoint, method, device)
-    scale = recorded_scale(provenance["scene"]["provenance"])
+    scale = identity.scale
     scene = load_scene(config, folder).with_near_plane(config.near_plane / scale)
-    if scene.provenance.get("fingerprint") != identity.fingerprint:
+    if scene.provenance.fingerprint != identity.fingerprint:
         raise InputError(
             f"{folder} is not the data the run was trained on", "the same, unchanged data", "Pass `data=SCENE`"
         )

@@ -262,7 +262,7 @@ class Trainer:
                 "extent": scene.extent,
                 "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
                 "points": len(scene.points),
-                "provenance": scene.provenance,
+                "provenance": scene.provenance.record(),
             },
             "plan": self.strategy.plan(),
         }

@@ -13,7 +13,7 @@ import torch
 
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, recorded_scale, training_scale
+from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.evaluator import check_evaluable
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
@@ -70,8 +70,8 @@ def open_training(
         # The config stored in the run, even if that of this name has changed since.
         method = load_method_for(request.data, str(folder.config_file.resolve()), overrides, data_format)
         method = replace(method, name=name)
-        provenance = folder.provenance()
-        seed, scale = int(provenance["seed"]), recorded_scale(provenance["scene"]["provenance"])
+        identity = folder.identity()
+        seed, scale = identity.seed, identity.scale
         if request.seed not in (None, seed):
             begun = f"{folder.path}, which was started with seed {seed}"
             raise InputError(f"`seed={request.seed}` for {begun}", "no `seed`, or that one")

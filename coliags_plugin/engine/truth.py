@@ -56,8 +56,8 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     sets |= {name: frames for name, frames in other.test_sets.items() if name != "test"}
     if not same_split:  # seen masks tell what the other scene's training frames show
         sets = {name: [replace(frame.to("cpu"), seen=None) for frame in frames] for name, frames in sets.items()}
-    split = (other if same_split else own).provenance.get("split", "")
-    provenance = {**other.provenance, "split": split}
+    split = (other if same_split else own).provenance.split
+    provenance = other.provenance.model_copy(update={"split": split})
     held_out = {name: frames for name, frames in sets.items() if frames}
     return Truth(replace(other, train=train, test_sets=held_out, provenance=provenance), matched_by)
 

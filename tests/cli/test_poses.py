@@ -206,7 +206,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert summary.startswith("5 of 5 images posed")
     assert unit.startswith("unit: unknown, as images alone do not determine it; the median depth of the points is")
     assert read_unit(out) == "unknown"
-    assert open_scene(out).provenance["unit"] == "unknown"
+    assert open_scene(out).provenance.unit == "unknown"
     assert end == [
         f"written: {out}",
         f"next:    coliags depth estimate {out} --output {out}-depth",

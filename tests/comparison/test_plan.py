@@ -74,7 +74,7 @@ def test_a_method_under_another_name_has_the_same_key(wall):
 
 def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
     manager = C3VDDataManager(C3VDDataManager.Settings())
-    assert keys(wall).fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance["fingerprint"]
+    assert keys(wall).fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance.fingerprint
 
 
 @pytest.mark.parametrize("layout", ["c3vd", "colmap"])

@@ -64,7 +64,7 @@ def test_undistorted_geometry_is_right_through_every_lens_and_no_other(tmp_path,
     scene = load(folder, width=90, height=72, lens=name)
     k, camera = LENSES[name].resized(90, 72).pinhole, scene.train[0].camera
     assert vars(camera.intrinsics) == pytest.approx(vars(k))
-    assert worst_off_wall(scene.train[0]) < 0.2 and scene.provenance["lens"] == name
+    assert worst_off_wall(scene.train[0]) < 0.2 and scene.provenance.lens == name
     points = scene.points.positions.double().numpy()
     assert np.abs(scene.points.colors.numpy().astype(int) - colors(points)).max() < 12
     other = "omnidirectional" if name == "legacy-pinhole" else "legacy-pinhole"
@@ -110,7 +110,7 @@ def test_the_option_and_the_file_decide_on_the_lens(tmp_path, caplog, lens, has_
         (tmp_path / "camera_intrinsics.txt").write_text(as_text())
     scene = load(folder, "c3vd-v2", lens=lens)
     assert worst_off_wall(scene.train[0]) < 0.5
-    assert scene.provenance["lens_source"].endswith(source)
+    assert scene.provenance.lens_source.endswith(source)
     assert ("unverified" in caplog.text) == (not has_file)
 
 
@@ -173,10 +173,10 @@ def test_options_choose_the_split(walls, options, train, test):
     scene = load(walls("c3vd"), **options)
     assert [frame.index for frame in scene.train] == train
     assert [frame.index for frame in scene.test_sets.get("test", [])] == test
-    split = scene.provenance["split"]
-    assert split["name"] == options.get("split", "every-8th")
-    assert split["train"] == names(scene.train) and split.get("block", [0.5, 0.8]) == [0.5, 0.8]
-    assert split["test_sets"] == {name: names(frames) for name, frames in scene.test_sets.items()}
+    split = scene.provenance.split
+    assert split.name == options.get("split", "every-8th")
+    assert split.train == names(scene.train) and ("block" not in options or split.block == (0.5, 0.8))
+    assert split.test_sets == {name: names(frames) for name, frames in scene.test_sets.items()}
 
 
 @pytest.mark.parametrize(
@@ -205,10 +205,10 @@ def test_rotation_views_are_a_test_set_of_their_own(walls):
     scene = load(walls("c3vd"))
     assert names(scene.test_sets["rotation"]) == ["rotation-0000_color", "rotation-0001_color"]
     assert worst_off_wall(scene.test_sets["rotation"][1]) < 0.002
-    assert scene.provenance["frames"] == {"in_sequence": 11, "train": 9, "test": 2, "rotation": 2}
-    assert scene.provenance["rotation"]["layout"] == "undistorted"
-    assert scene.provenance["intrinsics"]["cx"] == scene.train[0].camera.cx
-    assert scene.provenance["points"] == {"source": "depth of the training frames", "count": 11520, "seed": 0}
+    assert scene.provenance.frames == {"in_sequence": 11, "train": 9, "test": 2, "rotation": 2}
+    assert scene.provenance.rotation["layout"] == "undistorted"
+    assert scene.provenance.intrinsics["cx"] == scene.train[0].camera.cx
+    assert scene.provenance.record()["points"] == {"source": "depth of the training frames", "count": 11520, "seed": 0}
 
 
 @pytest.mark.parametrize("colored", [True, False])
@@ -220,8 +220,8 @@ def test_points_come_from_the_scenes_ply_where_there_is_no_depth(mine, colored):
     assert all(frame.depth is None for frame in scene.train)
     np.testing.assert_allclose(scene.points.positions, positions, atol=1e-7)
     assert (scene.points.colors.numpy() == colors).all() if colored else scene.points.colors is None
-    assert scene.provenance["points"]["source"] == "points3D.ply" and "sha256" in scene.provenance["points"]
-    assert scene.provenance["invalid_depth_share"] is None
+    assert scene.provenance.points.source == "points3D.ply" and scene.provenance.points.sha256
+    assert scene.provenance.invalid_depth_share is None
 
 
 def test_points_come_from_a_named_file(mine, tmp_path):
@@ -231,7 +231,7 @@ def test_points_come_from_a_named_file(mine, tmp_path):
     np.testing.assert_allclose(scene.points.positions, positions, atol=1e-7)
     elsewhere = (mine / "cloud.npz").rename(tmp_path / "elsewhere.npz")
     other = load(mine, initial_points="file", points_file=str(elsewhere), points_count=7)
-    assert len(other.points) == 7 and other.provenance["points"]["source"] == "elsewhere.npz"
+    assert len(other.points) == 7 and other.provenance.points.source == "elsewhere.npz"
     write_ply(mine / "points3D.ply", point_properties(positions))
     assert len(load(mine, initial_points="data").points) == 50
     assert len(load(mine, initial_points="none").points) == 0

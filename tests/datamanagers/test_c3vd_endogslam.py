@@ -78,20 +78,20 @@ def release(copied):
 @pytest.mark.parametrize("source", ["slam", "ground-truth"])
 def test_points_are_the_map_in_the_world_of_the_poses(walls, kind, source):
     scene = load(walls(kind), poses=source)
-    is_true = scene.provenance["world"] == "pose.txt"
+    is_true = scene.provenance.world == "pose.txt"
     assert is_true == (source == "ground-truth" and kind == "c3vd-endogslam")
     world = np.eye(4) if is_true else poses(1)[0]
     np.testing.assert_allclose(world @ matrices(scene), poses(11), atol=1e-4)
     points = scene.points.positions.double().numpy() @ world[:3, :3].T + world[:3, 3]
     assert off_wall(points).max() < 1e-3
-    assert scene.provenance["points"]["source"].endswith("params.npz" if kind == "c3vd-endogslam" else "cloud.ply")
+    assert scene.provenance.points.source.endswith("params.npz" if kind == "c3vd-endogslam" else "cloud.ply")
 
 
 def test_the_release_is_read_from_its_root_or_its_scene(release, walls):
     root, scene = load(release), load(walls("pr-endo"))
     np.testing.assert_array_equal(matrices(root), matrices(scene))
-    assert root.provenance["layout"] == "pr-endo"
-    assert root.provenance["slam"]["compared_with_pose_file"] is None
+    assert root.provenance.layout == "pr-endo"
+    assert root.provenance.slam["compared_with_pose_file"] is None
     for part in ("C3VD", "C3VD_endogslam_optimized"):
         shutil.copytree(release / part / "phantom", release / part / "again")
     with pytest.raises(InputError, match=r"holds several scenes.*C3VD/again"):
@@ -106,7 +106,7 @@ def test_the_latest_cloud_of_the_release_is_taken(release):
     with pytest.raises(InputError, match=r"iteration_100000/point_cloud.ply"):
         load(release)
     shutil.rmtree(clouds / "iteration_100000")
-    assert "iteration_30000" in load(release).provenance["points"]["source"]
+    assert "iteration_30000" in load(release).provenance.points.source
 
 
 # Poses
@@ -119,7 +119,7 @@ def test_poses_go_to_the_frames_that_were_tracked(tmp_path, count, every):
     estimate(folder, tracked, drift)
     scene = load(folder, split="all-train")
     np.testing.assert_allclose(matrices(scene)[tracked], drift(from_first(count)[tracked]), atol=1e-4)
-    facts = scene.provenance["slam"]
+    facts = scene.provenance.slam
     assert facts["frames"] == len(tracked)
     assert facts["images"] == ("every" if len(tracked) == count else "all but 7, 15, 23, ...")
 
@@ -134,7 +134,7 @@ def test_test_frames_take_true_poses_brought_into_the_mapped_world(mine):
     turn = left @ right
     motion = rigid(turn[None], (mapped[:, :3, 3] - true[:, :3, 3] @ turn.T).mean(axis=0)[None])[0]
     np.testing.assert_allclose(frame.camera.camera_to_world, motion @ from_first(11)[7], atol=1e-4)
-    facts = scene.provenance["slam"]
+    facts = scene.provenance.slam
     errors = np.linalg.norm((motion @ true - mapped)[:, :3, 3], axis=1)
     assert facts["ate_rmse_mm"] == pytest.approx(np.sqrt((errors**2).mean()), abs=1e-4)
     assert facts["ate_max_mm"] == pytest.approx(errors.max(), abs=1e-4)
@@ -150,7 +150,7 @@ def test_a_rigid_error_is_undone_to_the_digit(mine):
     estimate(mine, training(11), lambda pose: turn @ pose, **colors, log_scales=np.zeros((1, 1)))
     scene = load(mine)
     np.testing.assert_allclose(matrices(scene), turn @ from_first(11), atol=1e-4)
-    assert scene.provenance["slam"]["ate_rmse_mm"] < 1e-4
+    assert scene.provenance.slam["ate_rmse_mm"] < 1e-4
     np.testing.assert_allclose(scene.points.positions, [[1.0, 2.0, 3.0]], atol=1e-6)
     assert scene.points.colors.tolist() == [[128, 51, 255]]
     (point,) = load(mine, poses="ground-truth").points.positions.double().numpy()
@@ -183,7 +183,7 @@ def test_the_result_may_be_named(mine, tmp_path):
     (tmp_path / "experiments").mkdir()
     elsewhere = (mine / PARAMS).rename(tmp_path / "experiments/x.npz")
     for name in (str(elsewhere), "../experiments/x.npz"):
-        assert load(mine, params_file=name).provenance["slam"]["frames"] == 10
+        assert load(mine, params_file=name).provenance.slam["frames"] == 10
     with pytest.raises(InputError, match=r"no file .*y.npz.*params_file"):
         load(mine, params_file="y.npz")
 
@@ -211,14 +211,14 @@ def test_depth_may_be_of_16_bits(mine, walls):
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), depth_steps((stored + 0.5) / 2.55))
     scene = load(mine, poses="ground-truth")
-    assert scene.provenance["depth_step_mm"] == 100 / 65535 and worst_off_wall(scene.train[1]) < 0.25
-    assert load(walls("c3vd-endogslam")).provenance["depth_step_mm"] == 100 / 255
+    assert scene.provenance.depth_step_mm == 100 / 65535 and worst_off_wall(scene.train[1]) < 0.25
+    assert load(walls("c3vd-endogslam")).provenance.depth_step_mm == 100 / 255
 
 
 def test_without_a_result_the_camera_is_endogslams(mine):
     (mine / PARAMS).unlink()
     scene = load(mine, poses="ground-truth")
-    assert scene.provenance["intrinsics_from"] == "EndoGSLAM's table"
+    assert scene.provenance.intrinsics_from == "EndoGSLAM's table"
     assert scene.train[0].camera.fx == pytest.approx(401.1595 * WIDTH / 675)
     assert names(scene.test_sets["rotation"]) == ["rotation-0000_color", "rotation-0001_color"]
     assert max(worst_off_wall(frame) for frame in (*scene.train, *scene.test_sets["rotation"])) < 0.5
@@ -246,7 +246,7 @@ def test_points_come_from_depth_where_the_map_is_empty(mine):
     change_npz(PARAMS, lambda arrays: arrays.update(empty))(mine)
     scene = load(mine)
     assert len(scene.points) == 10 * WIDTH * HEIGHT
-    assert scene.provenance["points"]["source"] == "depth of the training frames"
+    assert scene.provenance.points.source == "depth of the training frames"
 
 
 def test_originals_kept_by_the_script_are_left_alone(mine):

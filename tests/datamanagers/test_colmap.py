@@ -206,7 +206,7 @@ def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     load(mine)
     assert f"1 of {COUNT} frames have a mask; 1 other files beside the masks" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
-    assert scene.train[1].mask is None and scene.provenance["masks"] == 1
+    assert scene.train[1].mask is None and scene.provenance.masks == 1
 
 
 def test_masks_and_alpha_hide_both(mine):
@@ -316,8 +316,8 @@ def test_points_are_initial_points_in_their_colours(wall, walls):
     pairs = zip(scene.points.positions.numpy(), scene.points.colors.numpy(), strict=True)
     assert {tuple(position): tuple(color) for position, color in pairs} == known and len(known) == POINTS
     observing = [frame.name for frame in scene.test_sets["test"] if frame.sparse_depth is not None]
-    assert observing and scene.provenance["held_out_used"] == {"points": observing}
-    assert "held_out_used" not in load(wall, split="all-train").provenance
+    assert observing and scene.provenance.held_out_used == {"points": observing}
+    assert not load(wall, split="all-train").provenance.held_out_used
     # What the phantom writes agrees with its poses.
     written = pycolmap.Reconstruction(str(walls("colmap") / "sparse/0"))
     written.update_point_3d_errors()
@@ -325,7 +325,7 @@ def test_points_are_initial_points_in_their_colours(wall, walls):
 
 
 def test_observations_that_poses_do_not_explain_are_counted(mine):
-    assert load(mine).provenance["misplaced_observations"] == 0
+    assert load(mine).provenance.misplaced_observations == 0
 
     def stretch(model: pycolmap.Reconstruction) -> None:
         for image in model.images.values():
@@ -334,9 +334,9 @@ def test_observations_that_poses_do_not_explain_are_counted(mine):
 
     change_model(stretch)(mine)
     facts = load(mine).provenance
-    assert facts["misplaced_observations"] > 0.7 * facts["observations"]
+    assert facts.misplaced_observations > 0.7 * facts.observations
     assert "poses and points of the model contradict each other" in [
-        found.what for found in findings_of("points", facts)
+        found.what for found in findings_of("points", dict(vars(facts)))
     ]
 
 
@@ -473,7 +473,7 @@ def test_a_real_scene_loads(shared_data):
     scene = load(folder)
     assert [frame.name for frame in scene.test_sets["test"]] == ["DSC_5283", "DSC_5291", "DSC_5299"]
     assert len(scene.train) == 20 and len(scene.points) == 1443
-    assert scene.provenance["sparse_depths"] > 5500
+    assert scene.provenance.sparse_depths > 5500
     for frame in scene.train:
         assert frame.image.shape[:2] == (frame.camera.height, frame.camera.width)
         assert len(frame.sparse_depth.depth) > 150

@@ -47,7 +47,7 @@ def folder(request, copied) -> Path:
 @pytest.mark.parametrize("keep", [True, False])
 def test_stored_values_are_255ths(folder, keep):
     scene = load(folder, keep_pixels=keep)
-    assert scene.provenance["depth_is_estimated"] is True
+    assert scene.provenance.depth_is_estimated is True
     for frame in scene.video:
         expected = torch.from_numpy(stored(frame.index)).float() / 255.0
         for values in (frame.depth_confidence, frame.to("cpu").depth_confidence, frame.target.depth_confidence):
@@ -75,7 +75,7 @@ def test_it_is_part_of_the_fingerprint_and_can_be_left_out(folder):
     else:
         change_frames("transforms.json", lambda _, entry: entry.pop("confidence_file_path"))(folder)
     scene = load(folder)
-    assert scene.provenance["depth_is_estimated"] is False
+    assert scene.provenance.depth_is_estimated is False
     assert scene.train[0].depth_confidence is None and scene.train[0].true_depth is not None
 
 

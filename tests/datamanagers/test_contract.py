@@ -88,7 +88,7 @@ def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
     assert [frame.index for frame in frames] == list(range(FRAMES))
     assert [frame.index for frame in held_out] == test
     assert len(set(names([*scene.train, *(frame for part in scene.test_sets.values() for frame in part)]))) == sum(
-        scene.provenance["frames"][part] for part in ("train", *scene.test_sets)
+        scene.provenance.frames[part] for part in ("train", *scene.test_sets)
     )
     pinhole = layout_of(kind.layout).lens(WIDTH, HEIGHT)[0].pinhole
     for frame in frames:
@@ -110,7 +110,7 @@ def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
             assert difference.max() < kind.accuracy and np.median(difference) < max(0.12, 0.6 * kind.accuracy)
     points = scene.points.positions.double().numpy() @ world[:3, :3].T + world[:3, 3]
     assert len(points) > 100 and off_wall(points).max() < 1e-3 + kind.accuracy
-    said = json.loads(json.dumps(scene.provenance, allow_nan=False))
+    said = json.loads(json.dumps(scene.provenance.record(), allow_nan=False))
     assert said["dataset"] == kind.format and said["stored_size"] == said["size"] == [WIDTH, HEIGHT]
     assert said["unit"] == "mm"
 
@@ -121,7 +121,8 @@ def test_a_scene_is_the_same_again_read_from_disk_each_time_or_at_once(walls, na
     for again in (load(walls(name), name, points_count=150, keep_pixels=keep) for keep in (True, False)):
         assert torch.equal(scene.points.positions, again.points.positions)
         assert all(equal(*pair) for pair in zip(in_order(scene, name), in_order(again, name), strict=True))
-        assert again.provenance == scene.provenance | {"invalid_depth_share": again.provenance["invalid_depth_share"]}
+        share = again.provenance.invalid_depth_share
+        assert again.provenance == scene.provenance.model_copy(update={"invalid_depth_share": share})
     other = load(walls(name), name, points_count=150, seed=1).points.positions
     assert len(other) == 150 and not torch.equal(other, scene.points.positions)
 
@@ -176,7 +177,7 @@ def test_depth_is_unknown_at_0_and_bounded_at_the_end_of_its_range(copied, name,
         assert frame.depth_at_least is None
     else:
         torch.testing.assert_close(frame.depth_at_least[0, :4], torch.tensor(bound), equal_nan=True)
-    assert scene.provenance["invalid_depth_share"] == pytest.approx(np.isnan(depth).mean())
+    assert scene.provenance.invalid_depth_share == pytest.approx(np.isnan(depth).mean())
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -39,8 +39,8 @@ def test_depth_is_read_to_the_bit(walls):
         steps = cv2.imread(str(folder / f"depth/{frame.name}.png"), cv2.IMREAD_UNCHANGED)
         expected = (steps[pixels[..., 1], pixels[..., 0]] / calibration.depth_scale).astype(np.float32)
         np.testing.assert_array_equal(frame.depth, np.where(expected == 0.0, np.nan, expected))
-    assert scene.provenance["lens"] == "FisheyeLens"
-    assert scene.provenance["intrinsics_from"] == "calibration.xml"
+    assert scene.provenance.lens == "FisheyeLens"
+    assert scene.provenance.intrinsics_from == "calibration.xml"
 
 
 def test_more_of_the_field_of_view_is_kept_without_its_dark_surroundings(walls):

@@ -135,13 +135,13 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, mi
     for one, other in zip(before.train, after.train, strict=True):
         torch.testing.assert_close(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
     assert off_wall(after.points.positions.numpy()).max() < 1e-3
-    assert any("undone" in remark for remark in after.provenance["pose_convention"]["remarks"])
+    assert any("undone" in remark for remark in after.provenance.pose_convention["remarks"])
 
 
 def test_the_unit_of_depth_is_the_options_or_the_files_or_a_millimetre(copied):
     folder = copied("nerfstudio")
     depth = load(folder).train[1].depth
-    assert load(folder).provenance["depth_unit"] == 0.01
+    assert load(folder).provenance.depth_unit == 0.01
     torch.testing.assert_close(load(folder, depth_unit_scale_factor=0.05).train[1].depth, 5.0 * depth, equal_nan=True)
     change_json(FILE, depth_unit_scale_factor=None)(folder)
     for unit in ("mm", "m"):  # of the poses

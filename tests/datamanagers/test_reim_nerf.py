@@ -63,7 +63,7 @@ def test_its_own_split_leaves_validation_out(folder, scene):
     assert [frame.index for frame in scene.train] == train
     assert names(scene.train) == [f"{index:04d}_color" for index in train]
     assert [frame.index for frame in scene.test_sets["test"]] == [i for i in range(FRAMES) if i % 5]
-    assert scene.provenance["parts"] == {"train": 5, "val": 1, "test": FRAMES, "true_test": 21}
+    assert scene.provenance.parts == {"train": 5, "val": 1, "test": FRAMES, "true_test": 21}
     other = load(folder, split="every-8th", initial_points="none")
     assert len(other.video) == FRAMES
     assert [frame.index for frame in other.test_sets["test"]] == [0, 8, 16, 24]
@@ -128,5 +128,5 @@ def test_without_distances_points_come_from_a_file(mine):
     np.savez(mine / "points.npz", positions=np.ones((3, 3)))
     scene = load(mine, initial_points="file", points_file="points.npz")
     assert scene.train[0].depth is None and len(scene.points) == 3
-    assert scene.provenance["mask"] == "rgb_mask.png"
-    assert math.isclose(scene.provenance["pose_convention"]["scene_scale"], content_of(mine)["scene_scale"])
+    assert scene.provenance.mask == "rgb_mask.png"
+    assert math.isclose(scene.provenance.pose_convention["scene_scale"], content_of(mine)["scene_scale"])

@@ -66,8 +66,8 @@ def test_times_are_associated(walls):
     scene = load(walls("rgbd"))
     assert names(scene.video) == stamps(TIMES)
     facts = {"by": "time", "without_pose": 0, "without_depth": 0, "largest_difference_s": 0.0}
-    assert scene.provenance["association"] == facts and scene.provenance["depth_scale"] == SCALE
-    assert load(walls("rgbd-by-order")).provenance["association"] == {"by": "order"}
+    assert scene.provenance.association == facts and scene.provenance.depth_scale == SCALE
+    assert load(walls("rgbd-by-order")).provenance.association == {"by": "order"}
 
 
 def test_clocks_that_nearly_agree(mine):
@@ -77,7 +77,7 @@ def test_clocks_that_nearly_agree(mine):
         path.rename(path.with_name(f"{float(path.stem) - 0.008:.6f}.png"))
     scene = load(mine)
     assert_right(scene.video, [*range(FRAMES)])
-    assert scene.provenance["association"]["largest_difference_s"] == pytest.approx(0.009, abs=1e-6)
+    assert scene.provenance.association["largest_difference_s"] == pytest.approx(0.009, abs=1e-6)
 
 
 def test_a_motion_capture_that_is_faster_than_the_camera(mine):
@@ -95,8 +95,8 @@ def test_images_without_a_pose_or_depth_are_left_out_and_counted(mine, caplog):
     kept = [index for index in range(FRAMES) if index not in (2, 4, 10)]
     assert names(scene.video) == [stamps(TIMES)[index] for index in kept]
     assert_right(scene.video, kept)
-    assert scene.provenance["association"]["without_pose"] == 2
-    assert scene.provenance["association"]["without_depth"] == 1
+    assert scene.provenance.association["without_pose"] == 2
+    assert scene.provenance.association["without_depth"] == 1
     assert "of 11 images 2 have no pose and 1 no depth" in caplog.text
 
 
@@ -165,7 +165,7 @@ def test_whole_numbers_can_be_times(numbered):
 def test_scales_of_depth(mine):
     with pytest.raises(InputError, match=r"depth_scale = 500, but the option depth_scale is 5000"):
         load(mine, depth_scale=5000.0)
-    assert load(mine, depth_scale=SCALE).provenance["depth_scale"] == SCALE
+    assert load(mine, depth_scale=SCALE).provenance.depth_scale == SCALE
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif", ".jpg"])
@@ -205,7 +205,7 @@ def test_intrinsics_may_be_in_a_text_file(mine, form):
     with_intrinsics(form.format(*(k[key] for key in ("fx", "fy", "cx", "cy"))))(mine)
     scene = load(mine, depth_scale=SCALE)
     assert_right(scene.video, [*range(FRAMES)])
-    assert scene.provenance["intrinsics_from"] == "intrinsics.txt"
+    assert scene.provenance.intrinsics_from == "intrinsics.txt"
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def test_gaussian_pancakes_folder(pancakes):
     assert frames[0].camera.intrinsics == PINHOLE
     assert scene.points.positions.tolist() == [[1.0, 2.0, 40.0], [-1.5, 0.0, 41.0]]
     assert scene.points.colors.tolist() == [[255, 128, 0], [0, 0, 255]]
-    assert scene.provenance["points"]["source"] == "mesh.obj"
+    assert scene.provenance.points.source == "mesh.obj"
     with pytest.raises(InputError, match=r"or `datamanager.depth=none` if it is relative"):
         load(pancakes)
     frame = load(pancakes, depth_scale=SCALE).train[0]

@@ -51,7 +51,7 @@ def test_another_divisor_scales_depth(walls, divisor):
 
 def test_without_points_they_come_from_depth(mine):
     (mine / "init_point_cloud.ply").unlink()
-    assert load(mine).provenance["points"]["source"] == "depth of the training frames"
+    assert load(mine).provenance.points.source == "depth of the training frames"
 
 
 def test_alpha_is_dropped(mine):
@@ -78,7 +78,7 @@ def test_images_without_pose_are_left_out_and_counted(mine):
     change_json("transforms.json", lambda content: content["frames"].pop(4))(mine)
     scene = load(mine)
     assert names(scene.train) == [f"{index:04d}" for index in range(FRAMES) if index != 4]
-    assert scene.provenance["images_without_pose"] == 1
+    assert scene.provenance.images_without_pose == 1
 
 
 def test_test_views_may_be_elsewhere_of_another_camera_or_none(mine):

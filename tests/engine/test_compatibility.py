@@ -9,6 +9,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError, NothingDrawnError
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.compatibility import _check_data, _check_sampler
 from coliags_plugin.losses.photometric import L1Loss
@@ -29,7 +30,7 @@ def test_what_was_made_from_held_out_images_is_warned_of(tmp_path, caplog):
     scene, used = wall_scene(), {"depth": ["0004", "0008"]}
     start(tmp_path / "own", scene=scene)
     assert "held-out" not in caplog.text
-    start(tmp_path / "other", scene=replace(scene, provenance={**scene.provenance, "held_out_used": used}))
+    start(tmp_path / "other", scene=replace(scene, provenance=Provenance(held_out_used=used)))
     assert f"scene '{scene.name}': its depth comes from images of 2 held-out frames too" in caplog.text
 
 

@@ -66,8 +66,8 @@ def test_auto_passes_on_what_was_set(wall):
     auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
     manager = data_manager(auto, wall)
     scene = manager.load(wall)
-    assert scene.provenance["dataset"] == "c3vd" and len(scene.points) == 77
-    assert manager.fingerprint(wall) == scene.provenance["fingerprint"]
+    assert scene.provenance.dataset == "c3vd" and len(scene.points) == 77
+    assert manager.fingerprint(wall) == scene.provenance.fingerprint
 
 
 def test_options_of_the_folders_own_format_may_be_set(wall):

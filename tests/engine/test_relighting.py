@@ -15,6 +15,7 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
@@ -46,7 +47,7 @@ def lit_wall(frames: int = 10) -> Scene:
         made.append(Frame(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
     x, y = torch.meshgrid(torch.arange(-22.0, 22, 0.8), torch.arange(-16.0, 16, 0.8), indexing="ij")
     points = torch.stack([x, y, torch.full_like(x, 20.0)], -1).reshape(-1, 3)
-    return Scene("lit", made, {"test": made[:1]}, PointCloud(points), {"fingerprint": "lit"})
+    return Scene("lit", made, {"test": made[:1]}, PointCloud(points), Provenance(fingerprint="lit"))
 
 
 def wall_albedo(points):

@@ -35,7 +35,7 @@ def scene():
     left = torch.zeros(24, 32, dtype=torch.bool)
     left[:, :16] = True
     turned = [replace(frame, name=f"turned-{frame.name}", seen=left) for frame in made.test_sets["test"]]
-    provenance = {**made.provenance, "held_out_used": {"points": ["0000"]}}
+    provenance = made.provenance.model_copy(update={"held_out_used": {"points": ["0000"]}})
     return replace(made, test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
 
 

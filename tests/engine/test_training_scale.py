@@ -11,10 +11,11 @@ import torch
 
 from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine import training as training_module
-from coliags_plugin.engine.data_formats import SCALE_KEY, UNKNOWN_MEDIAN_DEPTH, training_scale
+from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH, training_scale
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import render_view
@@ -36,7 +37,7 @@ DEPTHS = ("rgb", "alpha", "depth_accumulated", "depth_expected", "inverse_depth_
 
 
 def with_unit(scene, unit):
-    return replace(scene, provenance={"fingerprint": "wall", "dataset": "c3vd", "unit": unit})
+    return replace(scene, provenance=Provenance(fingerprint="wall", dataset="c3vd", unit=unit))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +85,7 @@ def test_the_median_depth_in_view_becomes_that_of_a_colon(small, factor):
 @pytest.mark.thorough
 def test_a_scene_of_unknown_unit_trains_like_the_same_in_mm(runs, factor):
     own, mm = runs
-    assert own.provenance["scene"]["provenance"][SCALE_KEY] == own.model.scale == factor
+    assert own.provenance["scene"]["provenance"]["training_scale"] == own.model.scale == factor
     assert mm.model.scale == 1.0 and own.step == mm.step == 6
     for one, other in zip(own.model.parameters(), mm.model.parameters(), strict=True):
         assert torch.equal(one, other)

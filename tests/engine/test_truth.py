@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.provenance import Provenance, SplitRecord
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine.evaluator import evaluate
@@ -32,7 +33,7 @@ def true():
     seen = torch.zeros(24, 32, dtype=torch.bool)
     seen[:, :16] = True
     turned = [replace(frame, name=f"turned-{frame.name}", seen=seen) for frame in made.test_sets["test"]]
-    provenance = {"fingerprint": "true", "split": {"name": "every-8th"}, "unit": "mm"}
+    provenance = Provenance(fingerprint="true", split=SplitRecord(name="every-8th"))
     return replace(made, name="phantom", test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
 
 
@@ -44,7 +45,8 @@ def estimated(true):
         return replace(frame, depth=1.03 * frame.depth, depth_confidence=confidence, sparse_depth=points, seen=None)
 
     sets = {"test": true.test_sets["test"]}
-    provenance = {"fingerprint": "estimated", "split": {"name": "own"}, "unit": "unknown", "dataset": "nerfstudio"}
+    own = SplitRecord(name="own")
+    provenance = Provenance(fingerprint="estimated", split=own, unit="unknown", dataset="nerfstudio")
     return changed(replace(true, test_sets=sets), change, name="estimate", provenance=provenance)
 
 
@@ -70,7 +72,7 @@ def test_frames_are_matched_by_name(true, estimated):
     assert [frame.name for frame in truth.scene.train] == [frame.name for frame in true.train]
     assert truth.scene.test_sets["test"] == true.test_sets["test"]
     assert truth.scene.test_sets["rotation"] == true.test_sets["rotation"]
-    assert truth.scene.provenance["split"] == {"name": "every-8th"}
+    assert truth.scene.provenance.split_name == "every-8th"
 
 
 def test_or_by_index_where_names_differ(true, estimated):
@@ -83,7 +85,7 @@ def test_of_another_split_the_seen_masks_do_not_hold(true, estimated):
     moved = [*estimated.train[1:], *estimated.test_sets["test"]]
     own = replace(estimated, train=moved, test_sets={"test": estimated.train[:1]})
     truth = match_truth(own, true)
-    assert truth.scene.provenance["split"] == {"name": "own"}
+    assert truth.scene.provenance.split_name == "own"
     assert [frame.name for frame in truth.scene.test_sets["test"]] == [estimated.train[0].name]
     assert all(frame.seen is None for frames in truth.scene.test_sets.values() for frame in frames)
 

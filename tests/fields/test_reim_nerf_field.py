@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
@@ -250,7 +251,7 @@ def sphere_scene():
         frames.append(Frame(f"{index:04d}", index, image, camera, depth))
     train, test = [f for f in frames if f.index % 6], [f for f in frames if f.index % 6 == 0]
     points = torch.cat([f.camera.unproject(f.depth.double())[f.depth.isfinite()] for f in train])
-    return Scene("ball", train, {"test": test}, PointCloud(points), {"fingerprint": "ball"})
+    return Scene("ball", train, {"test": test}, PointCloud(points), Provenance(fingerprint="ball"))
 
 
 @pytest.mark.thorough

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import PointCloud, Scene, View
@@ -168,7 +169,7 @@ def test_known_perturbations_are_undone(tmp_path):
         pose[:3, :3] = pose[:3, :3] @ rotation_of_vector(turn * math.radians(0.5) / turn.norm())
         pose[:3, 3] += 0.5 * shift / shift.norm()
         perturbed.append(replace(frame, camera=replace(frame.camera, camera_to_world=pose)))
-    scene = Scene("tube", perturbed, {"test": []}, PointCloud(points, colors), {"fingerprint": "tube"})
+    scene = Scene("tube", perturbed, {"test": []}, PointCloud(points, colors), Provenance(fingerprint="tube"))
     trainer = Trainer(
         load_method("3dgs-depth", METHOD), scene, "tube", RunFolder(tmp_path / "run"), 0, torch.device("cpu")
     )

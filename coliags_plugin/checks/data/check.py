@@ -58,7 +58,7 @@ class SceneCheck:
             "suspect": bool(self.findings),
             "findings": self.findings,
             "undecided": self.undecided,
-            "data": self.scene.provenance,
+            "data": self.scene.provenance.record(),
             "initial_points": len(self.scene.points),
             **self.facts,
             "pairs": [[source.name, target.name] for source, target in self.pairs],
@@ -127,7 +127,7 @@ def check_scene(
     depth, path = rules.depth_facts(sample), rules.path_facts(video)
     images, lamp = rules.image_facts(sample), rules.lamp_facts(sample)
     measured = [
-        ("points", scene.provenance),
+        ("points", dict(vars(scene.provenance))),
         ("depth", depth and depth | {"metric": scene.is_metric}),
         ("lamp", lamp),
         ("path", path),

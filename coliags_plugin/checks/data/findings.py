@@ -207,7 +207,7 @@ def is_flat(depth: JsonObject) -> bool:
 RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str, str, str]]] = {
     "points": [
         (
-            lambda data: data.get("misplaced_observations", 0) > 0.5 * data.get("observations", 0),
+            lambda data: data["misplaced_observations"] > 0.5 * data["observations"],
             "poses and points of the model contradict each other",
             "{misplaced_observations} of {observations} observations of points are not where the poses project them",
             "Take poses, points and intrinsics from one model: a factor on the poses alone, another camera or poses of "

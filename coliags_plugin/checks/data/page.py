@@ -33,7 +33,7 @@ def check_page(check: SceneCheck) -> model.Page:
         model.Section("Agreement", _agreement(check)),
         model.Section("Reprojected frames", [_pair_images(*pair, unit) for pair in shown], screen_only=True),
         model.Section("Trajectory", [_trajectory(check.scene.video, unit)], screen_only=True),
-        model.Section("Data", [model.record("Origin of the data", check.scene.provenance)], screen_only=True),
+        model.Section("Data", [model.record("Origin of the data", check.scene.provenance.record())], screen_only=True),
     ]
     return model.Page(f"{name}: data check", sections, list(_facts(check)), heading=f"{name}: {verdict(check)}")
 
@@ -53,17 +53,16 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     data = scene.provenance
     camera = scene.train[0].camera
     counts = {"train": len(scene.train), **{name: len(frames) for name, frames in scene.test_sets.items()}}
-    layout, stored = data.get("layout"), data.get("stored_size")
-    yield model.Fact("format", str(data.get("dataset", "unknown")), note=f"{layout} layout" if layout else "")
+    yield model.Fact("format", data.dataset, note=f"{data.layout} layout" if data.layout else "")
     yield model.Fact("frames", ", ".join(f"{count} {name}" for name, count in counts.items()))
-    yield model.Fact("split", str(data.get("split", {}).get("name", "unknown")))
+    yield model.Fact("split", data.split_name or "unknown")
     size = sizes_text((frame.camera.width, frame.camera.height) for frame in scene.video)
-    several = " and others" if " to " in size else ""
+    several, stored = " and others" if " to " in size else "", data.stored_size
     yield model.Fact("image size", f"{size} px" + (f", stored {stored[0]} x {stored[1]}{several}" if stored else ""))
-    yield model.Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
+    yield model.Fact("lens", data.lens or "pinhole images")
     focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"
     yield model.Fact("calibration", f"{focal}, {center} px, {angle_across(camera.intrinsics):.1f} degrees across")
-    yield model.Fact("pose convention", _convention(data.get("pose_convention")))
+    yield model.Fact("pose convention", _convention(data.pose_convention))
     unit = scene.length_unit
     stated = "unknown (--set datamanager.unit=mm or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
@@ -86,7 +85,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     if lamp:
         correlation = f"rank correlation {lamp['correlation']:.2f} (median of {counted(lamp['frames'], 'frame')})"
         yield model.Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
-    yield model.Fact("initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}")
+    yield model.Fact("initial points", f"{len(scene.points)} from {data.points.source}")
 
 
 def _convention(facts: Any) -> str:

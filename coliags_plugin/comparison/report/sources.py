@@ -19,7 +19,7 @@ from coliags_plugin.comparison.plan_file import (
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.scenes import held_out_uses
+from coliags_plugin.core.provenance import held_out_uses
 from coliags_plugin.reporting.model import leaves
 from coliags_plugin.results.hashing import training_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result

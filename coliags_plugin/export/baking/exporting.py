@@ -124,7 +124,7 @@ def _written(
         "run": {
             "method": trained.method,
             "scene": trained.scene.name,
-            "fingerprint": trained.scene.provenance.get("fingerprint"),
+            "fingerprint": trained.scene.provenance.fingerprint,
             "seed": trained.seed,
             "step": trained.step,
         },

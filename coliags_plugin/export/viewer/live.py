@@ -24,7 +24,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
-from coliags_plugin.engine.data_formats import recorded_scale
 from coliags_plugin.engine.devices import make_current
 from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
@@ -385,7 +384,7 @@ class LiveView(Follower):
 
     def __init__(self, trainer: Trainer, port: int = 8080) -> None:
         method, provenance = trainer.method, trainer.provenance()
-        scale = recorded_scale(trainer.scene.provenance)
+        scale = trainer.scene.provenance.training_scale
         scene, model = trainer.scene.scaled(1.0 / scale), trainer.model.with_field(trainer.model.field, scale)
         trained = TrainedRun(
             trainer.run, method.config, method.name, scene, model, trainer.step, trainer.device,

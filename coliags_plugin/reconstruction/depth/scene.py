@@ -74,7 +74,7 @@ def estimate_scene(
     prior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
     described = {
         "version": _VERSION,
-        "data": scene.provenance["fingerprint"],
+        "data": scene.provenance.fingerprint,
         "frames": [frame.name for frame in frames],
         "sources": sources,
         "size": [frames[0].camera.width, frames[0].camera.height],
@@ -95,8 +95,8 @@ def estimate_scene(
 
 def training_options(scene: Scene) -> list[str]:
     """Options of training with which the scene written for a source has its split and its size."""
-    split, camera = scene.provenance["split"], scene.train[0].camera
-    options = split_options(split["name"], split.get("block", ()))
+    split, camera = scene.provenance.split, scene.train[0].camera
+    options = [] if split is None else split_options(split.name, split.block)
     if fitted(camera.width, camera.height, PAPER_SIZE) != (camera.width, camera.height):
         options += [f"datamanager.width={camera.width}", f"datamanager.height={camera.height}"]
     return options
@@ -155,9 +155,9 @@ def _write(
         )
     train = [frame.name for frame in scene.train]
     test = [frame.name for frame in scene.test_sets.get("test", ())]
-    own = scene.provenance["split"]["name"] == "own"
+    own = scene.provenance.split_name == "own"
     writer.finish(positions, colors, train, (train, test) if own else None)
-    write_unit(folder, scene.provenance["unit"])
+    write_unit(folder, scene.provenance.unit)
     bins = np.searchsorted(np.cumsum(counts), np.multiply(known, _SHARES))
     near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)
     share = f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"

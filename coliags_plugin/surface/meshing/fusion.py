@@ -202,7 +202,7 @@ def _summary(
         "scene": scene.name,
         "step": trained.step,
         "views": len(scene.train),
-        "unit": scene.provenance.get("unit", "mm") if scene.is_metric else "unknown",
+        "unit": scene.provenance.unit,
         "settings": settings.model_dump() | used,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh),

@@ -171,7 +171,7 @@ def test_everything_in_metres(scene):
     findings = whats(metres)
     assert "depth looks like metres" in findings
     assert "different units" not in findings
-    unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
+    unknown = replace(metres, provenance=metres.provenance.model_copy(update={"unit": "unknown"}))
     check = check_scene(unknown)
     assert check.findings == []
     assert "depth error, units" in (text := page_text(check_page(check))) and " mm;" not in text
@@ -179,7 +179,7 @@ def test_everything_in_metres(scene):
 
 def test_depth_of_other_frames(frames):
     mixed = [replace(frame, depth=frames[7 * frame.index % len(frames)].depth) for frame in frames]
-    assert "frames do not agree on the surface" in whats(Scene("mixed", mixed, {}, PointCloud(torch.zeros(0, 3)), {}))
+    assert "frames do not agree on the surface" in whats(Scene("mixed", mixed, {}, PointCloud(torch.zeros(0, 3))))
 
 
 def test_intrinsics_of_another_size(scene):
@@ -250,7 +250,7 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
         camera = replace(frame.camera, camera_to_world=pose)
         name, index, image = f"{len(video):04d}", len(video), frame.image + noise
         video.append(replace(frame, name=name, index=index, camera=camera, depth=None, image=image))
-    return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)), {})
+    return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)))
 
 
 @pytest.mark.thorough
@@ -290,7 +290,7 @@ def lit(frames: list[Frame]) -> list[Frame]:
 @pytest.mark.thorough
 def test_reversed_depth_contradicts_the_lamp(frames):
     def scene_of(frames):
-        return Scene("lit", frames, {}, PointCloud(torch.zeros(0, 3)), {})
+        return Scene("lit", frames, {}, PointCloud(torch.zeros(0, 3)))
 
     def only_points(frame):
         pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(frame.index)) * torch.tensor([160, 128])

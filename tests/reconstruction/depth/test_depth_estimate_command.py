@@ -121,7 +121,7 @@ def test_the_depth_of_training_frames_does_not_depend_on_the_images_of_test_fram
 
 def test_what_a_split_holds_out_is_recorded_where_depth_was_made_from_it(estimated, tmp_path):
     def used(folder, split):
-        return open_scene(folder, options=[f"split={split}"]).provenance.get("held_out_used")
+        return open_scene(folder, options=[f"split={split}"]).provenance.held_out_used
 
     assert used(estimated, "every-8th") is None
     assert used(estimated, "all-train") is None

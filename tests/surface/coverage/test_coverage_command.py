@@ -6,6 +6,7 @@ import csv
 import html
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import tests.layouts  # noqa: F401  (registers c3vd-raw)
 from coliags_plugin.api.scenes import make_phantom
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_8_bit, write_image
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.surface.coverage.page import RESEARCH_USE
@@ -140,8 +142,7 @@ def test_of_a_short_video_the_seen_wall_is_written_and_why_there_is_no_section(p
 
 @pytest.mark.thorough
 def test_a_scene_of_unknown_unit_has_its_areas_in_square_units(phantom, tmp_path):
-    scene = open_recording(phantom)
-    scene.provenance["unit"] = "unknown"
+    scene = replace(open_recording(phantom), provenance=Provenance(unit="unknown"))
     made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "out", CoverageSettings(rays=8000))
     assert made.values["unit"] == "unknown" and made.values["settings"]["far"] is None
     assert "square units" in made.summary[0] and "unit of length is unknown" in made.values["no_section"]

@@ -56,4 +56,4 @@ def exact_run(frames: int = 17, square: bool = False, scene: Scene | None = None
 
 def with_provenance(scene: Scene, **provenance) -> Scene:
     """The scene with more of its origin known."""
-    return replace(scene, provenance={**scene.provenance, **provenance})
+    return replace(scene, provenance=scene.provenance.model_copy(update=provenance))
