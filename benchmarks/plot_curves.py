@@ -14,7 +14,9 @@ from typing import Any
 import tyro
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.reporting.charts import Series, line_chart
+from coliags_plugin.reporting.charts import Series
+from coliags_plugin.reporting.html_page import chart_svg
+from coliags_plugin.reporting.model import Chart
 
 #: What is drawn: key of a row, axis label, whether the axis is logarithmic.
 PANELS = (
@@ -66,7 +68,7 @@ def panel(curves: list[tuple[str, list[dict[str, Any]]]], key: str, label: str, 
         Series(name, style, [row["step"] for row in rows if key in row], [row[key] for row in rows if key in row])
         for style, (name, rows) in enumerate(curves)
     ]
-    return line_chart(series, "step", label, log_y=log_y)
+    return chart_svg(Chart(series, "step", label, log_y=log_y))
 
 
 def legend(names: list[str], top: int) -> list[str]:

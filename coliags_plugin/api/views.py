@@ -17,7 +17,13 @@ from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.reporting.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
+from coliags_plugin.reporting.colormaps import (
+    DEPTH_ERROR_LIMIT_MM,
+    colorize_depth,
+    colorize_error,
+    depth_error,
+    depth_limits,
+)
 from coliags_plugin.reporting.image_files import as_array, eight_bit, encode_png
 
 #: Smallest width of an image in a notebook, px on the screen.
@@ -63,9 +69,8 @@ class RenderedView:
             shown[f"true depth, {scale}"] = colorize_depth(self.true_depth, limits)
         shown[f"depth, {scale}"] = colorize_depth(self.depth, limits)
         if self.true_depth is not None:
-            known, limit = np.isfinite(self.true_depth), self.error_limit
-            errors = colorize_depth_error(self.depth, self.true_depth, known, limit)
-            shown[f"depth error, 0 to {limit:g} {self.unit}"] = errors
+            errors, limit = depth_error(self.depth, self.true_depth), self.error_limit
+            shown[f"depth error, 0 to {limit:g} {self.unit}"] = colorize_error(*errors, limit)
         return shown
 
     def _repr_html_(self) -> str:

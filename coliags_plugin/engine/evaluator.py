@@ -27,8 +27,9 @@ from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
     colorize_depth,
-    colorize_depth_error,
+    colorize_error,
     common_limits,
+    depth_error,
 )
 from coliags_plugin.reporting.image_files import eight_bit, read_depth_tiff, write_depth_tiff, write_png
 from coliags_plugin.results.hashing import code_key, metrics_sha256, plain_config, result_key
@@ -122,8 +123,8 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, error_limit)
-    write_png(folder / "errors" / f"{name}.png", errors)
+    errors = depth_error(comparison.depth, known, comparison.depth_valid)
+    write_png(folder / "errors" / f"{name}.png", colorize_error(*errors, error_limit))
 
 
 def _write_depth_pictures(evaluation: Path, unit: str) -> None:

@@ -23,17 +23,17 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
+    RGB_ERROR_LIMIT,
     color_bar,
     colorize_depth,
-    colorize_depth_error,
-    colorize_rgb_error,
+    colorize_error,
+    depth_error,
     depth_limits,
+    rgb_error,
 )
 from coliags_plugin.reporting.image_files import as_array, eight_bit, write_depth_tiff, write_png
 from coliags_plugin.reporting.video import write_video
 
-#: Upper limit of the colour error images, as a share of the colour range.
-RGB_ERROR_LIMIT = 0.2
 #: Outputs of a view unless others are asked for.
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
@@ -144,11 +144,11 @@ def _write_frame(
     write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
     valid = frame.valid.cpu()
     if not trained.relit:
-        errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
-        write_png(folder / "rgb_error" / name, errors)
+        errors = rgb_error(output.rgb.cpu(), frame.image, valid)
+        write_png(folder / "rgb_error" / name, colorize_error(*errors, RGB_ERROR_LIMIT))
     if (true := frame.true_depth) is not None:
-        errors = colorize_depth_error(depth.cpu(), true, valid, error_limit_of(trained))
-        write_png(folder / "depth_error" / name, errors)
+        errors = depth_error(depth.cpu(), true, valid)
+        write_png(folder / "depth_error" / name, colorize_error(*errors, error_limit_of(trained)))
 
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:

@@ -20,11 +20,10 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
 from coliags_plugin.pipeline.stages import PAGE_FILE
-from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.reporting.charts import COLORS
 from coliags_plugin.reporting.image_files import encode_jpeg
 from coliags_plugin.reporting.model import EncodedImage, Template
-from coliags_plugin.reporting.numbers import counted
+from coliags_plugin.reporting.numbers import counted, linear_ticks, tick_label
 
 #: Columns of the ribbon and of the curves, and pictures above it.
 _COLUMNS, _BINS, _PICTURES = 2000, 600, 24

@@ -1,24 +1,22 @@
-"""Line charts and colour bars as inline SVG, styled by the page.
+"""Geometry of line charts, which the template ``charts.html`` draws as SVG and the page's style sheet colours.
 
-The SVG uses CSS classes and no colours, so a chart is readable on a light and on a dark page. The page defines
-``.chart .frame``, ``.grid``, ``.tick``, ``.axis`` and, for each series style, ``.s0`` to ``.s7`` with a ``color``;
-line and marker take the current colour. A ninth series takes the first colour again, dashed.
+The SVG has CSS classes and no colours, so that a chart can be read on a light and on a dark page: ``.chart .frame``,
+``.grid``, ``.tick``, ``.axis`` and, for each series style, ``.s0`` to ``.s7`` with a ``color`` that lines and markers
+take. A ninth series takes the first colour again, dashed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
+from typing import ClassVar
 
-from coliags_plugin.reporting.axis_ticks import linear_ticks, log_ticks, tick_label
 from coliags_plugin.reporting.colormaps import ColorMap, color_table
+from coliags_plugin.reporting.numbers import linear_ticks, log_ticks, tick_label
 
 COLORS = 8
 
-_WIDTH, _HEIGHT = 600, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 68, 14, 12, 50
 _STOPS = 16
 #: Width of one character of an x tick label, view box units.
 _LABEL_ROOM = 7.5
@@ -34,154 +32,91 @@ class Series:
     #: same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line
     y: Sequence[float]
 
+    def points(self, log_y: bool) -> Iterator[tuple[float, float] | None]:
+        """Points of the line; None where one cannot be drawn."""
+        for x, y in zip(self.x, self.y, strict=True):
+            yield (x, y) if math.isfinite(x) and math.isfinite(y) and (y > 0.0 or not log_y) else None
+
 
 def style_classes(style: int) -> str:
     """CSS classes of a series style."""
     return f"s{style % COLORS}" + (f" dash{style // COLORS}" if style >= COLORS else "")
 
 
-def line_chart(
-    series: Sequence[Series],
-    x_label: str,
-    y_label: str,
-    *,
-    log_y: bool = False,
-    x_names: Sequence[str] | None = None,
-    markers: bool = False,
-) -> str:
-    """SVG line chart with labelled axes, or an empty string where no series has a point to draw.
-
-    ``x_names`` are the names of x = 0, 1, ... of a categorical axis; ``markers`` draws a dot with a tooltip at every
-    point.
-    """
-    points = [
-        (x, y)
-        for line in series
-        for x, y in zip(line.x, line.y, strict=True)
-        if math.isfinite(x) and _drawable(y, log_y)
-    ]
-    if not points:
-        return ""
-    axes = _Axes.around([x for x, _ in points], [y for _, y in points], log_y, x_names)
-    caption = escape(f"{y_label} over {x_label}", quote=True)
-    parts = [f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{caption}">']
-    parts += axes.drawn(x_label, y_label)
-    for line in series:
-        parts.append(f'<g class="series {style_classes(line.style)}"><title>{escape(line.name)}</title>')
-        parts += [f'<path class="line" d="{path}"/>' for path in axes.paths(line)]
-        if markers:
-            parts += [
-                f'<circle class="dot" cx="{axes.x(x):.1f}" cy="{axes.y(y):.1f}" r="3"><title>{escape(line.name)}, '
-                f"{escape(x_names[int(x)] if x_names else tick_label(x))}: {y:.4g}</title></circle>"
-                for x, y in zip(line.x, line.y, strict=True)
-                if _drawable(y, log_y)
-            ]
-        parts.append("</g>")
-    parts.append("</svg>")
-    return "".join(parts)
-
-
-def color_bar_svg(limits: tuple[float, float], unit: str, color_map: ColorMap, label: str, name: str) -> str:
-    """SVG colour bar of ``label`` with ticks and unit; ``name``, unique on the page, identifies its gradient."""
-    low, high = limits
-    left, width, top, height = 14, 312, 20, 12
+def color_stops(color_map: ColorMap) -> list[tuple[float, str]]:
+    """Offsets, 0 to 1, and hexadecimal colours of a gradient."""
     table = color_table(color_map)
-    stops = "".join(
-        f'<stop offset="{index / _STOPS:.4f}" stop-color="#{bytes(table[round(index / _STOPS * 255)]).hex()}"/>'
-        for index in range(_STOPS + 1)
-    )
-    parts = [
-        f'<svg class="bar" viewBox="0 0 340 50" role="img" aria-label="{escape(f"{label}, {unit}", quote=True)}">',
-        f'<defs><linearGradient id="{escape(name, quote=True)}">{stops}</linearGradient></defs>',
-        f'<text class="axis" x="{left}" y="13">{escape(label)} <tspan class="unit">[{escape(unit)}]</tspan></text>',
-        f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="url(#{escape(name, quote=True)})"/>',
-    ]
-    for tick in linear_ticks(low, high):
-        x = left + (tick - low) / (high - low) * width
-        parts.append(f'<path class="frame" d="M{x:.1f} {top + height}v4"/>')
-        parts.append(
-            f'<text class="tick" x="{x:.1f}" y="{top + height + 16}" text-anchor="middle">{tick_label(tick)}</text>'
-        )
-    return "".join([*parts, "</svg>"])
+    return [(index / _STOPS, bytes(table[round(index / _STOPS * 255)]).hex()) for index in range(_STOPS + 1)]
 
 
-def _drawable(value: float, log_y: bool) -> bool:
-    return math.isfinite(value) and (value > 0.0 or not log_y)
+class Axes:
+    """Mapping from the values of series, which have points, to the coordinates of a view box.
 
+    ``names`` are those of x = 0, 1, ... of a categorical axis.
+    """
 
-@dataclass(frozen=True)
-class _Axes:
-    """Mapping from values to view box coordinates, and the axes' SVG."""
+    width: ClassVar[int] = 600
+    height: ClassVar[int] = 300
+    left: ClassVar[int] = 68
+    right: ClassVar[int] = 586
+    top: ClassVar[int] = 12
+    bottom: ClassVar[int] = 250
 
-    x_low: float
-    x_high: float
-    y_low: float
-    y_high: float
-    log_y: bool
-    x_names: Sequence[str] | None
-
-    @classmethod
-    def around(cls, xs: Sequence[float], ys: Sequence[float], log_y: bool, x_names: Sequence[str] | None) -> _Axes:
-        x_low, x_high = (-0.5, len(x_names) - 0.5) if x_names is not None else (min(xs), max(xs))
-        if x_low == x_high:
-            x_low, x_high = x_low - 0.5, x_high + 0.5
-        y_low, y_high = min(ys), max(ys)
+    def __init__(self, series: Sequence[Series], log_y: bool = False, names: Sequence[str] | None = None) -> None:
+        self._log_y, self._names = log_y, names
+        xs, ys = zip(*(point for line in series for point in line.points(log_y) if point), strict=True)
+        self._x_limits = (min(xs), max(xs)) if names is None else (-0.5, len(names) - 0.5)
+        if self._x_limits[0] == self._x_limits[1]:
+            self._x_limits = self._x_limits[0] - 0.5, self._x_limits[1] + 0.5
+        low, high = min(ys), max(ys)
         if log_y:
             # At least half a decade, so that there are tick labels.
-            margin = max(1.1, math.sqrt(10.0**0.5 / min(y_high / y_low, 10.0**0.5)))
-            return cls(x_low, x_high, y_low / margin, y_high * margin, log_y, x_names)
-        margin = 0.06 * (y_high - y_low) or max(abs(y_high), 1.0) * 0.05
-        return cls(x_low, x_high, y_low - margin, y_high + margin, log_y, x_names)
+            margin = max(1.1, math.sqrt(10.0**0.5 / min(high / low, 10.0**0.5)))
+            self._y_limits = low / margin, high * margin
+        else:
+            margin = 0.06 * (high - low) or max(abs(high), 1.0) * 0.05
+            self._y_limits = low - margin, high + margin
 
     def x(self, value: float) -> float:
-        return _LEFT + (value - self.x_low) / (self.x_high - self.x_low) * (_WIDTH - _LEFT - _RIGHT)
+        """Horizontal coordinate of a value."""
+        low, high = self._x_limits
+        return self.left + (value - low) / (high - low) * (self.right - self.left)
 
     def y(self, value: float) -> float:
-        if self.log_y:
-            fraction = math.log(value / self.y_low) / math.log(self.y_high / self.y_low)
-        else:
-            fraction = (value - self.y_low) / (self.y_high - self.y_low)
-        return _HEIGHT - _BOTTOM - fraction * (_HEIGHT - _TOP - _BOTTOM)
+        """Vertical coordinate of a value."""
+        low, high = self._y_limits
+        share = math.log(value / low) / math.log(high / low) if self._log_y else (value - low) / (high - low)
+        return self.bottom - share * (self.bottom - self.top)
 
-    def drawn(self, x_label: str, y_label: str) -> list[str]:
-        """Grid, ticks and labels."""
-        right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
-        parts = []
-        for tick in (log_ticks if self.log_y else linear_ticks)(self.y_low, self.y_high):
-            y = self.y(tick)
-            parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{right}"/>')
-            parts.append(
-                f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>'
-            )
-        for position, name in self._x_ticks():
-            x = self.x(position)
-            parts.append(f'<path class="frame" d="M{x:.1f} {bottom}v4"/>')
-            parts.append(f'<text class="tick" x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{escape(name)}</text>')
-        parts.append(f'<path class="frame" d="M{_LEFT} {_TOP}V{bottom}H{right}"/>')
-        middle = (_LEFT + right) / 2
-        parts.append(f'<text class="axis" x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">{escape(x_label)}</text>')
-        middle = (_TOP + bottom) / 2
-        parts.append(
-            f'<text class="axis" transform="translate(15 {middle}) rotate(-90)" text-anchor="middle">'
-            f"{escape(y_label)}</text>"
-        )
-        return parts
+    @property
+    def y_ticks(self) -> list[tuple[float, str]]:
+        """Coordinates and labels of the y axis."""
+        ticks = log_ticks(*self._y_limits) if self._log_y else linear_ticks(*self._y_limits)
+        return [(self.y(tick), tick_label(tick)) for tick in ticks]
 
-    def _x_ticks(self) -> list[tuple[float, str]]:
-        if self.x_names is None:
-            return [(tick, tick_label(tick)) for tick in linear_ticks(self.x_low, self.x_high)]
-        longest = max(len(name) for name in self.x_names) + 2
-        room = max(1, int((_WIDTH - _LEFT - _RIGHT) / (longest * _LABEL_ROOM)))
-        stride = math.ceil(len(self.x_names) / room)
-        return [(float(index), self.x_names[index]) for index in range(0, len(self.x_names), stride)]
+    @property
+    def x_ticks(self) -> list[tuple[float, str]]:
+        """Coordinates and labels of the x axis; of many names, some."""
+        if (names := self._names) is None:
+            return [(self.x(tick), tick_label(tick)) for tick in linear_ticks(*self._x_limits)]
+        longest = max(map(len, names)) + 2
+        room = max(1, int((self.right - self.left) / (longest * _LABEL_ROOM)))
+        return [(self.x(index), names[index]) for index in range(0, len(names), math.ceil(len(names) / room))]
 
     def paths(self, line: Series) -> list[str]:
-        """One path per uninterrupted segment of a line."""
-        stretches: list[list[str]] = [[]]
-        for x, y in zip(line.x, line.y, strict=True):
-            if math.isfinite(x) and _drawable(y, self.log_y):
-                stretches[-1].append(f"{self.x(x):.1f} {self.y(y):.1f}")
+        """SVG paths of the uninterrupted segments of a line."""
+        segments: list[list[str]] = [[]]
+        for point in line.points(self._log_y):
+            if point is None:
+                segments.append([])
             else:
-                stretches.append([])
+                segments[-1].append(f"{self.x(point[0]):.1f} {self.y(point[1]):.1f}")
         # A segment of one point is visible too: round caps draw a line of no length as a dot.
-        return ["M" + "L".join(s if len(s) > 1 else s * 2) for s in stretches if s]
+        return ["M" + "L".join(s if len(s) > 1 else s * 2) for s in segments if s]
+
+    def markers(self, line: Series) -> list[tuple[float, float, str]]:
+        """Coordinates and label of a marker at every point of a line."""
+        return [
+            (self.x(x), self.y(y), f"{line.name}, {self._names[int(x)] if self._names else tick_label(x)}: {y:.4g}")
+            for x, y in filter(None, line.points(self._log_y))
+        ]

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.reporting.image_files import as_array
+from coliags_plugin.reporting.numbers import linear_ticks, tick_label
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,6 +24,8 @@ ColorMap = Literal["depth", "error"]
 
 #: Full scale of stand-alone depth error maps, mm; the same for all, so that they are comparable.
 DEPTH_ERROR_LIMIT_MM = 2.0
+#: Full scale of RGB error maps, as a fraction of that of the colours.
+RGB_ERROR_LIMIT = 0.2
 #: Grey level of pixels of unknown depth.
 UNKNOWN_GREY = 128
 #: Grey levels of the hatching over error pixels without ground truth.
@@ -83,21 +85,6 @@ def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor], unit: str 
     return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))
 
 
-def colorize_depth_error(
-    rendered_mm: Float[np.ndarray, "H W"] | Tensor,
-    true_mm: Float[np.ndarray, "H W"] | Tensor,
-    valid: Bool[np.ndarray, "H W"] | Tensor | None,
-    limit_mm: float,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped absolute depth error on a fixed scale; pixels without ground truth are hatched in grey.
-
-    Depths are of one kind, mm; NaN of the truth is unknown. ``valid`` masks the pixels that count. Errors from
-    ``limit_mm`` on take the last colour, and so does a pixel whose truth is known and whose rendering is not finite.
-    """
-    error, known = depth_error(rendered_mm, true_mm, valid)
-    return colorize_error(error, known, limit_mm)
-
-
 def depth_error(
     rendered_mm: Float[np.ndarray, "H W"] | Tensor,
     true_mm: Float[np.ndarray, "H W"] | Tensor,
@@ -105,7 +92,8 @@ def depth_error(
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Absolute depth error, mm, and where the truth is known.
 
-    The error is infinite where only the rendering is not finite, and 0 where the truth is unknown.
+    Depths are of one kind, mm; NaN of the truth is unknown. ``valid`` masks the pixels that count. The error is
+    infinite where only the rendering is not finite, and 0 where the truth is unknown.
     """
     rendered, true = (as_array(depth).astype(np.float64) for depth in (rendered_mm, true_mm))
     known = np.isfinite(true)
@@ -117,20 +105,17 @@ def depth_error(
     return error, known
 
 
-def colorize_rgb_error(
+def rgb_error(
     rendered: np.ndarray | Tensor,
     true: np.ndarray | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
-    limit: float = 0.2,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped absolute RGB error (channel mean) on a fixed scale; ignored pixels are hatched in grey.
+) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Mean over the channels of |rendered - true|, as a fraction of full scale, and which pixels count.
 
-    Colours are uint8, or floating point in [0, 1]. Errors from ``limit`` on, a fraction of full scale, take the last
-    colour.
+    Colours are uint8, or floating point in [0, 1]. ``valid`` masks the pixels that count.
     """
-    error = rgb_error(rendered, true)
-    known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
-    return colorize_error(error, known, limit)
+    error: np.ndarray = np.abs(_unit_rgb(rendered) - _unit_rgb(true)).mean(axis=2)
+    return error, np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
 
 
 def colorize_error(
@@ -140,12 +125,6 @@ def colorize_error(
     image = _colored(np.where(known, error, 0.0) / limit, "error")
     image[~known] = hatch(*known.shape)[~known]
     return image
-
-
-def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
-    """Mean over the channels of |rendered - true|, as a fraction of full scale. [H, W]"""
-    error: np.ndarray = np.abs(_unit_rgb(rendered) - _unit_rgb(true)).mean(axis=2)
-    return error
 
 
 def color_bar(

@@ -11,18 +11,19 @@ import re
 import shutil
 from base64 import b64encode
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2.environment import TemplateModule
 from markupsafe import Markup, escape
 
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.reporting.charts import color_bar_svg, line_chart, style_classes
-from coliags_plugin.reporting.model import Block, Chart, ColorBar, EncodedImage, Figure, Image, Page, Template
-from coliags_plugin.reporting.numbers import DASH, counted, sentence, unit_text
+from coliags_plugin.reporting.charts import Axes, color_stops, style_classes
+from coliags_plugin.reporting.model import Block, Chart, EncodedImage, Figure, Page
+from coliags_plugin.reporting.numbers import DASH, counted, linear_ticks, sentence, tick_label, unit_text
 
 #: Largest page, bytes; pictures that have no room in it are written into a folder beside it.
 PAGE_LIMIT = 40_000_000
@@ -46,16 +47,21 @@ def write_html(page: Page, output: Path, limit: int = PAGE_LIMIT) -> None:
 
 def html_text(page: Page, output: Path | None = None, limit: int = PAGE_LIMIT) -> str:
     """A page as HTML, all pictures within it, or those beyond ``limit`` bytes in files beside ``output``."""
-    pictures: dict[str, EncodedImage] = {}
     style, script = (Markup((_ASSETS / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js"))
-    text = _filled(pictures, "page.html", page=page, style=style, script=script, version=__version__)
-    return _with_pictures(text, pictures, output, limit)
+    writer = _Writer()
+    text = writer.filled("page.html", page=page, style=style, script=script, version=__version__)
+    return _with_pictures(text, writer.pictures, output, limit)
 
 
-def html_blocks(blocks: Sequence[Block]) -> str:
+def html_blocks(blocks: Sequence[Block | Figure]) -> str:
     """Blocks as HTML without a page around them, all pictures within the text."""
-    pictures: dict[str, EncodedImage] = {}
-    return _with_pictures(_filled(pictures, "fragment.html", blocks=blocks), pictures)
+    writer = _Writer()
+    return _with_pictures("".join(map(writer.show, blocks)), writer.pictures)
+
+
+def chart_svg(chart: Chart) -> str:
+    """A line chart as SVG, or an empty string where it has no point to draw."""
+    return str(_Writer().filled("chart.svg", chart=chart)) if chart.has_points else ""
 
 
 def refuse_folder(output: Path) -> None:
@@ -64,18 +70,29 @@ def refuse_folder(output: Path) -> None:
         raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
 
 
-def _filled(pictures: dict[str, EncodedImage], file: str, **values: object) -> Markup:
-    """The text of a template, with placeholders for pictures, which are added to ``pictures``."""
+class _Writer:
+    """Writes blocks and figures by the macros that ``blocks.html`` has of their kinds, and collects their pictures."""
 
-    def address(image: EncodedImage) -> str:
+    def __init__(self) -> None:
+        self.pictures: dict[str, EncodedImage] = {}
+        self._names = {"show": self.show, "filled": self.filled, "address": self.address}
+
+    def show(self, block: Block | Figure, level: int = 2) -> Markup:
+        return Markup(getattr(self._macros, block.kind)(block, level))
+
+    @cached_property
+    def _macros(self) -> TemplateModule:
+        return environment(_ASSETS).get_template("blocks.html").make_module(self._names)
+
+    def filled(self, file: str, **values: object) -> Markup:
+        """The text of a template, with placeholders for pictures."""
+        return Markup(environment(_ASSETS).get_template(file).render(values | self._names))
+
+    def address(self, image: EncodedImage) -> str:
+        """Placeholder for the address of a picture."""
         key = hashlib.sha256(image.data).hexdigest()[:20]
-        pictures[key] = image
+        self.pictures[key] = image
         return f"picture:{key}"
-
-    def filled(block: Template) -> Markup:
-        return _filled(pictures, block.file, **block.values)
-
-    return Markup(environment(_ASSETS).get_template(file).render(address=address, filled=filled, **values))
 
 
 def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | None = None, limit: int = 0) -> str:
@@ -109,38 +126,21 @@ def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | 
 @cache
 def environment(assets: Path) -> Environment:
     """The Jinja environment of the templates in a folder."""
-    loader = FileSystemLoader(assets)
-    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    functions = (columns_of, drawn, enumerate, sentence, style_classes, unit_text)
-    made.tests["a"] = lambda block, kind: kind in (each.__name__ for each in type(block).__mro__)
-    made.globals |= {"dash": DASH, **{function.__name__: function for function in functions}}
-    return made
+    templates = Environment(
+        loader=FileSystemLoader(assets),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    functions = (color_stops, columns_of, enumerate, linear_ticks, sentence, style_classes, tick_label, unit_text)
+    templates.globals |= {"dash": DASH, "axes_of": Axes, **{function.__name__: function for function in functions}}
+    return templates
 
 
 def columns_of(count: int) -> int:
     """Pictures in a row, at most four, such that rows are filled evenly: 3 for six pictures."""
     return math.ceil(count / math.ceil(count / 4)) if count else 1
-
-
-def drawn(figures: Sequence[Figure]) -> list[tuple[Figure, Markup]]:
-    """Figures with their SVG, without charts that have no point to draw."""
-    return [(figure, Markup(_svg(figure))) for figure in figures if not isinstance(figure, Chart) or figure.has_points]
-
-
-def _svg(figure: Figure) -> str:
-    """SVG of a chart or colour bar; empty for pictures."""
-    if isinstance(figure, Image):
-        return ""
-    if isinstance(figure, ColorBar):
-        return color_bar_svg(figure.limits, figure.unit, figure.color_map, figure.label, figure.name)
-    return line_chart(
-        figure.series,
-        figure.x_label,
-        figure.y_label,
-        log_y=figure.log_y,
-        x_names=figure.x_names,
-        markers=figure.markers,
-    )
 
 
 def _remove_former(folder: Path, kept: set[str]) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from coliags_plugin.reporting.numbers import Direction, column_decimals, number_text, plain, ranks_of, unit_text
 
@@ -24,6 +23,12 @@ Value = str | int | float | None
 _LARGEST_MAPPING = 12
 _ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+class Block:
+    """A piece of a page; writers have a method, and ``blocks.html`` a macro, named as its ``kind``."""
+
+    kind: ClassVar[str]
 
 
 @dataclass(frozen=True)
@@ -94,9 +99,10 @@ class Footnote:
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Block):
     """A table: columns, and rows of values or cells by the keys of the columns."""
 
+    kind: ClassVar[str] = "table"
     title: str
     columns: Sequence[Column]  # the first one labels the rows
     rows: Sequence[Mapping[str, Value | TableCell]]  # values by key; a missing one is shown as a dash
@@ -126,9 +132,10 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Paragraph:
+class Paragraph(Block):
     """Sentences, in the small print of a hint unless said otherwise."""
 
+    kind: ClassVar[str] = "paragraph"
     text: str
     hint: bool = True
 
@@ -143,17 +150,19 @@ class Bullet:
 
 
 @dataclass(frozen=True)
-class Bullets:
+class Bullets(Block):
     """A list; of warnings, in a frame."""
 
+    kind: ClassVar[str] = "bullets"
     items: Sequence[Bullet]
     warning: bool = False
 
 
 @dataclass(frozen=True)
-class FactList:
+class FactList(Block):
     """Facts in a column, names to the left of values; says so where there are none."""
 
+    kind: ClassVar[str] = "facts"
     facts: Sequence[Fact]
 
 
@@ -178,6 +187,7 @@ class EncodedImage:
 class Image:
     """A picture."""
 
+    kind: ClassVar[str] = "image"
     image: EncodedImage  # the file
     caption: str
     wide: bool = False  # whether it takes the page's width, on white
@@ -185,8 +195,9 @@ class Image:
 
 @dataclass(frozen=True)
 class Chart:
-    """A line chart (:func:`coliags_plugin.reporting.charts.line_chart`)."""
+    """A line chart."""
 
+    kind: ClassVar[str] = "chart"
     series: Sequence[Series]  # lines over one x axis
     x_label: str  # quantity and unit of the x axis
     y_label: str  # quantity and unit of the y axis
@@ -200,11 +211,7 @@ class Chart:
     @property
     def has_points(self) -> bool:
         """Tell whether any point of it can be drawn."""
-        return any(
-            math.isfinite(x) and math.isfinite(y) and (y > 0.0 or not self.log_y)
-            for line in self.series
-            for x, y in zip(line.x, line.y, strict=True)
-        )
+        return any(point for line in self.series for point in line.points(self.log_y))
 
     @property
     def names(self) -> list[tuple[int, str]]:
@@ -216,6 +223,7 @@ class Chart:
 class ColorBar:
     """The scale of a colour map."""
 
+    kind: ClassVar[str] = "color_bar"
     limits: tuple[float, float]  # values of the first and the last colour
     unit: str  # of the values
     color_map: ColorMap  # the colour map
@@ -227,42 +235,43 @@ Figure = Image | Chart | ColorBar
 
 
 @dataclass(frozen=True)
-class Figures:
+class Figures(Block):
     """Figures of one kind beside each other; charts without a line are left out."""
 
+    kind: ClassVar[str] = "figures"
     figures: Sequence[Figure]  # of one kind
     title: str = ""  # above them
     legend: Sequence[str] = ()  # names of the styles 0, 1, ... of charts, above them.
 
 
 @dataclass(frozen=True)
-class Template:
+class Template(Block):
     """Block that only the HTML page shows: a template of this package, filled with values."""
 
+    kind: ClassVar[str] = "template"
     file: str  # name of the file in ``reporting/assets``
     values: Mapping[str, Any] = field(default_factory=dict)  # by the names that the template uses
 
 
 @dataclass(frozen=True)
-class Folded:
+class Folded(Block):
     """Blocks behind a title that a reader unfolds; in Markdown and LaTeX, blocks under a title."""
 
+    kind: ClassVar[str] = "folded"
     title: str
     blocks: Sequence[Block]
     is_open: bool = False
 
 
 @dataclass(frozen=True)
-class Section:
+class Section(Block):
     """Blocks under a heading."""
 
+    kind: ClassVar[str] = "section"
     title: str
     blocks: Sequence[Block]  # sections among them have smaller headings
     screen_only: bool = False  # whether only the HTML page has it
     name: str = ""  # identifier, unique on a page; empty: none
-
-
-Block = Paragraph | Bullets | FactList | Table | Figures | Template | Folded | Section
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table as Grid
+from rich.text import Text
 
 from coliags_plugin.reporting.model import (
     Block,
@@ -25,6 +28,8 @@ from coliags_plugin.reporting.model import (
 )
 from coliags_plugin.reporting.numbers import DASH, sentence, unit_text
 
+#: Columns that a terminal is taken to have, so that no line is broken.
+_WIDEST = 100_000
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~])")
 _HEAD = "% Needs \\usepackage{booktabs}, and \\usepackage[T1]{fontenc} for names with underscores."
 _ESCAPES = {
@@ -59,33 +64,49 @@ _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 
 
 class _Text:
-    """Plain text, and what the formats without figures that derive from it share."""
+    """Plain text, from which the other text formats derive: a method for each kind of block, named as its ``kind``."""
 
     dash: ClassVar[str] = "-"  # stands for a missing value
     plus_minus: ClassVar[str] = "±"
 
     def blocks(self, blocks: Sequence[Block], level: int = 2) -> str:
         """Blocks one after the other, without those that have no text; titles are headings of a level and deeper."""
-        return "\n\n".join(filter(None, (self._block(block, level) for block in blocks)))
+        return "\n\n".join(filter(None, (getattr(self, block.kind)(block, level) for block in blocks)))
 
-    def _block(self, block: Block, level: int) -> str:
-        match block:
-            case Paragraph():
-                return self.escaped(block.text)
-            case Bullets():
-                return "\n".join(map(self._item, block.items))
-            case FactList():
-                return self._facts([fact for fact in block.facts if fact.text])
-            case Table():
-                return self.table(block)
-            case Section() | Folded():
-                return self._titled(block.title, self.blocks(block.blocks, level + 1), level)
-            case _:
-                return ""
+    def paragraph(self, block: Paragraph, level: int = 2) -> str:
+        return self.escaped(block.text)
+
+    def bullets(self, block: Bullets, level: int = 2) -> str:
+        return "\n".join(map(self._item, block.items))
+
+    def facts(self, block: FactList, level: int = 2) -> str:
+        return self._facts([fact for fact in block.facts if fact.text])
+
+    def table(self, block: Table, level: int = 2) -> str:
+        """The columns of a table that are shown, with its title, footnotes and notes."""
+        table = block.only_shown()
+        marks = {text: self._raised(note.mark) for text, note in table.footnotes.items()}
+        rows = [[self._cell(cell, marks.get(cell.note, "")) for cell in row] for row in table.cells]
+        notes = [*(f"{mark} {self.escaped(text)}" for text, mark in marks.items()), *map(self.escaped, table.notes)]
+        return self._table(table, [[*map(self._heading, table.columns)], *rows], [*map(sentence, notes)])
+
+    def figures(self, block: Block, level: int = 2) -> str:
+        return ""  # pictures are only on HTML pages
+
+    template = figures
+
+    def section(self, block: Section | Folded, level: int = 2) -> str:
+        return self._titled(block.title, self.blocks(block.blocks, level + 1), level)
+
+    folded = section
 
     def escaped(self, text: str) -> str:
         """Words of a text, none of whose characters has a meaning of its own."""
         return text
+
+    def page(self, page: Page) -> str:
+        head = "\n".join(filter(None, [self.facts(FactList(page.facts)), page.note, *page.cautions]))
+        return "\n\n".join(filter(None, [head, self.blocks(page.text_sections)]))
 
     def _item(self, item: Bullet) -> str:
         return ": ".join(filter(None, (item.href or item.lead, item.text)))
@@ -95,14 +116,6 @@ class _Text:
 
     def _titled(self, title: str, body: str, level: int) -> str:
         return f"{title}\n{body}" if body else ""
-
-    def table(self, table: Table) -> str:
-        """The columns of a table that are shown, with its title, footnotes and notes."""
-        shown = table.only_shown()
-        marks = {text: self._raised(note.mark) for text, note in shown.footnotes.items()}
-        rows = [[self._cell(cell, marks.get(cell.note, "")) for cell in row] for row in shown.cells]
-        notes = [*(f"{mark} {self.escaped(text)}" for text, mark in marks.items()), *map(self.escaped, table.notes)]
-        return self._table(shown, [[*map(self._heading, shown.columns)], *rows], [*map(sentence, notes)])
 
     def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
         """A table of headings and cells as texts, with its notes."""
@@ -137,6 +150,13 @@ class _Markdown(_Text):
     def escaped(self, text: str) -> str:
         return _MARKDOWN_SPECIAL.sub(r"\\\1", " ".join(text.split()))
 
+    def page(self, page: Page) -> str:
+        parts = [f"# {self.escaped(page.title)}", f"> {self.escaped(page.note)}" if page.note else ""]
+        parts.append(self.facts(FactList([fact for fact in page.facts if not fact.wide])))
+        parts += [f"{fact.name}: {self.escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
+        parts.append("\n".join(f"- **{self.escaped(caution)}**" for caution in page.cautions))
+        return "\n\n".join(filter(None, [*parts, self.blocks(page.text_sections)])) + "\n"
+
     def _item(self, item: Bullet) -> str:
         lead = f"[{self.escaped(item.lead)}]({item.href})" if item.href else self.escaped(item.lead)
         return f"- {': '.join(filter(None, (lead, self.escaped(item.text))))}"
@@ -170,7 +190,7 @@ class _Markdown(_Text):
 
 
 class _Latex(_Markdown):
-    """Tables alone."""
+    """Tables alone, below the title and the cautions of the page as comments."""
 
     dash, plus_minus = "--", r"$\pm$"
 
@@ -180,12 +200,24 @@ class _Latex(_Markdown):
         plain = [_SPECIAL.sub(lambda match: _ESCAPES[match.group()], part) for part in parts]
         return "".join(rf"\texttt{{{part}}}" if number % 2 else part for number, part in enumerate(plain))
 
+    def page(self, page: Page) -> str:
+        head = "\n".join([_HEAD, *(f"% {' '.join(text.split())}" for text in (page.title, *page.cautions))])
+        return "\n\n".join([head, self.blocks(page.text_sections)]) + "\n"
+
+    def paragraph(self, block: Block, level: int = 2) -> str:
+        return ""
+
+    bullets = facts = paragraph
+
+    def _titled(self, title: str, body: str, level: int) -> str:
+        return body
+
     def _table(self, table: Table, rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
         count = f" ({table.count})" if table.count else ""
         head, *body = (rf"{' & '.join(cells)} \\" for cells in rows)
-        printed = [row[0].published for row in table.cells]
-        if True in printed[1:] and not printed[0]:
-            body.insert(printed.index(True), r"\midrule")
+        published = [row[0].published for row in table.cells]
+        if True in published[1:] and not published[0]:
+            body.insert(published.index(True), r"\midrule")
         lines = [
             r"\begin{table}[t]",
             r"\centering",
@@ -214,12 +246,14 @@ class _Latex(_Markdown):
         return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(cell.rank or 0, text)
 
 
-_MARKDOWN, _LATEX = _Markdown(), _Latex()
+_PLAIN, _MARKDOWN, _LATEX = _Text(), _Markdown(), _Latex()
 
-#: Blocks as text, with empty lines between them.
-terminal_text = _Text().blocks
+#: Blocks as text, with empty lines between them; a page without its figures.
+terminal_text, page_text = _PLAIN.blocks, _PLAIN.page
 #: A table with its title, footnotes and notes as Markdown, or as an environment ``table``: the columns that are shown.
 markdown_table, latex_table = _MARKDOWN.table, _LATEX.table
+#: A page without its figures; all of its tables, below its title and cautions as comments.
+markdown_text, latex_text = _MARKDOWN.page, _LATEX.page
 
 
 @dataclass(frozen=True, repr=False)
@@ -239,83 +273,57 @@ class DisplayTable(Table):
         return html_blocks([self])
 
 
-def page_text(page: Page) -> str:
-    """Facts, tables and sentences of a page as text; no figures."""
-    head = "\n".join(filter(None, [terminal_text([FactList(page.facts)]), page.note, *page.cautions]))
-    return "\n\n".join(filter(None, [head, terminal_text(page.text_sections)]))
-
-
-def markdown_text(page: Page) -> str:
-    """A page without its figures."""
-    escaped = _MARKDOWN.escaped
-    parts = [f"# {escaped(page.title)}", f"> {escaped(page.note)}" if page.note else ""]
-    parts.append(_MARKDOWN.blocks([FactList([fact for fact in page.facts if not fact.wide])]))
-    parts += [f"{fact.name}: {escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
-    parts.append("\n".join(f"- **{escaped(caution)}**" for caution in page.cautions))
-    return "\n\n".join(filter(None, [*parts, _MARKDOWN.blocks(page.text_sections)])) + "\n"
-
-
-def latex_text(page: Page) -> str:
-    """All tables in the order of the page, below its title and cautions as comments."""
-    head = "\n".join([_HEAD, *(f"% {' '.join(text.split())}" for text in (page.title, *page.cautions))])
-    return "\n\n".join([head, *map(latex_table, _tables_of(page.text_sections))]) + "\n"
-
-
-def _tables_of(blocks: Sequence[Block]) -> Iterator[Table]:
-    for block in blocks:
-        if isinstance(block, Table):
-            yield block
-        elif isinstance(block, (Section, Folded)):
-            yield from _tables_of(block.blocks)
-
-
 def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
     """Rows of cells as lines; ``l`` or ``r`` for each column."""
-    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
-    lines = []
+    grid = Grid.grid(padding=(0, 2))
+    for side in alignment:
+        grid.add_column(justify="right" if side == "r" else "left", no_wrap=True)
     for row in rows:
-        pads = [" " * (width - cell_len(text)) for text, width in zip(row, widths, strict=True)]
-        cells = [
-            pad + text if side == "r" else text + pad for text, pad, side in zip(row, pads, alignment, strict=True)
+        grid.add_row(*map(Text, row))
+    console = Console(file=io.StringIO(), width=_WIDEST, color_system=None, force_jupyter=False)
+    return "\n".join("".join(part.text for part in line).rstrip() for line in console.render_lines(grid, pad=False))
+
+
+class _Values:
+    """JSON values: a method for each kind of block gives the key of the list that its values belong to, and these."""
+
+    def paragraph(self, block: Block) -> None:
+        """Sentences and pictures have no values."""
+
+    bullets = figures = template = paragraph
+
+    def facts(self, block: FactList) -> tuple[str, Any]:
+        return "facts", self.facts_by_name(block.facts)
+
+    def table(self, block: Table) -> tuple[str, Any]:
+        """Columns with their units, and rows of plain values by their keys."""
+        columns = [
+            {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
+            for column in block.columns
         ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+        keys = [column.key for column in block.columns]
+        cells = ([cell.text or None if cell.value is None else cell.value for cell in row] for row in block.cells)
+        rows = [dict(zip(keys, row, strict=True)) for row in cells]
+        return "tables", {"title": block.title, "columns": columns, "rows": rows, "notes": list(block.notes)}
+
+    def section(self, block: Section | Folded) -> tuple[str, Any]:
+        values: dict[str, Any] = {"title": block.title}
+        for key, value in filter(None, (getattr(self, inner.kind)(inner) for inner in block.blocks)):
+            values.setdefault(key, []).append(value)
+        return "sections", values
+
+    folded = section
+
+    def facts_by_name(self, facts: Sequence[Fact]) -> dict[str, Any]:
+        return {fact.name: {"value": fact.value, "unit": fact.unit} if fact.unit else fact.value for fact in facts}
 
 
 def page_values(page: Page) -> dict[str, Any]:
-    """Facts, cautions and tables of a page; no figures and no explaining sentences."""
+    """Facts, cautions and tables of a page as JSON values; no figures and no explaining sentences."""
+    values = _Values()
     return {
         "title": page.title,
-        "facts": _fact_values(page.facts),
+        "facts": values.facts_by_name(page.facts),
         "cautions": list(page.cautions),
-        "sections": [_section_values(section) for section in page.text_sections],
+        "sections": [values.section(section)[1] for section in page.text_sections],
     }
-
-
-def _fact_values(facts: Sequence[Fact]) -> dict[str, Any]:
-    return {fact.name: {"value": fact.value, "unit": fact.unit} if fact.unit else fact.value for fact in facts}
-
-
-def _section_values(section: Section | Folded) -> dict[str, Any]:
-    values: dict[str, Any] = {"title": section.title}
-    for block in section.blocks:
-        match block:
-            case Table():
-                values.setdefault("tables", []).append(_table_values(block))
-            case FactList():
-                values.setdefault("facts", []).append(_fact_values(block.facts))
-            case Section() | Folded():
-                values.setdefault("sections", []).append(_section_values(block))
-    return values
-
-
-def _table_values(table: Table) -> dict[str, Any]:
-    """Columns with their units, and rows of plain values by their keys."""
-    columns = [
-        {"key": column.key, "title": column.name, "unit": column.unit, "better": column.direction}
-        for column in table.columns
-    ]
-    keys = [column.key for column in table.columns]
-    cells = ([cell.text or None if cell.value is None else cell.value for cell in row] for row in table.cells)
-    rows = [dict(zip(keys, row, strict=True)) for row in cells]
-    return {"title": table.title, "columns": columns, "rows": rows, "notes": list(table.notes)}

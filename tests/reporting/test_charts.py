@@ -6,9 +6,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.reporting.axis_ticks import linear_ticks, log_ticks, round_up, tick_label
-from coliags_plugin.reporting.charts import Series, color_bar_svg, line_chart, style_classes
+from coliags_plugin.reporting.charts import Series, style_classes
 from coliags_plugin.reporting.colormaps import color_table
+from coliags_plugin.reporting.html_page import chart_svg, html_blocks
+from coliags_plugin.reporting.model import Chart, ColorBar
+from coliags_plugin.reporting.numbers import linear_ticks, log_ticks, round_up, tick_label
+
+
+def line_chart(*arguments, **options):
+    return chart_svg(Chart(*arguments, **options))
 
 
 def texts(svg):
@@ -87,7 +93,7 @@ def test_styles_repeat_with_dashes():
 
 
 def test_color_bar():
-    svg = color_bar_svg((0.0, 5.0), "mm", "error", "|depth error|", "scale")
+    svg = html_blocks([ColorBar((0.0, 5.0), "mm", "error", "|depth error|", "scale")])
     assert texts(svg) == ["|depth error| [mm]", "0", "1", "2", "3", "4", "5"]
     stops = [element.get("stop-color") for element in ET.fromstring(svg).iter("stop")]
     table = color_table("error")

@@ -9,11 +9,11 @@ from coliags_plugin.reporting.colormaps import (
     color_bar,
     color_table,
     colorize_depth,
-    colorize_depth_error,
-    colorize_rgb_error,
+    colorize_error,
     common_limits,
     depth_error,
     hatch,
+    rgb_error,
     side_by_side,
 )
 
@@ -49,7 +49,7 @@ def test_depth_error_image():
     true[1, 1] = np.nan
     valid = np.ones((2, 4), bool)
     valid[1, 2] = False
-    image = colorize_depth_error(torch.from_numpy(rendered), true, valid, limit_mm=2.0)
+    image = colorize_error(*depth_error(torch.from_numpy(rendered), true, valid), limit=2.0)
     np.testing.assert_array_equal(image[0], table[[0, 128, 255, 255]])
     np.testing.assert_array_equal(image[1, 0], table[255])  # nothing rendered where there is a truth
     np.testing.assert_array_equal(image[1, 1:3], hatch(2, 4)[1, 1:3])
@@ -69,10 +69,14 @@ def test_rgb_error_image():
     rendered[0, 1] = (51, 0, 0)  # a mean of 17 levels: one third of 0.2
     rendered[0, 2] = 255
     expected = table[[0, 85, 255]]
-    np.testing.assert_array_equal(colorize_rgb_error(rendered, true)[0], expected)
-    np.testing.assert_array_equal(colorize_rgb_error(torch.from_numpy(rendered / 255.0), true)[0], expected)
-    masked = colorize_rgb_error(rendered, true, np.array([[True, True, False]]))
-    np.testing.assert_array_equal(masked[0, 2], hatch(1, 3)[0, 2])
+
+    def image(*arguments):
+        return colorize_error(*rgb_error(*arguments), limit=0.2)[0]
+
+    np.testing.assert_array_equal(image(rendered, true), expected)
+    np.testing.assert_array_equal(image(torch.from_numpy(rendered / 255.0), true), expected)
+    masked = image(rendered, true, np.array([[True, True, False]]))
+    np.testing.assert_array_equal(masked[2], hatch(1, 3)[0, 2])
 
 
 def test_color_bar_runs_through_the_map_and_is_labelled():

@@ -14,9 +14,11 @@ from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.reporting import html_page, text_formats
 from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
 from coliags_plugin.reporting.model import (
+    Block,
     Bullet,
     Bullets,
     Chart,
@@ -179,6 +181,12 @@ def test_all_formats_have_the_same_numbers(report):
         assert markdown_cells(markdown_table(table)) == said(table)
         assert latex_cells(latex_table(table)) == said(table)
         assert html_cells(html_blocks([table])) == said(table)
+
+
+@pytest.mark.parametrize("kind", [block.kind for block in Block.__subclasses__()])
+def test_every_kind_of_block_is_written_in_every_format(kind):
+    writers = (text_formats._PLAIN, text_formats._MARKDOWN, text_formats._LATEX, text_formats._Values())
+    assert all(callable(getattr(writer, kind)) for writer in (*writers, html_page._Writer()._macros))
 
 
 def test_latex_is_tables_and_comments(report):

@@ -15,7 +15,7 @@ from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
 from coliags_plugin.reporting.charts import Series
-from coliags_plugin.reporting.colormaps import colorize_depth, colorize_rgb_error
+from coliags_plugin.reporting.colormaps import RGB_ERROR_LIMIT, colorize_depth, colorize_error, rgb_error
 from coliags_plugin.reporting.image_files import eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
@@ -147,7 +147,7 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
             (eight_bit(canvas), f"{target.name} warped from {source.name}"),
             (eight_bit(mixed), "checkerboard of both: edges must be continuous"),
             (
-                colorize_rgb_error(painted.float(), target.rgb, shown),
+                colorize_error(*rgb_error(painted.float(), target.rgb, shown), RGB_ERROR_LIMIT),
                 "difference, black 0 to yellow 20 % of full scale",
             ),
         ]

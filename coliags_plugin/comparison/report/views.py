@@ -17,7 +17,6 @@ from coliags_plugin.comparison.report.metric_tables import metric_title
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.reporting.axis_ticks import linear_ticks, round_up
 from coliags_plugin.reporting.colormaps import (
     colorize_depth,
     colorize_error,
@@ -28,7 +27,7 @@ from coliags_plugin.reporting.colormaps import (
 )
 from coliags_plugin.reporting.image_files import encode_jpeg, encode_webp, read_depth_tiff
 from coliags_plugin.reporting.model import ColorBar, EncodedImage, Paragraph, Section, Template
-from coliags_plugin.reporting.numbers import column_decimals, number_text, unit_text
+from coliags_plugin.reporting.numbers import column_decimals, linear_ticks, number_text, round_up, unit_text
 
 #: Wider images are reduced by an integer factor, to limit the size of the report, px.
 _WIDEST = 640
@@ -132,7 +131,7 @@ def _read_view(frame: _Frame, runs: Sequence[StudyRun]) -> _View:
         errors = [None if depth is None else _depth_error(depth, true_depth) for depth in depths("depth")]
     of_depth = any(error is not None for error in errors)
     if not of_depth:
-        errors = [(rgb_error(render, small_truth) * 255.0).astype(np.float32) for render in renders]
+        errors = [(rgb_error(render, small_truth)[0] * 255.0).astype(np.float32) for render in renders]
     return _View(frame, runs, small_truth, true_depth, renders, errors, of_depth, depths("expected_depth"))
 
 

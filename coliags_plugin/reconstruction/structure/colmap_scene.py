@@ -17,9 +17,9 @@ from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas
-from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.reporting.colormaps import INK, draw_text, text_width
 from coliags_plugin.reporting.image_files import write_png
+from coliags_plugin.reporting.numbers import linear_ticks, tick_label
 
 #: Name of the picture of the sub-maps.
 RIBBON_FILE = "atlas.png"

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.reporting.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.reporting.colormaps import INK, draw_text, side_by_side, stacked, text_width
 from coliags_plugin.reporting.model import (
     Block,
@@ -25,7 +24,7 @@ from coliags_plugin.reporting.model import (
     record,
     simple_table,
 )
-from coliags_plugin.reporting.numbers import area_text
+from coliags_plugin.reporting.numbers import area_text, linear_ticks, tick_label
 from coliags_plugin.surface.coverage.centreline import STEP
 from coliags_plugin.surface.coverage.measure import MissedRegion, PartialCoverage, SeenWall, WallCoverage
 from coliags_plugin.surface.coverage.visibility import GUESS_COLOR, GUESS_LABEL, CoverageSettings, CoverageView, Level

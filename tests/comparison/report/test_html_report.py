@@ -266,7 +266,7 @@ def test_profiles_are_pooled_by_pixels(tmp_path):
     folder = write_comparison(tmp_path, results)
     html = (tmp_path / "page").resolve()
     write_report([folder], ReportOptions(html))
-    chart = re.search(r'aria-label="PSNR \[dB\] over distance.*?</svg>', html.read_text()).group()
+    chart = re.search(r'(?s)aria-label="PSNR \[dB\] over distance.*?</svg>', html.read_text()).group()
     titles = re.findall(r"<title>([\w-]+), ([\d.]+): ([\d.]+)</title>", chart)
     assert titles == [(method, x, y) for method in ("3dgs", "coliags") for x, y in (("5", "30"), ("15", "23.98"))]
 
