@@ -29,8 +29,8 @@ from coliags_plugin.cli.runs import (
     ViewCommand,
 )
 from coliags_plugin.cli.scenes import DataCommand, DepthCommand, PhantomCommand
-from coliags_plugin.core.decoder_messages import separate_stderr
 from coliags_plugin.core.errors import ReportedError
+from coliags_plugin.core.libraries import separate_stderr
 
 Command = (
     Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]

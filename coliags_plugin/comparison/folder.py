@@ -26,7 +26,7 @@ from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.locks import locked
+from coliags_plugin.core.jobs import locked
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.results.hashing import code_key, training_config

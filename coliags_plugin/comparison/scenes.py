@@ -16,9 +16,8 @@ from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import user_path
+from coliags_plugin.core.jobs import Progress, locked
 from coliags_plugin.core.json_files import json_text, parse_json
-from coliags_plugin.core.locks import locked
-from coliags_plugin.core.progress import Progress
 from coliags_plugin.phantom.generate import generate, resolve
 from coliags_plugin.phantom.settings import PhantomSettings
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import ClassVar, Generic
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings, SettingsT
 

@@ -1,4 +1,4 @@
-"""Reading NPZ and NPY files of unknown origin: no pickle, and no more memory than the file is worth."""
+"""Reading NPZ and NPY files of unknown origin, without pickle; dilation and erosion of masks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
+from jaxtyping import Bool
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import unreadable
@@ -73,3 +74,27 @@ def read_array(path: Path, expected: str) -> np.ndarray:
         return np.array(mapped)
     except _DAMAGED as error:
         raise unreadable(path, f"cannot read {path}: {error}", expected, "Write it again") from error
+
+
+def dilated(mask: Bool[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
+    """The mask with all pixels within ``reach`` rows and columns of it. [H, W]"""
+    from skimage.morphology import dilation
+
+    return np.asarray(dilation(mask.astype(np.uint8), _square(reach), mode="ignore")).astype(bool)
+
+
+def eroded(mask: Bool[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
+    """The mask without the pixels within ``reach`` rows and columns of its complement. [H, W]"""
+    from skimage.morphology import erosion
+
+    return np.asarray(erosion(mask.astype(np.uint8), _square(reach), mode="ignore")).astype(bool)
+
+
+def _square(reach: int) -> tuple[tuple[np.ndarray, int], ...]:
+    """The square footprint as a column and a row, which together cost far less."""
+    from skimage.morphology import footprint_rectangle
+
+    footprint: tuple[tuple[np.ndarray, int], ...] = footprint_rectangle(
+        (2 * reach + 1, 2 * reach + 1), decomposition="separable"
+    )
+    return footprint

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from coliags_plugin.core.gaussians import rotation_of_vector
 from coliags_plugin.core.intrinsics import NEAR_PLANE, Intrinsics
-from coliags_plugin.core.rotations import rotation_of_vector
-from coliags_plugin.core.transfers import constant, sent
+from coliags_plugin.core.tensors import constant, sent
 
 
 @dataclass(frozen=True)

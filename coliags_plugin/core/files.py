@@ -7,6 +7,7 @@ renames that replace a folder leaves none at its place: the next write there fin
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import json
 import logging
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Name of the list of checksums of a folder, as ``sha256sum`` writes and checks it.
+CHECKSUMS = "SHA256SUMS"
 #: Scratch folders: of which name, and of which process.
 _SCRATCH = re.compile(r"\.(.+)\.([0-9]+)-[a-z0-9_]+\.partial")
 #: What was at the place of a folder that is being replaced, in its scratch folder.
@@ -221,3 +224,43 @@ def not_writable(folder: Path, error: OSError) -> NotWritableError:
     if error.errno in _FULL:
         return NotWritableError(seen, "a disk with space left", "Free some, or choose another output")
     return NotWritableError(seen, "a writable folder", "Choose another output")
+
+
+def file_sha256(file: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    digest = hashlib.sha256()
+    try:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}", "a readable file") from error
+    return digest.hexdigest()
+
+
+def write_checksums(folder: Path) -> None:
+    """List the checksums of all files of a folder in a file of it, :data:`CHECKSUMS`."""
+    names = sorted(path.name for path in folder.iterdir() if path.is_file() and path.name != CHECKSUMS)
+    atomic_write(folder / CHECKSUMS, "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names))
+
+
+def differing_files(folder: Path) -> list[str]:
+    """Names of files that are missing from a folder or are not those of its list of checksums; without a list, none."""
+    try:
+        lines = (folder / CHECKSUMS).read_text(encoding="ascii").splitlines()
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError):
+        return [CHECKSUMS]
+    differing = []
+    for line in lines:
+        digest, _, name = line.partition("  ")
+        if not name or "/" in name:
+            return [CHECKSUMS]
+        try:
+            is_there = (folder / name).is_file()
+        except OSError:  # the name is too long
+            return [CHECKSUMS]
+        if not is_there or file_sha256(folder / name) != digest:
+            differing.append(name)
+    return differing

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
 from coliags_plugin.core import bounds
-from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.text_files import unreadable
 
 if TYPE_CHECKING:

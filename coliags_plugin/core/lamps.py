@@ -15,7 +15,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 
 #: Shortest distance to a lamp, scene units.
 _MIN_DISTANCE = 1e-6

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from coliags_plugin.core.masked import zero_outside
-from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.tensors import wall_normals, zero_outside
 
 #: Approximate number of patches, and the nearest of them that tell how large one is.
 _PATCHES, _NEIGHBOURS = 600, 8

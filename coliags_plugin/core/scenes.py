@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.pixel_ids import pixel_ids
 from coliags_plugin.core.provenance import Provenance
-from coliags_plugin.core.transfers import sent
+from coliags_plugin.core.tensors import pixel_ids, sent
 
 
 @dataclass(frozen=True)

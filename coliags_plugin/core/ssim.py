@@ -16,9 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.core.tables import fit_kernels, tables
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant, fit_kernels, masked_mean, tables, zero_outside
 
 SIGMA = 1.5
 #: Half width of the window, pixels.
@@ -48,7 +46,7 @@ def ssim_map(
     the gradient of any other; a window without ignored pixels is what it is without a mask, to the bit; and two equal
     images score 1 whatever the mask. (Setting ignored pixels to one common value in both images would do the first,
     but would also put a strong common edge into all windows around them and so raise the score there.) The values at
-    the ignored pixels themselves are meaningless: average with :func:`coliags_plugin.core.masked.masked_mean`.
+    the ignored pixels themselves are meaningless: average with :func:`coliags_plugin.core.tensors.masked_mean`.
     """
     if rendered.shape != truth.shape or rendered.dim() != 3:
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")

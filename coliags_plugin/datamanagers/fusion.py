@@ -12,8 +12,8 @@ import torch
 from coliags_plugin.core import bounds
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import read_vertices, vertex_colors
-from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.reading.files import parallel_map, required_file
 

@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Bool
 
 from coliags_plugin.contracts import DataManager
-from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import user_path
+from coliags_plugin.core.files import file_sha256, user_path
 from coliags_plugin.core.images import sizes_text, tell_of_alpha
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.provenance import PointsRecord, Provenance, SplitRecord
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled

@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float32, Shaped
 from pydantic import Field
 
-from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.datamanagers.fusion import load_points

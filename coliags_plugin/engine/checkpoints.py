@@ -19,9 +19,8 @@ from torch import Tensor
 from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Renderer, Sampler, Strategy
-from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
-from coliags_plugin.core.files import atomic_folder, final_place, write_json
+from coliags_plugin.core.files import atomic_folder, differing_files, final_place, write_checksums, write_json
 from coliags_plugin.core.json_files import JsonObject, json_text, parse_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.costs import TrainingCost

@@ -11,7 +11,7 @@ from coliags_plugin.config.components import Component, is_auto, named_component
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recorded import NoPointsError

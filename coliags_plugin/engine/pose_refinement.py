@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import OPAQUE_ALPHA
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.tensors import masked_mean
 from coliags_plugin.datamanagers.rectification import fitted
 from coliags_plugin.engine.model import Model
 

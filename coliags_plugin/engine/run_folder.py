@@ -19,8 +19,8 @@ from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
+from coliags_plugin.core.jobs import locked
 from coliags_plugin.core.json_files import JsonObject, parse_json, read_json, scalars
-from coliags_plugin.core.locks import locked
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.settings import validated
 from coliags_plugin.results.hashing import code_key
@@ -79,7 +79,7 @@ class RunFolder:
         return self.path / "checkpoints"
 
     def owned(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Keep other processes from training this run; see :func:`coliags_plugin.core.locks.locked`."""
+        """Keep other processes from training this run; see :func:`coliags_plugin.core.jobs.locked`."""
         return locked(self.path.with_name(f".{self.path.name}.lock"), self.path, wait)
 
     @property

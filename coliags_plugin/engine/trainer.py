@@ -19,15 +19,13 @@ from coliags_plugin.contracts import Draw, Field, Follower, Loss, Sampler, Sched
 from coliags_plugin.core.errors import DeviceMemoryError, InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import BLANK_ALPHA, RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
-from coliags_plugin.core.transfers import sent
+from coliags_plugin.core.tensors import masked_mean, sent
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
-from coliags_plugin.engine.costs import CostMeter, TrainingCost
+from coliags_plugin.engine.costs import CostMeter, HeapTrimmer, TrainingCost
 from coliags_plugin.engine.devices import software
-from coliags_plugin.engine.heap import HeapTrimmer
 from coliags_plugin.engine.loggers import Followers
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
@@ -42,7 +40,7 @@ logger = logging.getLogger(__name__)
 MAX_BLANK_VIEWS = 10
 #: What takes less memory on a device.
 LESS = (
-    "Fewer initial points (--set datamanager.points_count=50000), slower growth (a higher strategy.gradient_threshold) "
+    "Fewer initial points (`datamanager.points_count=50000`), slower growth (a higher strategy.gradient_threshold) "
     "or smaller images (datamanager.width and height) take less; `device=cpu` has the computer's memory"
 )
 #: So that the PSNR of a perfect view stays a number, dB.

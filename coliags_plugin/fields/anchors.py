@@ -18,10 +18,9 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight
-from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.tables import fit_kernels, fit_triton_kernels
+from coliags_plugin.core.tensors import fit_kernels, fit_triton_kernels, wall_normals
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren, drawn_children, fused_children, visible_anchors
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum

@@ -19,7 +19,7 @@ from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.tables import fit_kernels, tables
+from coliags_plugin.core.tensors import fit_kernels, tables
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
 MAX_OFFSET = 20.0

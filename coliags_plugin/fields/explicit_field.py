@@ -16,10 +16,10 @@ from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.point_normals import point_normals
-from coliags_plugin.core.rotations import shortest_axes
+from coliags_plugin.core.gaussians import shortest_axes
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tensors import point_normals
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 

@@ -15,7 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.tables import fit_kernels
+from coliags_plugin.core.tensors import fit_kernels
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.rows import unique_rows

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 
 #: A Gaussian of opacity one is drawn up to alpha = 1/255, at sqrt(2 ln 255) standard deviations.
 DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))

@@ -16,12 +16,11 @@ from typing_extensions import Self
 from coliags_plugin.contracts import LitField, Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.gaussians import Gaussians, third_axes
 from coliags_plugin.core.lamps import HeldLight, Lamp
-from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.transfers import sent
+from coliags_plugin.core.tensors import sent
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.mlp import Precision, linear_layers, reduced_dtype

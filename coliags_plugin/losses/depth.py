@@ -14,10 +14,8 @@ from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.masked import masked_mean, weighted_mean, zero_outside
-from coliags_plugin.core.pixel_ids import fixed_uniform
-from coliags_plugin.core.sampling import interpolated
 from coliags_plugin.core.scenes import Target
+from coliags_plugin.core.tensors import fixed_uniform, interpolated, masked_mean, weighted_mean, zero_outside
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]

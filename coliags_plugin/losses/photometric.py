@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
-from coliags_plugin.core.masked import masked_mean, weighted_mean, zero_outside
 from coliags_plugin.core.scenes import Target
 from coliags_plugin.core.ssim import ssim_map
+from coliags_plugin.core.tensors import masked_mean, weighted_mean, zero_outside
 
 
 class PhotometricSettings(LossSettings):

@@ -13,8 +13,7 @@ from torch import Tensor
 from coliags_plugin.contracts import GainModule, Loss, LossSettings, TrainedModel, TrainingStep
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant, masked_mean, zero_outside
 
 
 class OpacityLoss(Loss):

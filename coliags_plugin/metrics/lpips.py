@@ -15,8 +15,8 @@ from torch import Tensor
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.masked import zero_outside
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tensors import zero_outside
 from coliags_plugin.metrics.image import require_image
 from coliags_plugin.metrics.lpips_network import LPIPSNetwork
 from coliags_plugin.metrics.lpips_weights import find_weights, load_network

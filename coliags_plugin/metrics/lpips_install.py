@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coliags_plugin._version import __version__
-from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.core.files import atomic_path
+from coliags_plugin.core.files import atomic_path, file_sha256
 from coliags_plugin.metrics.lpips_weights import (
     BACKBONE_FILES,
     default_folder,

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Protocol
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.sampling import interpolated
 from coliags_plugin.core.scenes import Frame, SparseDepth
+from coliags_plugin.core.tensors import interpolated
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 

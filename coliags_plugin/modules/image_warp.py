@@ -14,9 +14,9 @@ from typing_extensions import Self
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.sampling import bilinear
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tensors import bilinear
 from coliags_plugin.modules.frame_rows import FrameRows
 
 

@@ -15,7 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Approximate number of scene points that the median depth is computed from.

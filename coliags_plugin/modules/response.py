@@ -17,7 +17,7 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 
 #: Brightest colour, relative to full scale, up to which the slope changes; glints and near walls lie beyond 1.
 _TOP = 1.5

@@ -20,8 +20,8 @@ from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_arrays, write_json
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.alignment import umeyama
 from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter

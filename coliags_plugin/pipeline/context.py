@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.datamanagers.colmap import find_models
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frames import read_blurred

@@ -8,7 +8,7 @@ from itertools import islice, pairwise
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.arrays import dilated
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import is_repeated
 

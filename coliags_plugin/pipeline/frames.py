@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.pipeline.frame_selection import (

@@ -22,7 +22,7 @@ from coliags_plugin.core.errors import (
     NotWritableError,
     ReportedError,
 )
-from coliags_plugin.core.locks import locked
+from coliags_plugin.core.jobs import locked
 from coliags_plugin.engine.task_queue import Job, JobQueue
 from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, TaskOutcome, attempt, run_worker
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images

@@ -79,7 +79,7 @@ _BRACKETS = "Brackets are segments, dashed where they failed. "
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
-    "more frames (--every), a part of the video without cuts, a mask of what does not move with the wall (--mask), or "
+    "more frames (`every`), a part of the video without cuts, a mask of what does not move with the wall (`mask`), or "
     "the calibration of the camera (`camera`, `params`)."
 )
 

@@ -17,8 +17,8 @@ from pydantic import Field, TypeAdapter
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.jobs import locked
 from coliags_plugin.core.json_files import json_text, parse_json
-from coliags_plugin.core.locks import locked
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.core.text_files import without_places
 from coliags_plugin.reporting.numbers import duration

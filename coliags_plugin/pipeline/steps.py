@@ -126,7 +126,7 @@ def make_poses(context: StageContext) -> StageOutcome:
             f"{len(largest.registered)} of {count} frames have poses",
             f"at least {FEWEST}",
             "Choose a part of the video in which the camera moves along tissue that it sees well, keep more frames "
-            "(--every), or give the camera (--camera)",
+            "(`every`), or give the camera (`camera`)",
         )
     warnings = []
     if (posed := count - len(atlas.lost)) < _MOST * count:
@@ -142,7 +142,7 @@ def make_poses(context: StageContext) -> StageOutcome:
     write_sfm_scene(context.posed, atlas, mask, overwrite=True, units=units, link=True)
     depth = atlas.largest.median_depth
     unit = (
-        f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
+        f"unit of length unknown (`diameter` gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
         if units[0] == "unknown"
         else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
     )

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.pipeline.frame_selection import lens_mask, motion_and_survival, overlays, reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings

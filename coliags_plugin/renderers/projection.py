@@ -13,8 +13,7 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.rotations import rotation_matrices, shortest_columns
+from coliags_plugin.core.gaussians import Gaussians, rotation_matrices, shortest_columns
 
 #: Margin beyond the image, relative to half the field of view, within which the Jacobian is not clamped.
 JACOBIAN_MARGIN = 0.3

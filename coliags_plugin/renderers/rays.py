@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.core.transfers import sent
+from coliags_plugin.core.tensors import sent
 
 #: Added to every weight, so that no stretch of a ray is left out for good.
 WEIGHT_FLOOR = 1e-5

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.renderers.projection import facing
 
 

@@ -11,7 +11,7 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.tables import what_triton_lacks
+from coliags_plugin.core.tensors import what_triton_lacks
 from coliags_plugin.renderers.checks import check_device, check_float32
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.stages import Stages, draw_view

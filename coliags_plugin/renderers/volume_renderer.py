@@ -18,7 +18,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 from coliags_plugin.renderers.checks import check_outputs, check_primitive
 from coliags_plugin.renderers.rays import CompositedRays, even_places, refined_places, transmittances
 

@@ -10,8 +10,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep, steps_text
+from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.strategies.image_gradients import gradient_lengths
 

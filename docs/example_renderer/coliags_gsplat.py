@@ -15,10 +15,9 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.gaussians import Gaussians, shortest_axes
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.rotations import shortest_axes
-from coliags_plugin.core.transfers import constant
+from coliags_plugin.core.tensors import constant
 from coliags_plugin.renderers.checks import check_device, check_float32, check_gaussian_outputs
 from coliags_plugin.renderers.projection import facing
 from coliags_plugin.renderers.splatting import DrawnView, SplattingRenderer, SplattingSettings, split_channels

@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.core.morphology import dilated, eroded
-from coliags_plugin.core.pixel_ids import fixed_uniform, pixel_ids
-from coliags_plugin.core.sampling import bilinear
+from coliags_plugin.core.arrays import dilated, eroded
 from coliags_plugin.core.scenes import concatenate_targets
+from coliags_plugin.core.tensors import bilinear, fixed_uniform, masked_mean, pixel_ids, zero_outside
 from tests.scenes import camera_at, wall_scene
 
 

@@ -16,7 +16,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_path, atomic_write, write_json
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.jobs import LockedError, locked
 from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.geometry.poses import colmap
@@ -178,7 +178,7 @@ def test_errors_of_the_block_that_are_not_the_disks_pass(tmp_path):
 HOLDER = """if True:
     import sys, time
     from pathlib import Path
-    from coliags_plugin.core.locks import locked
+    from coliags_plugin.core.jobs import locked
     with locked(Path(sys.argv[1]), "it"):
         print("held", flush=True)
         time.sleep(60)

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.core.decoder_messages import decoder_messages
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, encode_image, sizes_text, write_image, write_mask
+from coliags_plugin.core.libraries import decoder_messages
 from tests.layouts.rotatecolon import write_exr
 
 
@@ -104,7 +104,7 @@ def test_sizes_as_text():
 READ = """if True:
     import logging, sys
     from pathlib import Path
-    from coliags_plugin.core.decoder_messages import separate_stderr
+    from coliags_plugin.core.libraries import separate_stderr
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.core.images import decode_image
     from coliags_plugin.datamanagers.rotatecolon import read_exr_channel

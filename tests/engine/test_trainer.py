@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
 from coliags_plugin.core.errors import DeviceMemoryError, InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.core.files import CHECKSUMS, write_checksums
 from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,

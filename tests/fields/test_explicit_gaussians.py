@@ -12,8 +12,8 @@ from scipy.special import sph_harm_y
 
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.point_normals import point_normals, wall_normals
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.tensors import point_normals, wall_normals
 from coliags_plugin.fields.explicit_field import ReferenceNormals
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians
 from coliags_plugin.fields.numba_kernels import spherical_harmonics as kernel

@@ -18,7 +18,7 @@ from coliags_plugin.comparison.named_files import load_ablation, load_benchmark
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core import bounds
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
+from coliags_plugin.core.files import CHECKSUMS, write_checksums
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.files import read_splats
 from coliags_plugin.geometry.meshes.files import read_mesh

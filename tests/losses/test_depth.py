@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, huber_loss
 
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import SparseDepth, concatenate_targets
+from coliags_plugin.core.tensors import masked_mean
 from tests.losses.terms import make, make_output, step
 from tests.scenes import camera_at, wall_scene
 from tests.scenes import plain_frame as make_frame

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import LossSettings, Schedule
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.masked import zero_outside
 from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.core.ssim import ssim
+from coliags_plugin.core.tensors import zero_outside
 from coliags_plugin.engine.model import Model
 from coliags_plugin.losses.depth import DepthKind
 from coliags_plugin.losses.photometric import wall_weights

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import rotation_of_vector
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import PointCloud, Scene, View
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer

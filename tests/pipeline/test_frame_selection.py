@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.arrays import dilated
 from coliags_plugin.pipeline.frame_selection import (
     EMPTY,
     THINNED,

@@ -13,9 +13,9 @@ import pycolmap
 import pytest
 
 import coliags_plugin as cp
+from coliags_plugin.core.arrays import eroded
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
-from coliags_plugin.core.morphology import eroded
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import OUTPUTS
-from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
 from tests.renderers import test_surfels as surfels

@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.gaussians import rotation_matrices
 from tests.fields.made import make_field
 from tests.strategies.steps import after_backward, make_output, stepped_optimizers
 

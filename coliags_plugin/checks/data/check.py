@@ -24,8 +24,8 @@ from coliags_plugin.checks.data.hypotheses import (
     follow,
     match,
 )
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 
 #: Largest number of frame pairs.

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.poses.rigid import w_first
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap

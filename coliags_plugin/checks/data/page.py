@@ -64,7 +64,7 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     yield model.Fact("calibration", f"{focal}, {center} px, {angle_across(camera.intrinsics):.1f} degrees across")
     yield model.Fact("pose convention", _convention(data.pose_convention))
     unit = scene.length_unit
-    stated = "unknown (--set datamanager.unit=mm or a file unit.txt states it)"
+    stated = "unknown (`datamanager.unit=mm` or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
     depth, path, images, lamp = check.facts.values()
     known = (

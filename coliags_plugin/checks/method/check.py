@@ -36,10 +36,10 @@ from coliags_plugin.config.method_config import load_method, method_tree
 from coliags_plugin.config.options import RenderOptions
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, InterruptedRunError
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, View
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tensors import masked_mean
 from coliags_plugin.engine.checkpoints import restore_model
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.evaluator import evaluate
@@ -603,8 +603,8 @@ def ignores_masked_pixels(context: CheckContext) -> str:
     (rows, first), (spoilt_rows, second) = runs
     for ours, theirs in zip(rows, spoilt_rows, strict=True):
         wrong = [key for key, value in ours["terms"].items() if theirs["terms"][key] != value]
-        refuse("loss terms that depend on masked pixels", wrong, "see coliags_plugin.core.masked")
-    refuse("masked pixels change the model", difference(first, second), "see coliags_plugin.core.masked")
+        refuse("loss terms that depend on masked pixels", wrong, "see coliags_plugin.core.tensors")
+    refuse("masked pixels change the model", difference(first, second), "see coliags_plugin.core.tensors")
     return "masked pixels change nothing"
 
 

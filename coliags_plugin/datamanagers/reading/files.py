@@ -17,8 +17,8 @@ from typing import TypeVar
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.json_files import image_size, read_json, read_number
-from coliags_plugin.core.progress import Progress, with_progress
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from coliags_plugin.contracts import log_linear
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import NotFiniteError
 from coliags_plugin.core.lamps import HeldLight
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.tensors import masked_mean
 from coliags_plugin.engine.held_light import mean_camera, render_held, splatting_of
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport

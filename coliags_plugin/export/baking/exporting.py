@@ -12,9 +12,8 @@ import torch
 
 from coliags_plugin.config.options import ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
-from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError, check_name
-from coliags_plugin.core.files import atomic_folder, refuse_existing, write_json
+from coliags_plugin.core.files import atomic_folder, file_sha256, refuse_existing, write_json
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale

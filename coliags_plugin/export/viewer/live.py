@@ -21,7 +21,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts import Follower, GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
 from coliags_plugin.engine.devices import make_current

@@ -17,7 +17,7 @@ from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.lanes import WIDTH
 from coliags_plugin.core.numba_kernels.threads import pieces, workers
-from coliags_plugin.core.tables import tables
+from coliags_plugin.core.tensors import tables
 from coliags_plugin.fields.spherical_harmonics import FACTORS, Y0
 
 #: Gaussians that a thread takes at a time.

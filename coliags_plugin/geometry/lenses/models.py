@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from coliags_plugin.core import bounds
+from coliags_plugin.core.arrays import eroded
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.morphology import eroded
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.core.libraries import import_open3d
 
 #: Where rays begin: each of its own, or all of one.
 Origins: TypeAlias = Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"]

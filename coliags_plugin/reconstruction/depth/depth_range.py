@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.depth.views import MAX_TURN
 from coliags_plugin.reconstruction.structure.features import (

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import sizes_text
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange

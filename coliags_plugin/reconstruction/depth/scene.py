@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted

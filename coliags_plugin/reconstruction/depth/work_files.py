@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
-from coliags_plugin.core.locks import locked
+from coliags_plugin.core.jobs import locked
 
 log = logging.getLogger(__name__)
 

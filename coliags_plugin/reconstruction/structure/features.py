@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
-from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
 

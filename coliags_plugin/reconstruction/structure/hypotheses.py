@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import adjust, held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Again, held_part, part_of
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
@@ -135,7 +135,7 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
             f"a nominal field of view of {plausible[0]:g} to {plausible[1]:g} degrees",
             "Give the camera's calibration (`camera` and `params`, or a known `camera`), fix the focal length at a "
             "multiple of the larger side (`camera.refine=false` and `camera.focal_factors=[0.6]`), or state the "
-            "range (--set camera.field_of_view=[20, 150])",
+            "range (`camera.field_of_view=[20, 150]`)",
         )
     return best(left)
 

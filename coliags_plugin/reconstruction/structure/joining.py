@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Int64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.reconstruction.structure.adjustment import Rays, held_out_error, median_of_points, rigid_frames
 from coliags_plugin.reconstruction.structure.atlas import Again, link_at, weak_links

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 if TYPE_CHECKING:

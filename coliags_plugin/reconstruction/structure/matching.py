@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at
 from coliags_plugin.reconstruction.structure.matching import epipolar_inliers

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.adjustment import held_out_error, rigid_frames, rigidity
@@ -455,7 +455,7 @@ def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
         raise InputError(
             f"`diameter={diameter:g}`, and {len(beside)} of {len(points)} points lie beside the camera's path",
             f"at least {_FEWEST_BESIDE}",
-            "Take a longer part of the video, or give the distance of two cameras (--distance), or neither",
+            "Take a longer part of the video, or give the distance of two cameras (`distance`), or neither",
         )
     return float(diameter / (2.0 * np.median(beside)))
 

@@ -53,7 +53,7 @@ class CameraSettings(Settings):
     @model_validator(mode="after")
     def _ranges(self) -> Self:
         if self.params is not None and self.model is None:
-            raise ValueError("parameters (--params) without their camera model (--camera)")
+            raise ValueError("parameters (`params`) without their camera model (`camera`)")
         if not min(self.focal_factors) > 0.0:
             raise ValueError(f"focal_factors = {self.focal_factors}: they must be positive")
         if not 0.0 < self.field_of_view[0] < self.field_of_view[1] < 180.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.arrays import dilated
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, brightness, highlights
 
 #: Brightness, of 255, that is added before the logarithm, so that noise in the dark is not amplified without bound.

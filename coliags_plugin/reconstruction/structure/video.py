@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int64
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import tell_of_alpha
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image

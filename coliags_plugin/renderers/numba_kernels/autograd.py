@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from coliags_plugin.core.numba_kernels.compilation import Array
-from coliags_plugin.core.tables import tables
+from coliags_plugin.core.tensors import tables
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.pipeline import Pipeline
 

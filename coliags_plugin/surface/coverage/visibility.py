@@ -18,7 +18,7 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.core.progress import Progress, with_progress
+from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.reading.images import all_of, read_mask

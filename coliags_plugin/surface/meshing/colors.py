@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.open3d_library import import_open3d
-from coliags_plugin.core.sampling import bilinear
+from coliags_plugin.core.libraries import import_open3d
+from coliags_plugin.core.tensors import bilinear
 from coliags_plugin.geometry.meshes.mesh import Texture, TriangleMesh
 from coliags_plugin.surface.meshing.views import DepthView, looked_at
 

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field as Option
 from torch import Tensor
 
+from coliags_plugin.core.arrays import dilated
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.morphology import dilated
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.engine.rendering import render_view

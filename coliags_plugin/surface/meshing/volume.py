@@ -13,7 +13,7 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.core.libraries import import_open3d
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.meshing.views import DepthView, incidence_cosines
 

@@ -1,7 +1,7 @@
 """Smoothness of the rendered depth."""
 
 from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.core.masked import masked_mean
+from coliags_plugin.core.tensors import masked_mean
 
 
 class SmoothDepthLoss(Loss):

@@ -24,8 +24,8 @@ from coliags_plugin.contracts import (
 )
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.tensors import masked_mean
 from coliags_plugin.engine.samplers import FrameSampler
 from coliags_plugin.renderers.cpu_renderer import CpuRenderer
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
-from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.engine.held_light import mean_camera
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.gaussians import rotation_of_vector
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.core.rotations import rotation_of_vector
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.export.splats.cloud import field_of_cloud
 from coliags_plugin.export.splats.files import read_splat_spz

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from coliags_plugin.core import tables
-from coliags_plugin.core.transfers import constant, sent
+from coliags_plugin.core import tensors
+from coliags_plugin.core.tensors import constant, sent
 from tests.pretended_cuda import CUDA, PretendedCuda
 
 
@@ -50,10 +50,10 @@ def test_sent_tensors_are_where_they_should_be():
 
 @pytest.fixture
 def lacks(monkeypatch):
-    monkeypatch.setattr(tables, "find_spec", lambda name: object())
+    monkeypatch.setattr(tensors, "find_spec", lambda name: object())
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.10.0"))
     monkeypatch.delenv("CC", raising=False)
-    return tables.what_triton_lacks.__wrapped__
+    return tensors.what_triton_lacks.__wrapped__
 
 
 def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
@@ -67,7 +67,7 @@ def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
     assert "headers of Python" in lacks()
     monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.5.1"))
     assert "triton 3.5.1 is older than 3.6" in lacks()
-    monkeypatch.setattr(tables, "find_spec", lambda name: None)
+    monkeypatch.setattr(tensors, "find_spec", lambda name: None)
     assert "triton is not installed" in lacks()
 
 

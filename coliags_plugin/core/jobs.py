@@ -1,4 +1,4 @@
-"""Locks between processes, also of several machines that share a file system."""
+"""What long jobs need: progress callbacks, and locks between processes, also of machines that share a file system."""
 
 from __future__ import annotations
 
@@ -6,15 +6,30 @@ import logging
 import math
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
+from typing import TypeVar
 
 from filelock import FileLock, Timeout
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
+
+_Item = TypeVar("_Item")
+
+#: Called with a description of the work, the number of units done, and their total.
+Progress = Callable[[str, int, int], None]
+
+
+def with_progress(items: Sequence[_Item], what: str, progress: Progress | None) -> Iterator[_Item]:
+    """The items; each is reported when the next one is asked for."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        if progress is not None:
+            progress(what, done, len(items))
+
 
 log = logging.getLogger(__name__)
 
