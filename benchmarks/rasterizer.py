@@ -39,7 +39,7 @@ from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.engine.devices import choose_device
-from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.renderers.splatting import choose_renderer
 
 #: What is drawn, and the renderers' name for it.
 PRIMITIVES = {"gaussians3d": "gaussians3d", "flat": "gaussians3d", "surfels": "surfels"}

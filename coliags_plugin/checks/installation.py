@@ -24,9 +24,8 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.devices import choose_device, find_device
-from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders
-from coliags_plugin.renderers.choice import choose_renderer
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.metrics.lpips import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, choose_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.

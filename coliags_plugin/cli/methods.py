@@ -169,8 +169,8 @@ class WeightsCommand:
 
     def run(self) -> None:
         """Install what is missing, and print where the weights of each net are."""
+        from coliags_plugin.metrics.lpips import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
         from coliags_plugin.metrics.lpips_install import SOURCES, install
-        from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
 
         nets = DEFAULT_NETS if self.net is None else tuple(SOURCES) if self.net == "all" else (self.net,)
         folder = None if self.folder is None else self.folder.resolve()

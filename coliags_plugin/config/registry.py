@@ -209,7 +209,7 @@ _BUILT_INS: dict[tuple[str, str], dict[str, object]] = {
     },
     ("strategies", "strategy"): {
         "adaptive-density": "coliags_plugin.strategies.adaptive_density:AdaptiveDensity",
-        "none": "coliags_plugin.strategies.none:NoStrategy",
+        "none": "coliags_plugin.strategies:NoStrategy",
         "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
     },
     ("losses", "loss"): {

@@ -9,12 +9,12 @@ from coliags_plugin.contracts.fields import (
     GeometryHead,
     Head,
     HeadNetworks,
-    LitField,
     RadianceField,
     RadianceLevel,
     RadianceSamples,
+    SeenAnchors,
 )
-from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ViewModule
+from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear, steps_text
 from coliags_plugin.contracts.training import (
     Draw,
@@ -38,12 +38,10 @@ __all__ = [
     "Draw",
     "Field",
     "Follower",
-    "GainModule",
     "GaussianField",
     "GeometryHead",
     "Head",
     "HeadNetworks",
-    "LitField",
     "Logger",
     "Loss",
     "LossSettings",
@@ -56,6 +54,7 @@ __all__ = [
     "Renderer",
     "Sampler",
     "Schedule",
+    "SeenAnchors",
     "Strategy",
     "TrainedModel",
     "TrainingStep",

@@ -46,7 +46,7 @@ class Comparison:
 class Metric(ABC, Generic[SettingsT]):
     """One number from a :class:`Comparison`."""
 
-    Settings: ClassVar[type[Settings]]
+    Settings: ClassVar[type[Settings]] = Settings
     higher_is_better: ClassVar[bool]
     unit: ClassVar[str]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, NamedTuple
+from typing import ClassVar, Generic, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -29,6 +29,8 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
     primitive: ClassVar[str]
     #: Elements that strategies add and remove: ``anchors`` or ``gaussians``; ``none`` where the size is fixed.
     elements: ClassVar[str] = "none"
+    #: Whether the lamp is modelled apart from the tissue, so that :meth:`with_lamp` can exchange it after training.
+    lamp_is_apart: ClassVar[bool] = False
 
     @property
     def element_count(self) -> int:
@@ -66,8 +68,12 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether colours depend on where the lamp is, which can be held; default: not."""
-        return False
+        """Whether colours depend on where the lamp is, which can be held; default: if it is modelled apart."""
+        return self.lamp_is_apart
+
+    def with_lamp(self, lamp: Lamp) -> Self:
+        """The field under another lamp, sharing its parameters; only where :attr:`lamp_is_apart`."""
+        raise NotImplementedError(f"{type(self).__name__} has the light in its colours")
 
     @property
     def normals_and_references(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
@@ -103,19 +109,6 @@ class GaussianField(Field[SettingsT]):
     def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
         """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
         return self.gaussians(camera)
-
-
-class LitField(GaussianField[SettingsT]):
-    """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
-
-    @property
-    def knows_lamp(self) -> bool:
-        """Always."""
-        return True
-
-    @abstractmethod
-    def with_lamp(self, lamp: Lamp) -> Self:
-        """The field under another lamp; it shares the parameters."""
 
 
 @dataclass(frozen=True)
@@ -179,15 +172,34 @@ class RadianceField(Field[SettingsT], RadianceLevel):
         return None
 
 
+class SeenAnchors(NamedTuple):
+    """V anchors as seen by a camera: the inputs of heads.
+
+    Attributes:
+        features: Anchor features. [V, F]
+        directions: Unit vectors from the camera (and lamp) to the anchors, world frame. [V, 3]
+        distances: From the lamp to the anchors, scene units (mm), not normalised. [V, 1]
+        cosines: Of the angle at the lamp between optical axis and direction, in [0, 1]. [V, 1]
+        normals: Unit normals of the wall at the anchors, world frame, of either sign; None for heads that use none.
+            [V, 3]
+    """
+
+    features: Float[Tensor, "V F"]
+    directions: Float[Tensor, "V 3"]
+    distances: Float[Tensor, "V 1"]
+    cosines: Float[Tensor, "V 1"]
+    normals: Float[Tensor, "V 3"] | None = None
+
+
 class HeadNetworks(NamedTuple):
     """Networks of a head, of one hidden layer each (Linear, ReLU, Linear), with the same inputs.
 
     Attributes:
-        inputs: What they see besides the anchors' features. [V, R]
+        inputs: Inputs besides the anchors' features. [V, R]
         embedded: How many of the last inputs are embedded by gamma (docs/methods.md 3.2).
-        frequencies: Of gamma.
-        mlps: The networks: those of opacity, before tanh, and covariance; or that of colour, before the sigmoid. They
-            see the features, then the inputs with the embedded ones extended.
+        frequencies: Number of frequencies of gamma.
+        mlps: The networks: those of opacity, before tanh, and covariance; or that of colour, before the sigmoid. Their
+            inputs are the features, then ``inputs`` with the embedded ones extended.
     """
 
     inputs: Tensor
@@ -205,21 +217,24 @@ class Head(nn.Module, ABC, Generic[SettingsT]):
     Settings: ClassVar[type[Settings]]
     settings: SettingsT
 
-    #: Whether ``forward`` may consist of :meth:`networks`: not so where a class defines the former alone.
-    has_networks: ClassVar[bool] = False
+    #: What decodes anchors: ``"networks"``, kernels that run :meth:`networks`, where they serve the device, else
+    #: ``forward``, which gives the same; or ``"forward"``, always that method.
+    decoding: Literal["networks", "forward"]
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Set :attr:`has_networks`: a ``forward`` alone may decode in any way."""
+        """Refuse a class with a ``forward`` of its own that kernels would never call (TypeError)."""
         super().__init_subclass__(**options)
-        if "forward" in vars(cls):
-            cls.has_networks = "networks" in vars(cls)
+        forward = vars(cls).get("forward")
+        if forward is None or getattr(forward, "__isabstractmethod__", False) or "decoding" in vars(cls):
+            return
+        raise TypeError(
+            f"{cls.__name__} overrides forward, which kernels do not call: set decoding = 'forward' in the class, or "
+            "'networks' if the kernels may decode by its networks instead"
+        )
 
-    def networks(self, *inputs: Any) -> HeadNetworks | None:
-        """MLPs of this head and their inputs, for fused decoding; None where ``forward`` is not made of MLPs.
-
-        Called as ``forward`` is.
-        """
-        return None
+    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+        """MLPs of this head and their inputs, where ``decoding`` is "networks"."""
+        raise NotImplementedError(f"{type(self).__name__} has no networks for kernels to decode by")
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -230,14 +245,8 @@ class GeometryHead(Head[SettingsT]):
     """Anchor feature and viewing direction -> opacity, scale and rotation of every child."""
 
     @abstractmethod
-    def forward(
-        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
-    ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+    def forward(self, seen: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors.
-
-        Args:
-            features: Anchor features. [V, F]
-            directions: Unit vectors from the camera to the anchors, world frame. [V, 3]
 
         Returns:
             Signed opacities in (-1, 1), of which only positive ones are drawn [V, K]; and three scale logits and four
@@ -269,27 +278,8 @@ class AppearanceHead(Head[SettingsT]):
         """Adapt the initial parameters to the colours of the scene, before training."""
 
     @abstractmethod
-    def forward(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
-    ) -> Float[Tensor, "V K 3"]:
-        """Decode the children's colours.
-
-        Args:
-            features: Anchor features. [V, F]
-            directions: Unit vectors from the camera (and lamp) to the anchors, world frame. [V, 3]
-            distances: Camera to anchor, scene units (mm), not normalised. [V, 1]
-            cosines: Of the angle between optical axis and direction, in [0, 1]. [V, 1]
-            normals: Unit normals of the wall at the anchors, world frame, of either sign; None for heads that use
-                none. [V, 3]
-
-        Returns:
-            RGB in (0, 1). [V, K, 3]
-        """
+    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
+        """Decode the children's colours: RGB in (0, 1). [V, K, 3]"""
 
     def apply_light(
         self,

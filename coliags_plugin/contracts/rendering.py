@@ -14,6 +14,7 @@ from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts.fields import Field
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
@@ -42,9 +43,20 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
     devices: ClassVar[frozenset[str]]
     #: Whether it can render some pixels of a view; splatting renderers draw whole images.
     renders_pixels: ClassVar[bool] = False
+    #: Name in messages.
+    name: ClassVar[str]
 
     def __init__(self, settings: SettingsT) -> None:
         self.settings = settings
+
+    def check_primitive(self, field: Field) -> None:
+        """Refuse a field that this renderer cannot draw (InputError)."""
+        if field.primitive not in self.primitives:
+            raise InputError(
+                f"a field of '{field.primitive}' for the {self.name} renderer",
+                f"one of {', '.join(sorted(self.primitives))}",
+                "Choose another renderer or another field",
+            )
 
     @classmethod
     @abstractmethod
@@ -150,6 +162,15 @@ class ViewModule(nn.Module, ABC, Generic[SettingsT]):
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
         return {}
 
+    @property
+    def gain_curve(self) -> tuple[Sequence[float], Float[Tensor, "F C"]] | None:
+        """Exposure gain over the video, for losses; default: None, without one.
+
+        Index in the video of every training frame, ascending, and the logarithm of its gain, for all colours or for
+        each of three. [F], [F, C]
+        """
+        return None
+
     def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
         """The camera to render from, for instance with a corrected pose.
 
@@ -178,16 +199,3 @@ class ViewModule(nn.Module, ABC, Generic[SettingsT]):
             view: The training frame.
             output: What :meth:`shade` was given in the step.
         """
-
-
-class GainModule(ViewModule[SettingsT]):
-    """Base class of view modules with an exposure gain per training frame, by which colours are multiplied."""
-
-    @property
-    @abstractmethod
-    def times(self) -> Sequence[float]:
-        """Index in the video of every training frame, ascending."""
-
-    @abstractmethod
-    def log_gains(self) -> Float[Tensor, "F C"]:
-        """Logarithm of every training frame's gain, for all colours or for each of three. [F, C]"""

@@ -95,7 +95,7 @@ class Strategy(ABC, Generic[SettingsT, FieldT]):
         extent: Of the scene (:attr:`Scene.extent`), scene units.
     """
 
-    Settings: ClassVar[type[Settings]]
+    Settings: ClassVar[type[Settings]] = Settings
     #: Kinds of :attr:`Field.elements` that it can change; None where it changes nothing.
     serves: ClassVar[frozenset[str] | None]
     #: Attributes that are tensors of counters, saved with a checkpoint.
@@ -161,7 +161,7 @@ class Sampler(ABC, Generic[SettingsT]):
         queue: Frames that it has planned for further steps; saved with a checkpoint and restored by assignment.
     """
 
-    Settings: ClassVar[type[Settings]]
+    Settings: ClassVar[type[Settings]] = Settings
     #: Whether its steps see whole images; losses with ``whole_image`` need that.
     whole_images: ClassVar[bool]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.gaussians import Gaussians
 
 #: All outputs of renderers besides a field's own feature channels. "depth" alone names nothing: each kind
@@ -88,6 +88,21 @@ class RenderOutput:
             raise InputError("a rendered view without splats", "one of a splatting renderer", "Choose another renderer")
         return self.splats
 
+    @property
+    def gradient_lengths(self) -> Float[Tensor, "N"] | None:
+        """Length of the gradient of each of ``means2d`` in units of half the image; 0 where a Gaussian was not drawn.
+
+        These are the units of 3DGS's and Scaffold-GS's thresholds (docs/methods.md 4.3). None before ``backward``, or
+        if no gradient reached the centres.
+        """
+        gradient = self.drawn.means2d.grad
+        if gradient is None:
+            return None
+        height, width = self.alpha.shape
+        # A mask instead of indexing, which would synchronise with the GPU.
+        lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
+        return torch.where(self.drawn.radii > 0, lengths, 0.0)
+
     def __getitem__(self, name: str) -> Tensor:
         """An output by name. Raises KeyError if it was not requested."""
         if name == "rgb":
@@ -97,6 +112,14 @@ class RenderOutput:
         if name not in self.maps:
             raise KeyError(f"output '{name}' was not requested; the component that reads it must list it in `wants`")
         return self.maps[name]
+
+
+def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse outputs that a renderer does not have."""
+    known = tuple(known)
+    for name in wants:
+        if name not in known:
+            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(known)}", did_you_mean(name, known))
 
 
 def concatenate_pixels(parts: Sequence[RenderOutput]) -> RenderOutput:

@@ -10,7 +10,7 @@ from coliags_plugin.contracts import Loss, Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.provenance import held_out_uses
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.renderers.choice import ChosenRenderer
+from coliags_plugin.renderers.splatting import ChosenRenderer
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from coliags_plugin.config.registry import fields
-from coliags_plugin.contracts import GaussianField, LitField
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.lamps import FlattenedLight, HeldLight, Lamp, LightOfCamera
@@ -91,8 +91,8 @@ def splatting_of(model: Model) -> SplattingRenderer:
 def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
     """The run under another lamp; it shares the parameters."""
     model = trained.model
-    if not isinstance(model.field, LitField):
-        lit = ", ".join(name for name in fields if issubclass(fields.get(name), LitField))
+    if not model.field.lamp_is_apart:
+        lit = ", ".join(name for name in fields if fields.get(name).lamp_is_apart)
         raise InputError(
             f"another lamp for method '{trained.method}', whose field '{trained.config.field.name}' has the light in "
             "its colours",

@@ -23,14 +23,9 @@ def generators(seed: int) -> dict[str, torch.Generator]:
     return found
 
 
-class FrameSamplerSettings(Settings):
-    """No options."""
-
-
-class FrameSampler(Sampler[FrameSamplerSettings]):
+class FrameSampler(Sampler):
     """One whole frame per step, each once per round in random order (docs/methods.md 4)."""
 
-    Settings: ClassVar[type[Settings]] = FrameSamplerSettings
     whole_images: ClassVar[bool] = True
 
     def next(self) -> list[Draw]:

@@ -19,7 +19,7 @@ from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.renderers.splatting import choose_renderer
 
 
 @dataclass(frozen=True)

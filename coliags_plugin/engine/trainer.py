@@ -32,7 +32,7 @@ from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.samplers import generators
-from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
+from coliags_plugin.renderers.splatting import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
 

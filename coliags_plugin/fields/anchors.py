@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
-from coliags_plugin.contracts import GaussianField, HeadNetworks
+from coliags_plugin.contracts import GaussianField, HeadNetworks, SeenAnchors
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.json_files import JsonObject
@@ -21,15 +21,18 @@ from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import fit_kernels, fit_triton_kernels, wall_normals
-from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren, drawn_children, fused_children, visible_anchors
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
-from coliags_plugin.fields.rows import unique_rows
+from coliags_plugin.fields.points import (
+    DRAWN_SIGMAS,
+    initial_positions,
+    neighbour_log_scales,
+    spheres_in_frustum,
+    unique_rows,
+    voxelize,
+)
 
 logger = logging.getLogger(__name__)
 
-#: What the heads see of anchors: features, directions, distances, cosines, and normals where they use them.
-_Seen: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, "Tensor | None"]
 #: Approximate number of training cameras, evenly spaced, that the range of distances is computed from.
 _DISTANCE_CAMERAS = 16
 
@@ -87,6 +90,9 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         self.geometry_head, self.appearance_head = (
             head.target(head.settings, settings.features, settings.children, generator) for head in heads
         )
+        for head in (self.geometry_head, self.appearance_head):
+            if head.decoding == "forward":
+                logger.info("%s decodes by its own forward, in PyTorch: no kernels do it", type(head).__name__)
         self.register_buffer("normals", torch.zeros(anchor_count, 3) if self.appearance_head.uses_normals else None)
 
     @classmethod
@@ -158,7 +164,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     def visible_anchors(self, camera: Camera) -> Int[Tensor, "V"]:
         """Indices of anchors of which any child may overlap the image."""
         camera = camera.to(self.anchors.device, self.anchors.dtype)
-        if self._on_kernels:
+        if fit_kernels(self.anchors):
             return visible_anchors(self._rows, camera)
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
@@ -167,11 +173,6 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     @property
     def _rows(self) -> AnchorRows:
         return AnchorRows(self.anchors, self.offsets, self.scalings)
-
-    @property
-    def _on_kernels(self) -> bool:
-        """Whether the kernels of the CPU can decode these anchors."""
-        return fit_kernels(self.anchors)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
         camera = camera.to(self.anchors.device, self.anchors.dtype)
@@ -197,40 +198,41 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
 
     def _on_device(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]] | None:
         """Children by the kernels of triton, which find the visible anchors themselves; None without networks."""
-        seen = self._seen(self.anchors, self.features, self.normals, camera, light)
-        geometry, appearance = self._networks(seen)
-        if geometry is None or appearance is None:
+        networks = self._networks(_seen(self.anchors, self.features, self.normals, camera, light))
+        if networks is None:
             return None
         from coliags_plugin.fields.triton_kernels.children import visible_children
 
-        return visible_children(self._rows, camera, self.features, geometry, appearance)
+        return visible_children(self._rows, camera, self.features, *networks)
 
     def _of_visible(self, camera: Camera, light: HeldLight | None) -> tuple[DrawnChildren, Int[Tensor, "V"]]:
         """Children by the kernels of the CPU, or by the definition."""
         visible = self.visible_anchors(camera)
         anchors, features = (unique_rows(rows, visible) for rows in (self.anchors, self.features))
         normals = None if self.normals is None else self.normals.index_select(0, visible)
-        seen = self._seen(anchors, features, normals, camera, light)
-        geometry, appearance = self._networks(seen) if self._on_kernels else (None, None)
-        if geometry is not None and appearance is not None:
-            return fused_children(self._rows, visible, features, geometry, appearance), visible
-        opacities, covariances = self.geometry_head(*seen[:2])
-        return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(*seen)), visible
+        seen = _seen(anchors, features, normals, camera, light)
+        networks = self._networks(seen) if fit_kernels(self.anchors) else None
+        if networks is not None:
+            return fused_children(self._rows, visible, features, *networks), visible
+        opacities, covariances = self.geometry_head(seen)
+        return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(seen)), visible
 
-    def _networks(self, seen: _Seen) -> tuple[HeadNetworks | None, HeadNetworks | None]:
-        heads = (self.geometry_head, seen[:2]), (self.appearance_head, seen)
-        geometry, appearance = (head.networks(*inputs) if head.has_networks else None for head, inputs in heads)
-        return geometry, appearance
+    def _networks(self, seen: SeenAnchors) -> tuple[HeadNetworks, HeadNetworks] | None:
+        """Networks of both heads for the kernels; None where one decodes by its ``forward`` alone."""
+        if any(head.decoding == "forward" for head in (self.geometry_head, self.appearance_head)):
+            return None
+        return self.geometry_head.networks(seen), self.appearance_head.networks(seen)
 
-    @staticmethod
-    def _seen(
-        anchors: Tensor, features: Tensor, normals: Tensor | None, camera: Camera, light: HeldLight | None
-    ) -> _Seen:
-        sight = anchors - camera.center
-        distances = sight.norm(dim=1, keepdim=True)
-        directions = sight / distances
-        # Anchors behind the lens would have negative cosines; the lamp does not shine there (docs/methods.md 3.3).
-        cosines = (directions @ camera.optical_axis).clamp(0.0, 1.0)[:, None]
-        if light is not None:
-            distances, cosines = (values[:, None] for values in light.incidence(anchors))
-        return features, directions, distances, cosines, normals
+
+def _seen(
+    anchors: Tensor, features: Tensor, normals: Tensor | None, camera: Camera, light: HeldLight | None
+) -> SeenAnchors:
+    """The inputs of the heads for anchors that a camera sees under its own lamp or a held light."""
+    sight = anchors - camera.center
+    distances = sight.norm(dim=1, keepdim=True)
+    directions = sight / distances
+    # Anchors behind the lens would have negative cosines; the lamp does not shine there (docs/methods.md 3.3).
+    cosines = (directions @ camera.optical_axis).clamp(0.0, 1.0)[:, None]
+    if light is not None:
+        distances, cosines = (values[:, None] for values in light.incidence(anchors))
+    return SeenAnchors(features, directions, distances, cosines, normals)

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import TypeVar
 
-from coliags_plugin.contracts import AppearanceHead, HeadNetworks
+from coliags_plugin.contracts import AppearanceHead, HeadNetworks, SeenAnchors
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.mlp import mlp, outputs
 
@@ -44,14 +44,15 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
     direction_channels: ClassVar[int] = 3
     #: How many of the last inputs are embedded by gamma.
     embedded: ClassVar[int] = 0
+    decoding = "networks"
 
     def __init__(self, settings: AppearanceT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
         self.features = features
-        inputs = self.inputs(torch.zeros(1, self.direction_channels), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
-        inputs += 2 * self.embedded * self.frequencies
+        seen = SeenAnchors(*(torch.zeros(1, width) for width in (features, self.direction_channels, 1, 1)))
+        inputs = self.inputs(seen).shape[1] + 2 * self.embedded * self.frequencies
         self.color_mlp = mlp(features + inputs, settings.hidden, 3 * children, generator)
 
     @property
@@ -59,16 +60,12 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """Number of frequencies of the positional encoding; 0 means none."""
         return 0
 
-    def embed_direction(
-        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
-    ) -> Float[Tensor, "V D"]:
-        """Encoding of the viewing direction that the MLP gets; arguments as of :meth:`forward`."""
-        return directions
+    def embed_direction(self, seen: SeenAnchors) -> Float[Tensor, "V D"]:
+        """Encoding of the viewing direction that the MLP gets."""
+        return seen.directions
 
     @abstractmethod
-    def inputs(
-        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V R"]:
+    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
         """Inputs of the MLP besides the feature: the direction as encoded, then the distance if :attr:`knows_lamp`."""
 
     @torch.no_grad()
@@ -90,29 +87,15 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """The MLP."""
         return {"color_mlp": list(self.color_mlp.parameters())}
 
-    def networks(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
-    ) -> HeadNetworks:
+    def networks(self, seen: SeenAnchors) -> HeadNetworks:
         """The MLP."""
-        inputs = self.inputs(self.embed_direction(features, directions, normals), distances, cosines)
+        inputs = self.inputs(seen._replace(directions=self.embed_direction(seen)))
         return HeadNetworks(inputs, self.embedded, self.frequencies, (self.color_mlp,))
 
-    def forward(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
-    ) -> Float[Tensor, "V K 3"]:
+    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours."""
-        (colors,) = outputs(features, self.networks(features, directions, distances, cosines, normals))
-        return colors.view(len(features), self.children_per_anchor, 3).sigmoid()
+        (colors,) = outputs(seen.features, self.networks(seen))
+        return colors.view(len(colors), self.children_per_anchor, 3).sigmoid()
 
 
 class PlainAppearanceSettings(AppearanceSettings):
@@ -131,11 +114,9 @@ class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
         """True where the distance to the lamp is an input of the MLP."""
         return self.settings.distance
 
-    def inputs(
-        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V R"]:
+    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
         """v, and d if that is an input."""
-        return torch.cat([seen, distances], dim=1) if self.settings.distance else seen
+        return torch.cat([seen.directions, seen.distances], dim=1) if self.settings.distance else seen.directions
 
 
 class IMIAAppearanceSettings(AppearanceSettings):
@@ -159,11 +140,9 @@ class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
         """As set: gamma(cos theta) has 11 numbers at five."""
         return self.settings.frequencies
 
-    def inputs(
-        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
-    ) -> Float[Tensor, "V R"]:
+    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
         """v, d and cos theta."""
-        return torch.cat([seen, distances, cosines], dim=1)
+        return torch.cat([seen.directions, seen.distances, seen.cosines], dim=1)
 
 
 class GlintAppearanceHead(IMIAAppearanceHead):
@@ -194,15 +173,13 @@ class GlintAppearanceHead(IMIAAppearanceHead):
         """The MLP with the layer of the tilts."""
         return {"color_mlp": [*self.color_mlp.parameters(), *self.tilt_layer.parameters()]}
 
-    def embed_direction(
-        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
-    ) -> Float[Tensor, "V D"]:
+    def embed_direction(self, seen: SeenAnchors) -> Float[Tensor, "V D"]:
         """v, and the facets' components and lobes."""
-        assert normals is not None, "the field keeps normals, as uses_normals says"
-        tilts = MAX_TILT * self.tilt_layer(features).tanh()
-        across = tangent_components(directions, normals) - tilts
+        assert seen.normals is not None, "the field keeps normals, as uses_normals says"
+        tilts = MAX_TILT * self.tilt_layer(seen.features).tanh()
+        across = tangent_components(seen.directions, seen.normals) - tilts
         squares = across.square().sum(1, keepdim=True)
-        return torch.cat([directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
+        return torch.cat([seen.directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
 
 
 def tangent_components(directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"]) -> Float[Tensor, "V 2"]:

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from coliags_plugin.config.components import AppearanceHeadNode
-from coliags_plugin.contracts import AppearanceHead, HeadNetworks
+from coliags_plugin.contracts import AppearanceHead, HeadNetworks, SeenAnchors
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.lamps import HeldLight
@@ -59,6 +59,7 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     """
 
     Settings: ClassVar[type[Settings]] = AttenuatedAppearanceSettings
+    decoding = "networks"
 
     reference: Tensor
 
@@ -68,6 +69,7 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         super().__init__()
         self.settings = settings
         self.head: AppearanceHead = settings.head.target(settings.head.settings, features, children, generator)
+        self.decoding = self.head.decoding
         initial = [settings.distance_exponent, settings.cosine_exponent]
         if settings.incidence_exponent is not None:
             initial.append(settings.incidence_exponent)
@@ -104,20 +106,13 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         """Groups of the head, of the exponents, and of the lamp's offset, which needs a rate in scene units."""
         return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
 
-    def networks(self, *inputs: Any) -> HeadNetworks | None:
-        """Networks of the head below; None if it has none."""
-        return self.head.networks(*inputs) if self.head.has_networks else None
+    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+        """Networks of the head below."""
+        return self.head.networks(seen)
 
-    def forward(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
-    ) -> Float[Tensor, "V K 3"]:
+    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
         """The colours before attenuation."""
-        colors: Tensor = self.head(features, directions, distances, cosines, normals)
+        colors: Tensor = self.head(seen)
         return colors
 
     @property

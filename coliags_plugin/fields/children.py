@@ -14,7 +14,7 @@ from torch.nn import functional
 from coliags_plugin.contracts import HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.tensors import tables
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS, frustum_planes
+from coliags_plugin.fields.points import DRAWN_SIGMAS, frustum_planes
 
 
 class AnchorRows(NamedTuple):

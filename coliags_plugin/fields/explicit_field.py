@@ -20,8 +20,7 @@ from coliags_plugin.core.gaussians import shortest_axes
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import point_normals
-from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+from coliags_plugin.fields.points import DRAWN_SIGMAS, initial_positions, neighbour_log_scales, spheres_in_frustum
 
 
 class ReferenceNormals(nn.Module):

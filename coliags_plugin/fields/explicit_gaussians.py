@@ -18,7 +18,7 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import fit_kernels
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
-from coliags_plugin.fields.rows import unique_rows
+from coliags_plugin.fields.points import unique_rows
 
 #: Ratio of distances to the lamp, and its inverse, beyond which :class:`AttenuatedGaussians` change no further.
 FARTHEST = 2.0

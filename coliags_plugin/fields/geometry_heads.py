@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import TypeVar
 
-from coliags_plugin.contracts import GeometryHead, HeadNetworks
+from coliags_plugin.contracts import GeometryHead, HeadNetworks, SeenAnchors
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.mlp import mlp, outputs
 
@@ -32,6 +32,7 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
     """Geometry head of Scaffold-GS (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
+    decoding = "networks"
 
     def __init__(self, settings: GeometryT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -57,16 +58,14 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
             "covariance_mlp": list(self.covariance_mlp.parameters()),
         }
 
-    def networks(self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]) -> HeadNetworks:
+    def networks(self, seen: SeenAnchors) -> HeadNetworks:
         """The two MLPs."""
-        return HeadNetworks(directions, 3, self.frequencies, (self.opacity_mlp, self.covariance_mlp))
+        return HeadNetworks(seen.directions, 3, self.frequencies, (self.opacity_mlp, self.covariance_mlp))
 
-    def forward(
-        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
-    ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+    def forward(self, seen: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors."""
-        opacities, covariances = outputs(features, self.networks(features, directions))
-        return opacities.tanh(), covariances.view(len(features), self.children_per_anchor, 7)
+        opacities, covariances = outputs(seen.features, self.networks(seen))
+        return opacities.tanh(), covariances.view(len(opacities), self.children_per_anchor, 7)
 
 
 class IMVEGeometrySettings(PlainGeometrySettings):

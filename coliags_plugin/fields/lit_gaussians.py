@@ -13,7 +13,7 @@ from pydantic import model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.contracts import LitField, Schedule
+from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians, third_axes
@@ -24,7 +24,7 @@ from coliags_plugin.core.tensors import sent
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 from coliags_plugin.fields.mlp import Precision, linear_layers, reduced_dtype
-from coliags_plugin.fields.rows import unique_rows
+from coliags_plugin.fields.points import unique_rows
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ class LitGaussiansSettings(ExplicitFieldSettings):
         return self
 
 
-class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSettings]):
+class LitGaussians(ExplicitField[LitGaussiansSettings]):
     """Flat Gaussians whose colour is the light of a lamp that they reflect (docs/rivals/pr-endo.md).
 
     Attributes:
@@ -130,6 +130,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
 
     Settings: ClassVar[type[Settings]] = LitGaussiansSettings
     primitive: ClassVar[str] = "gaussians3d"
+    lamp_is_apart: ClassVar[bool] = True
     row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")
     host_buffers: ClassVar[tuple[str, ...]] = ("network_on",)
     scale_count: ClassVar[int] = 2

@@ -22,9 +22,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import sent
-from coliags_plugin.fields.anchor_points import initial_positions
-from coliags_plugin.fields.frustum import spheres_in_frustum
 from coliags_plugin.fields.mlp import Precision, cosine_embedding, first_layer, glorot_linear, reduced_dtype
+from coliags_plugin.fields.points import initial_positions, spheres_in_frustum
 
 logger = logging.getLogger(__name__)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal
 
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import GainModule, Loss, LossSettings, TrainedModel, TrainingStep
+from coliags_plugin.contracts import Loss, LossSettings, TrainedModel, TrainingStep
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.tensors import constant, masked_mean, zero_outside
@@ -93,26 +94,26 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
 
     def check(self, model: TrainedModel) -> None:
         """Refuse methods without that module."""
-        self._gains(model)
+        self._gain_curve(model)
 
-    def _gains(self, model: TrainedModel) -> GainModule:
+    def _gain_curve(self, model: TrainedModel) -> tuple[Sequence[float], Tensor]:
         module = model.view_modules.get(self.settings.module)
-        if not isinstance(module, GainModule):
-            known = [name for name, part in model.view_modules.items() if isinstance(part, GainModule)]
+        curve = None if module is None else module.gain_curve
+        if curve is None:
+            known = [name for name, module in model.view_modules.items() if module.gain_curve is not None]
             raise InputError(
                 f"loss 'smooth-gain' reads the gains of module '{self.settings.module}'",
                 f"the name of a module 'gain', one of {', '.join(known)}" if known else "a module 'gain'",
                 did_you_mean(self.settings.module, known),
             )
-        return module
+        return curve
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term."""
-        module = self._gains(step.model)
-        log_gains = module.log_gains()
+        times, log_gains = self._gain_curve(step.model)
         if len(log_gains) < 3:
             return log_gains.sum() * 0.0
-        gaps = constant(tuple(module.times), log_gains).diff().clamp_min(1.0)[:, None]
+        gaps = constant(tuple(times), log_gains).diff().clamp_min(1.0)[:, None]
         bends = (log_gains.diff(dim=0) / gaps).diff(dim=0).square()
         return (2.0 * bends / (gaps[1:] + gaps[:-1])).mean()
 

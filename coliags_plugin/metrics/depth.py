@@ -18,14 +18,9 @@ from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.settings import Settings, SettingsT
 
 
-class DepthMetricSettings(Settings):
-    """No options."""
-
-
 class DepthMetric(Metric[SettingsT]):
     """Base class of the depth metrics: pixel selection and the reasons for an unavailable value."""
 
-    Settings: ClassVar[type[Settings]] = DepthMetricSettings
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = "mm"
 

@@ -9,21 +9,15 @@ import torch
 
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.ssim import ssim
 
 
-class ImageMetricSettings(Settings):
-    """No options."""
-
-
-class PSNR(Metric[ImageMetricSettings]):
+class PSNR(Metric):
     """Peak signal-to-noise ratio, 10 log10(1 / mse), the mse over all channels of the valid pixels together.
 
     (The authors' in-training report averages one PSNR per channel instead; docs/methods.md 2.4.)
     """
 
-    Settings: ClassVar[type[Settings]] = ImageMetricSettings
     higher_is_better: ClassVar[bool] = True
     unit: ClassVar[str] = "dB"
 
@@ -51,10 +45,9 @@ class GainFittedPSNR(PSNR):
         return super().__call__(replace(comparison, rgb=comparison.rgb.double() * gain))
 
 
-class SSIM(Metric[ImageMetricSettings]):
+class SSIM(Metric):
     """Structural similarity by :func:`coliags_plugin.core.ssim.ssim`; ignored pixels do not enter the windows."""
 
-    Settings: ClassVar[type[Settings]] = ImageMetricSettings
     higher_is_better: ClassVar[bool] = True
     unit: ClassVar[str] = ""
 

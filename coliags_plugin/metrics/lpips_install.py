@@ -11,7 +11,7 @@ from pathlib import Path
 from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.files import atomic_path, file_sha256
-from coliags_plugin.metrics.lpips_weights import (
+from coliags_plugin.metrics.lpips import (
     BACKBONE_FILES,
     default_folder,
     find_weights,

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.contracts import GainModule
+from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
@@ -150,7 +150,7 @@ class FrameGainSettings(Settings):
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 
-class FrameGain(GainModule[FrameGainSettings]):
+class FrameGain(ViewModule[FrameGainSettings]):
     """Learned factor on the rendered colours for each training frame.
 
     Colours and gains are only known up to a common factor, which ``reference`` settles. Free cameras have the mean
@@ -207,9 +207,9 @@ class FrameGain(GainModule[FrameGainSettings]):
         return {"gain": [self.log_gain]}
 
     @property
-    def times(self) -> Sequence[float]:
-        """Index in the video of every training frame."""
-        return self.frames.times
+    def gain_curve(self) -> tuple[Sequence[float], Float[Tensor, "F C"]]:
+        """Index in the video and :meth:`log_gains` of every training frame."""
+        return self.frames.times, self.log_gains()
 
     def log_gains(self) -> Float[Tensor, "F C"]:
         """Logarithm of every training frame's gain, relative to the reference, within its bounds."""

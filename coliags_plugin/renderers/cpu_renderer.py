@@ -16,9 +16,8 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.projection import slope_limits
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_gaussian_outputs, is_surfels
 
 #: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones. Surfels have two scales.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}

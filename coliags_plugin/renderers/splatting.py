@@ -1,9 +1,9 @@
-"""Base class and options of the splatting renderers."""
+"""Splatting renderers: their base class, options and checks; and the choice of the renderer of any field."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,13 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import TypeVar
 
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import Component, candidates, is_auto, with_options
 from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, Splats
+from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, Splats, check_outputs
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.renderers.checks import check_primitive
 
 
 class AutoSettings(Settings):
@@ -72,8 +73,6 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
     """Base class of renderers that splat a :class:`GaussianField` into whole images."""
 
     outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS) - SURFEL_OUTPUTS
-    #: Name in messages.
-    name: ClassVar[str]
 
     @classmethod
     def outputs_of(cls, primitive: str) -> frozenset[str]:
@@ -116,7 +115,7 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
                 "whole images: it splats",
                 "Leave pixels out, or choose a renderer of radiance fields",
             )
-        check_primitive(field, self.primitives, self.name)
+        self.check_primitive(field)
 
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
@@ -162,3 +161,99 @@ def split_channels(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) ->
         name: part[..., 0] if name in OUTPUTS and part.shape[-1] == 1 else part
         for name, part in zip(features, parts, strict=True)
     }
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+
+
+def is_surfels(gaussians: Gaussians) -> bool:
+    """Whether Gaussians are surfels, with two scales each; InputError if they have neither two nor three."""
+    scales = gaussians.scales
+    if scales.ndim != 2 or scales.shape[1] not in (2, 3):
+        raise InputError(
+            f"Gaussians with scales of shape {list(scales.shape)}", "three scales each, [N, 3], or two for surfels"
+        )
+    return scales.shape[1] == 2
+
+
+def check_device(gaussians: Gaussians, devices: Collection[str], renderer: str) -> None:
+    """Refuse Gaussians that are on a device that a renderer does not serve."""
+    if gaussians.means.device.type not in devices:
+        raise InputError(
+            f"Gaussians on {gaussians.means.device.type} for the {renderer} renderer",
+            f"Gaussians on {', '.join(sorted(devices))}",
+            "Move the field there, or choose renderer 'auto'",
+        )
+
+
+def check_float32(gaussians: Gaussians, renderer: str) -> None:
+    """Refuse Gaussians of another dtype."""
+    if gaussians.means.dtype != torch.float32:
+        raise InputError(
+            f"Gaussians of dtype {str(gaussians.means.dtype).removeprefix('torch.')} for the {renderer} renderer",
+            "float32",
+            "Cast them, or choose the torch renderer, which computes in float64 too",
+        )
+
+
+def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
+    """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features."""
+    check_outputs(wants, (*OUTPUTS, *gaussians.features))
+    of_surfels = sorted(SURFEL_OUTPUTS & {*wants} - {*gaussians.features})
+    if of_surfels and not is_surfels(gaussians):
+        raise InputError(
+            f"output {', '.join(of_surfels)} of 3D Gaussians",
+            "surfels, which alone have it",
+            "Choose a field of surfels, or leave it out",
+        )
+    for name, values in gaussians.features.items():
+        if values.ndim != 2 or len(values) != len(gaussians):
+            raise InputError(f"feature {name} of shape {list(values.shape)}", f"[{len(gaussians)}, channels]")
+
+
+# --- choice -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ChosenRenderer:
+    """A renderer, its registered name and the reason for choosing it."""
+
+    name: str
+    renderer: Renderer
+    reason: str
+
+
+def choose_renderer(component: Component, primitive: str, device: torch.device) -> ChosenRenderer:
+    """Make the renderer of a config; of ``auto``, the first preferred one that can render the field."""
+    if is_auto(component.kind, component.name):
+        return _first_of(component, primitive, device)
+    obstacle = component.target.obstacle(primitive, device)
+    if obstacle:
+        raise InputError(
+            f"renderer '{component.name}' {obstacle}", "a renderer that can serve the field", _others(primitive, device)
+        )
+    return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
+
+
+def _first_of(auto: Component, primitive: str, device: torch.device) -> ChosenRenderer:
+    refused: list[str] = []
+    for name in auto.settings.model_dump()["prefer"]:
+        candidate = with_options(auto, name)
+        obstacle = candidate.target.obstacle(primitive, device)
+        if not obstacle:
+            available = candidate.target.availability().reason
+            reason = "; ".join([*refused, f"{auto.name} chose {name}: {available}"])
+            return ChosenRenderer(name, candidate.target(candidate.settings), reason)
+        refused.append(f"{name} {obstacle}")
+    raise InputError(
+        f"no renderer can serve: {'; '.join(refused)}",
+        f"one for {primitive} on {device.type}",
+        _others(primitive, device),
+    )
+
+
+def _others(primitive: str, device: torch.device) -> str:
+    """Hint that names the renderers of a primitive on a device; empty without any."""
+    classes = {name: registry.renderers.get(name) for name in candidates("renderers")}
+    able = [name for name, found in classes.items() if primitive in found.primitives and device.type in found.devices]
+    return f"Set `renderer=NAME`, NAME being {' or '.join(able)}" if able else ""

@@ -13,8 +13,13 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import constant
-from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
-from coliags_plugin.renderers.splatting import CutSettings, DrawnView, split_channels
+from coliags_plugin.renderers.splatting import (
+    CutSettings,
+    DrawnView,
+    check_gaussian_outputs,
+    is_surfels,
+    split_channels,
+)
 from coliags_plugin.renderers.tiles import TileGrid, TilePairs
 
 #: Outputs in the order of the depths of surfels.

@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.renderers.projection import ProjectedGaussians, filtered_covariances
+from coliags_plugin.renderers.projection import ProjectedGaussians, ProjectedSurfels, filtered_covariances
 from coliags_plugin.renderers.splatting import CutSettings
-from coliags_plugin.renderers.surfel_projection import ProjectedSurfels
 
 #: Slack on the squared Mahalanobis radius, so that rounding here never drops a pixel that compositing would draw.
 RADIUS_SLACK = 1e-2

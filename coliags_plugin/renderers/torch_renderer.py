@@ -13,12 +13,10 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.renderers.compositing import composite_gaussians
-from coliags_plugin.renderers.projection import facing_normals, project_gaussians
+from coliags_plugin.renderers.compositing import composite_gaussians, composite_surfels
+from coliags_plugin.renderers.projection import facing_normals, project_gaussians, project_surfels
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.stages import Placed, Stages, draw_view
-from coliags_plugin.renderers.surfel_compositing import composite_surfels
-from coliags_plugin.renderers.surfel_projection import project_surfels
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, bin_surfels, gaussian_extents, surfel_extents
 
 

@@ -12,8 +12,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import what_triton_lacks
-from coliags_plugin.renderers.checks import check_device, check_float32
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_device, check_float32
 from coliags_plugin.renderers.stages import Stages, draw_view
 from coliags_plugin.renderers.tiles import TileGrid
 

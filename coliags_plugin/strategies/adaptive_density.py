@@ -13,7 +13,6 @@ from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, Training
 from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.strategies.image_gradients import gradient_lengths
 
 #: A split Gaussian's scales are divided by 0.8 times the number of its parts.
 _SPLIT_PARTS = 2
@@ -116,7 +115,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         self.load_state_dict({name: like.new_zeros(len(like)) for name in self.counters})
 
     def _count(self, output: RenderOutput) -> None:
-        splats, lengths = output.drawn, gradient_lengths(output)
+        splats, lengths = output.drawn, output.gradient_lengths
         if lengths is None:
             return
         slots = splats.gaussians.source_index

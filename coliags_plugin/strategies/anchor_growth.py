@@ -13,7 +13,6 @@ from torch import Tensor
 from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep, steps_text
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.strategies.image_gradients import gradient_lengths
 
 
 class AnchorGrowthSettings(Settings):
@@ -118,7 +117,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
             setattr(self, name, torch.cat([values, values.new_zeros(missing)]) if missing else values)
 
     def _count(self, output: RenderOutput, children: int) -> None:
-        gaussians, lengths = output.drawn.gaussians, gradient_lengths(output)
+        gaussians, lengths = output.drawn.gaussians, output.gradient_lengths
         self.seen[gaussians.visible_sources] += 1
         self.opacity_sum.index_add_(0, gaussians.source_index // children, gaussians.opacities)
         if lengths is None:

@@ -18,9 +18,16 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians, shortest_axes
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.tensors import constant
-from coliags_plugin.renderers.checks import check_device, check_float32, check_gaussian_outputs
 from coliags_plugin.renderers.projection import facing
-from coliags_plugin.renderers.splatting import DrawnView, SplattingRenderer, SplattingSettings, split_channels
+from coliags_plugin.renderers.splatting import (
+    DrawnView,
+    SplattingRenderer,
+    SplattingSettings,
+    check_device,
+    check_float32,
+    check_gaussian_outputs,
+    split_channels,
+)
 
 #: Edge of gsplat's tiles, pixels.
 TILE_SIZE = 16

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
-from coliags_plugin.fields.frustum import spheres_in_frustum
 from coliags_plugin.fields.mlp import cosine_embedding
+from coliags_plugin.fields.points import neighbour_log_scales, spheres_in_frustum, voxelize
 from tests.fields.made import make_field
 from tests.scenes import camera_at, wall_scene
 
@@ -179,7 +178,7 @@ def test_anchors_behind_the_camera_have_cosine_zero():
     seen = {}
     head = field.appearance_head
     inputs = head.inputs
-    head.inputs = lambda v, d, c: seen.setdefault("cosines", c) is None or inputs(v, d, c)
+    head.inputs = lambda anchors: seen.setdefault("cosines", anchors.cosines) is None or inputs(anchors)
     with torch.no_grad():
         field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
         field.scalings.fill_(3.0)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from coliags_plugin.fields import anchors
 from coliags_plugin.fields.appearance_heads import PlainAppearanceHead
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 from coliags_plugin.fields.geometry_heads import PlainGeometryHead
+from coliags_plugin.fields.points import DRAWN_SIGMAS, spheres_in_frustum
 from tests.fields.made import make_field
 from tests.scenes import camera_at
 
@@ -225,21 +225,19 @@ def test_visible_anchors_are_those_whose_sphere_is_in_the_frustum(made):
         assert (near <= seen).all() and (seen <= far).all()
 
 
-def test_a_head_that_decodes_in_another_way_is_asked(made):
-    """A subclass with a ``forward`` of its own does not decode by the networks of the class above."""
+def test_a_head_with_a_forward_of_its_own_says_what_decodes(made):
+    """Kernels, which decode by networks, would skip it without notice."""
 
-    class Halved(PlainGeometryHead):
-        def forward(self, features, directions):
-            opacities, covariances = super().forward(features, directions)
-            return opacities / 2, covariances
+    def halved(head, seen):
+        opacities, covariances = PlainGeometryHead.forward(head, seen)
+        return opacities / 2, covariances
 
-    class Same(PlainAppearanceHead):
-        pass
-
+    with pytest.raises(TypeError, match="Halved overrides forward"):
+        type("Halved", (PlainGeometryHead,), {"forward": halved})
     field = made("scaffold")
     whole = field.gaussians(CAMERA)
-    field.geometry_head.__class__ = Halved
-    field.appearance_head.__class__ = Same
+    field.geometry_head.__class__ = type("Halved", (PlainGeometryHead,), {"forward": halved, "decoding": "forward"})
+    field.appearance_head.__class__ = type("Same", (PlainAppearanceHead,), {})
     half = field.gaussians(CAMERA)
     torch.testing.assert_close(half.opacities, whole.opacities / 2)
     torch.testing.assert_close(half.colors, whole.colors)

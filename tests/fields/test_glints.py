@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import SeenAnchors
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.fields.appearance_heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
@@ -29,10 +30,14 @@ def unit(*vectors: tuple[float, float, float]) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.tensor(vectors), dim=1)
 
 
-def embedded(head: GlintAppearanceHead, directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+def seen(directions: torch.Tensor, normals: torch.Tensor) -> SeenAnchors:
+    """Anchors of one feature, 7 mm in front of the lens."""
     count = len(directions)
-    distances, cosines = torch.full((count, 1), 7.0), torch.ones(count, 1)
-    return embedded_inputs(head.networks(torch.ones(count, 4), directions, distances, cosines, normals))
+    return SeenAnchors(torch.ones(count, 4), directions, torch.full((count, 1), 7.0), torch.ones(count, 1), normals)
+
+
+def embedded(head: GlintAppearanceHead, directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+    return embedded_inputs(head.networks(seen(directions, normals)))
 
 
 @settings(deadline=None)
@@ -99,7 +104,7 @@ def test_a_glint_beside_the_normal_is_learned():
     offsets = 0.5 * torch.rand(150, 2, generator=generator) - 0.25
     directions = torch.cat([offsets, (1.0 - offsets.square().sum(1, keepdim=True)).sqrt()], dim=1)
     glint = torch.exp(-(offsets - torch.tensor([0.17, 0.0])).square().sum(1) / 0.06**2)
-    normals, distances = unit((0.0, 0.0, 1.0)).expand(150, 3), torch.full((150, 1), 7.0)
+    normals = unit((0.0, 0.0, 1.0)).expand(150, 3)
     errors = {}
     for name in ("imia", "imia-glints"):
         head = make_head(name)
@@ -107,7 +112,7 @@ def test_a_glint_beside_the_normal_is_learned():
         fit = torch.optim.Adam(head.parameters(), lr=0.02)
         for _ in range(400):
             fit.zero_grad()
-            colors = head(torch.ones(150, 4), directions, distances, torch.ones(150, 1), normals)
+            colors = head(seen(directions, normals))
             error = (colors - (0.3 + 0.6 * glint)[:, None, None]).square().mean()
             error.backward()
             fit.step()

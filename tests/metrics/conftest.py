@@ -6,7 +6,7 @@ import cv2
 import pytest
 import torch
 
-from coliags_plugin.metrics import lpips_weights
+from coliags_plugin.metrics import lpips
 from tests.metrics.made import images
 
 
@@ -14,8 +14,8 @@ from tests.metrics.made import images
 def nowhere(monkeypatch, tmp_path):
     """A machine without any LPIPS weights."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
-    monkeypatch.setattr(lpips_weights, "find_spec", lambda name: None)
+    monkeypatch.delenv(lpips.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(lpips, "find_spec", lambda name: None)
     return tmp_path
 
 

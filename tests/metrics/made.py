@@ -7,8 +7,8 @@ import torch
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.metrics import lpips_weights
-from coliags_plugin.metrics.lpips_network import TAPS
+from coliags_plugin.metrics import lpips
+from coliags_plugin.metrics.lpips import TAPS
 
 
 def make(name, **options):
@@ -85,5 +85,5 @@ def lay_out(folder, net, heads="v0.1/{}.pth"):
     """As torchvision's downloads lie: the classifier too, under its published name."""
     (folder / heads.format(net)).parent.mkdir(parents=True, exist_ok=True)
     state = random_backbone(net, "features.") | {"classifier.0.weight": torch.zeros(2, 2)}
-    torch.save(state, folder / lpips_weights.BACKBONE_FILES[net][0])
+    torch.save(state, folder / lpips.BACKBONE_FILES[net][0])
     torch.save(random_heads(net), folder / heads.format(net))

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError, UnavailableError
-from coliags_plugin.metrics import lpips_weights
-from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork, features
+from coliags_plugin.metrics import lpips
+from coliags_plugin.metrics.lpips import TAPS, LPIPSNetwork, features
 from tests.metrics.made import TORCHVISION, images, lay_out, make, random_backbone, random_heads
 
 NETS = ["vgg", "alex", "squeeze"]
@@ -120,9 +120,9 @@ def test_building_a_network_draws_no_random_numbers(pair):
 def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypatch):
     lay_out(nowhere / "first", "alex", heads)
     lay_out(nowhere / "second", "alex", heads)
-    monkeypatch.setenv(lpips_weights.WEIGHTS_VARIABLE, str(nowhere / "second"))
-    assert {file.parents[heads.count("/")] for file in lpips_weights.find_weights("alex")[1:]} == {nowhere / "second"}
-    backbone, linear = lpips_weights.find_weights("alex", str(nowhere / "first"))
+    monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(nowhere / "second"))
+    assert {file.parents[heads.count("/")] for file in lpips.find_weights("alex")[1:]} == {nowhere / "second"}
+    backbone, linear = lpips.find_weights("alex", str(nowhere / "first"))
     assert backbone.parent == nowhere / "first"
     assert linear == nowhere / "first" / heads.format("alex")
 
@@ -131,12 +131,12 @@ def test_an_installed_lpips_package_lends_its_heads_without_being_imported(nowhe
     package = tmp_path / "site" / "lpips"
     lay_out(package / "weights", "alex")
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
-    (package / "weights" / lpips_weights.BACKBONE_FILES["alex"][0]).rename(tmp_path / "my-alex-backbone.pth")
+    (package / "weights" / lpips.BACKBONE_FILES["alex"][0]).rename(tmp_path / "my-alex-backbone.pth")
     monkeypatch.undo()
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.delenv(lpips.WEIGHTS_VARIABLE, raising=False)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    backbone, heads = lpips_weights.find_weights("alex", str(tmp_path))
+    backbone, heads = lpips.find_weights("alex", str(tmp_path))
     assert backbone == tmp_path / "my-alex-backbone.pth"
     assert heads == package / "weights" / "v0.1" / "alex.pth"
 
@@ -158,7 +158,7 @@ def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair):
 def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
     folder = nowhere / damage.replace(" ", "-")
     lay_out(folder, "squeeze")
-    backbone, heads = folder / lpips_weights.BACKBONE_FILES["squeeze"][0], folder / "v0.1" / "squeeze.pth"
+    backbone, heads = folder / lpips.BACKBONE_FILES["squeeze"][0], folder / "v0.1" / "squeeze.pth"
     culprit = heads if "heads" in damage else backbone
     if damage == "truncated":
         backbone.write_bytes(backbone.read_bytes()[:1000])

@@ -18,9 +18,15 @@ import torch
 from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.metrics import lpips_install
+from coliags_plugin.metrics.lpips import (
+    BACKBONE_FILES,
+    DEFAULT_NETS,
+    LPIPSNetwork,
+    find_weights,
+    load_network,
+    weights_in,
+)
 from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
-from coliags_plugin.metrics.lpips_network import LPIPSNetwork
-from coliags_plugin.metrics.lpips_weights import BACKBONE_FILES, DEFAULT_NETS, find_weights, load_network, weights_in
 from tests.commands import refused, run
 from tests.metrics.made import images, lay_out, make, random_backbone, random_heads
 

@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.model import Model
-from coliags_plugin.renderers import surfel_compositing, sweeping, torch_renderer
+from coliags_plugin.renderers import compositing, torch_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.naive import splat, splat_surfels
@@ -233,9 +233,9 @@ def test_the_size_of_the_working_set_changes_nothing(primitive, elements, monkey
     )
     cotangents = cotangents_of(gaussians, camera)
     plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
-    monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
-    monkeypatch.setattr(sweeping, "_MIN_RANKS", 3)
-    monkeypatch.setattr(sweeping, "_MAX_RANKS", 7)
+    monkeypatch.setitem(compositing.CHUNK_ELEMENTS, "cpu", elements)
+    monkeypatch.setattr(compositing, "_MIN_RANKS", 3)
+    monkeypatch.setattr(compositing, "_MAX_RANKS", 7)
     other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
     for key in cotangents:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
@@ -526,7 +526,7 @@ def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):
     def never(*_):
         raise AssertionError("depths were composited")
 
-    monkeypatch.setattr(surfel_compositing, "crossing_of_half", never)
+    monkeypatch.setattr(compositing, "crossing_of_half", never)
     render_gaussians(cast(gaussians, grad=True), camera, ("normals",)).rgb.sum().backward()
     with pytest.raises(AssertionError):
         render_gaussians(gaussians, camera, ("depth_expected",))

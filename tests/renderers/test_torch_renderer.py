@@ -19,7 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS
 from coliags_plugin.core.render_output import SURFEL_OUTPUTS
-from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.renderers.splatting import choose_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from tests.renderers.naive import extent
 

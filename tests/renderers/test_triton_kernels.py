@@ -77,12 +77,13 @@ def of_decoding():
     import torch
 
     from coliags_plugin.config.method_config import load_method
+    from coliags_plugin.contracts import SeenAnchors
     from coliags_plugin.fields.triton_kernels import children, decoding
 
     node = load_method("coliags").config.field
     field = node.target(node.settings, 1, torch.Generator())
-    seen = (field.features, *(torch.zeros(1, width) for width in (3, 1, 1)), None)
-    heads = field.geometry_head.networks(*seen[:2]), field.appearance_head.networks(*seen)
+    seen = SeenAnchors(field.features, *(torch.zeros(1, width) for width in (3, 1, 1)))
+    heads = field.geometry_head.networks(seen), field.appearance_head.networks(seen)
     opacity, covariance, color = children.networks_of(field.slots_per_element, field.features.shape[1], *heads)
     constants = {
         **{"NETWORK": opacity, "OPACITY": opacity, "COVARIANCE": covariance, "COLOR": color, "LENGTH": color.end},

@@ -13,8 +13,16 @@ from torch import nn
 
 from coliags_plugin.contracts import RadianceField, RadianceSamples
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.renderers.rays import WEIGHT_FLOOR, CompositedRays, even_places, refined_places, transmittances
-from coliags_plugin.renderers.volume_renderer import OPAQUE, VolumeRenderer, VolumeRendererSettings
+from coliags_plugin.renderers.volume_renderer import (
+    OPAQUE,
+    WEIGHT_FLOOR,
+    CompositedRays,
+    VolumeRenderer,
+    VolumeRendererSettings,
+    even_places,
+    refined_places,
+    transmittances,
+)
 from tests.scenes import camera_at
 
 COLOR = (0.8, 0.3, 0.1)

@@ -24,7 +24,7 @@ from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.samplers import generators
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
-from coliags_plugin.renderers.choice import choose_renderer
+from coliags_plugin.renderers.splatting import choose_renderer
 
 #: Steps, one view each, that are taken where the time allows.
 STEPS = 6000

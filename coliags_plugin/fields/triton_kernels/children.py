@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from coliags_plugin.contracts import HeadNetworks
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.fields.children import AnchorRows, DrawnChildren
-from coliags_plugin.fields.frustum import DRAWN_SIGMAS
+from coliags_plugin.fields.points import DRAWN_SIGMAS
 from coliags_plugin.fields.triton_kernels import decoding
 from coliags_plugin.fields.triton_kernels.networks import OUTPUTS, ROWS, Network
 
