@@ -200,7 +200,7 @@ class Run:
         Args:
             output: The file; of several formats, its suffix becomes that of each. None: ``export/SCENE.FORMAT`` in the
                 run folder.
-            formats: Of ``ply``, ``spz`` and ``glb``; none: ``ply``.
+            formats: Names of formats (docs/export.md 1); none: ``ply``.
             options: Others of :class:`~coliags_plugin.config.options.ExportOptions`.
 
         Raises:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import wraps
 from inspect import getdoc, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import tyro
 
@@ -61,6 +61,16 @@ Device = Annotated[
 Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
 AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 
+#: Modules of the formats of Gaussians that are written, by name: the suffix of their files.
+SPLAT_FORMATS = {
+    "ply": "coliags_plugin.export.splats.ply",
+    "spz": "coliags_plugin.export.splats.spz",
+    "glb": "coliags_plugin.export.splats.glb",
+}
+if TYPE_CHECKING:
+    SplatFormat = str
+else:
+    SplatFormat = Literal[tuple(SPLAT_FORMATS)]
 #: Light of Gaussians for all views.
 Light = Literal["recorded", "mean", "flattened"]
 
@@ -232,8 +242,7 @@ class ExportOptions(Options):
         seconds: Time limit, seconds, of the fit of baked Gaussians to the run's renderings, done where baking loses
             much.
         measure: Compare each file with the run on the held-out views, for the record and the terminal.
-        formats: Formats, all of one baking: PLY as 3DGS writes it, SPZ, glTF with KHR_gaussian_splatting. Lengths stay
-            those of the scene (mm).
+        formats: Formats, all of one baking (docs/export.md 1). Lengths stay those of the scene (mm).
     """
 
     output: OptionalOutput = None
@@ -243,7 +252,7 @@ class ExportOptions(Options):
         bool,
         _flag(help="Do not compare each file with the run on the held-out views, for the record and the terminal."),
     ] = True
-    formats: Annotated[tuple[Literal["ply", "spz", "glb"], ...], tyro.conf.arg(name="format")] = ("ply",)
+    formats: Annotated[tuple[SplatFormat, ...], tyro.conf.arg(name="format")] = ("ply",)
     overwrite: Overwrite = False
 
 

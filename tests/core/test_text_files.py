@@ -13,7 +13,7 @@ from coliags_plugin.core.images import decode_image
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.text_files import read_text, text_lines, whole_text
-from coliags_plugin.export.splats.files import read_splats
+from coliags_plugin.export.splats.cloud import read_splats
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses.formats import format_of
 

@@ -24,7 +24,7 @@ from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.training import TrainingRequest, open_training
 from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
-from coliags_plugin.export.splats.files import read_splats, write_splat_ply
+from coliags_plugin.export.splats.cloud import read_splats, write_splats
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
@@ -141,7 +141,7 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, small, tmp_path
     # Imported at any length, as much of it lies beyond the near plane.
     for length in (1.0, 1e-3):
         file, folder, scene = tmp_path / "small.ply", RunFolder(tmp_path / f"imported {length}"), small.scaled(length)
-        write_splat_ply(file, clouds[0].scaled(length))
+        write_splats(file, clouds[0].scaled(length), "ply")
         for module in (exporting, trained_module):
             monkeypatch.setattr(module, "load_scene", lambda config, _, s=scene: s.with_near_plane(config.near_plane))
         import_run(file, tmp_path, folder, CPU, "c3vd")

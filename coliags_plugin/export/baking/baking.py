@@ -20,8 +20,7 @@ from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
-from coliags_plugin.export.splats.files import THICKNESS_SHARE
+from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, cloud_of_field, field_of_cloud
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -172,7 +171,7 @@ def bake(
     trained = trained.in_model_units
     explicit = trained.model.field
     if most is None and isinstance(explicit, ExplicitGaussians):
-        made = field_of_cloud(cloud_of_field(explicit).with_thickness(THICKNESS_SHARE))
+        made = field_of_cloud(cloud_of_field(explicit).with_thickness())
         needs = explicit.scale_count < 3 and needs_distillation(made, trained, light)
         facts = {"steps": distil(made, trained, light, seconds, most_steps), "seconds": seconds} if needs else {}
         return cloud_of_field(made).scaled(1.0 / scale), facts

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.config.options import ExportOptions
+from coliags_plugin.config.options import SPLAT_FORMATS, ExportOptions
 from coliags_plugin.contracts import Comparison, GaussianField
 from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.core.files import atomic_folder, file_sha256, refuse_existing, write_json
@@ -27,8 +27,14 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, model_of_gaussians
-from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud, load_cloud
-from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
+from coliags_plugin.export.splats.cloud import (
+    SplatCloud,
+    field_of_cloud,
+    load_cloud,
+    read_splats,
+    reader_of,
+    write_splats,
+)
 from coliags_plugin.reporting.numbers import counted
 
 log = logging.getLogger(__name__)
@@ -71,7 +77,7 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     file = options.output or trained.run.path / "export" / f"{trained.provenance['scene']['name']}.{formats[0]}"
     outputs = {form: file.with_suffix(f".{form}") if len(formats) > 1 else file for form in formats}
     for form, output in outputs.items():
-        check_name("format", form, FORMATS)
+        check_name("format", form, SPLAT_FORMATS)
         for target in (output, _record_file(output)):
             refuse_existing(target, options.overwrite, "a new file")
     field = _gaussian_field(trained)
@@ -79,7 +85,7 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
     held = baked_in if field.knows_lamp else None
     cloud, facts = bake(trained, baked_in, options.seconds)
     baking = {"light": light_facts(light, field, baked_in), **facts} if facts else None
-    cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
+    cloud = _checked(cloud.with_thickness(), trained)
     return [_written(trained, cloud, form, output, baking, held, options.measure) for form, output in outputs.items()]
 
 
@@ -104,8 +110,8 @@ def _written(
     unit = trained.scene.length_unit
     comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"
     write_splats(output, cloud, form, comment)
-    _, read = FORMATS[form]
-    kept = cloud if read is None else read(output)
+    read = reader_of(form)
+    stored = cloud if read is None else read(output)
     record = {
         "format": "coliags-export",
         "version": RECORD_VERSION,
@@ -128,7 +134,7 @@ def _written(
             "step": trained.step,
         },
         "baking": baking,
-        "cost": export_cost(trained, kept, held) if measure else None,
+        "cost": export_cost(trained, stored, held) if measure else None,
         "software": software(),
     }
     write_json(_record_file(output), record)

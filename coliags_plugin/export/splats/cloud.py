@@ -1,18 +1,33 @@
-"""Gaussians of a file, a browser or an explicit field: a world frame, plain numbers, colours as spherical harmonics."""
+"""Gaussians of an explicit field or a file: a world frame, plain numbers, colours as spherical harmonics.
+
+A format of files is a module of :data:`~coliags_plugin.config.options.SPLAT_FORMATS` with ``write(path, cloud,
+comment)`` and, if its files are read as well, ``read(path)``.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32
+from scipy.special import logit
 
+from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core import bounds
+from coliags_plugin.core.errors import InputError, check_name
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
 from coliags_plugin.fields.spherical_harmonics import Y0
 
+log = logging.getLogger(__name__)
+
+#: Third scale of surfels in files, as a share of the smaller other one: small, and a finite logarithm.
+THICKNESS_SHARE = 0.01
 #: Opacities are kept this far from 0 and 1, where their logits would be infinite.
 OPACITY_MARGIN = 1e-6
 
@@ -62,7 +77,7 @@ class SplatCloud:
     def logits(self) -> Float32[np.ndarray, "N"]:
         """Logits of the opacities, finite. [N]"""
         inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
-        return np.log(inside / (1.0 - inside)).astype(np.float32)
+        return np.asarray(logit(inside), np.float32)
 
     def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
         """Some of the Gaussians."""
@@ -86,17 +101,12 @@ class SplatCloud:
             parts += [(np.abs(lengths) <= bounds.LENGTH).all(axis=1) for lengths in (self.means, self.scales)]
         return np.all(parts, axis=0)
 
-    def with_thickness(self, share: float) -> SplatCloud:
-        """Surfels as flat Gaussians, their third scale a share of the smaller other one; Gaussians unchanged."""
+    def with_thickness(self) -> SplatCloud:
+        """Surfels as flat Gaussians, with a third scale; Gaussians unchanged."""
         if self.scales.shape[1] == 3:
             return self
-        third = share * self.scales.min(axis=1, keepdims=True)
+        third = THICKNESS_SHARE * self.scales.min(axis=1, keepdims=True)
         return replace(self, scales=np.concatenate([self.scales, third], axis=1))
-
-
-def sigmoid(logits: Float32[np.ndarray, "N"]) -> Float32[np.ndarray, "N"]:
-    """Opacities of logits. [N]"""
-    return (0.5 * (1.0 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.float32)
 
 
 def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:
@@ -134,3 +144,36 @@ def field_of_cloud(cloud: SplatCloud) -> ExplicitGaussians:
                 values.copy_(torch.from_numpy(cloud.attenuation[:, column : column + 1]))
     load_cloud(field, cloud)
     return field
+
+
+def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") -> None:
+    """Write at least one Gaussian, all finite, in a named format; surfels become flat Gaussians."""
+    check_name("format", name, SPLAT_FORMATS)
+    if not len(cloud):
+        raise InputError("no Gaussian to write", "at least one")
+    import_module(SPLAT_FORMATS[name]).write(path, cloud.with_thickness(), comment)
+
+
+def reader_of(name: str) -> Callable[[Path], SplatCloud] | None:
+    """The function that reads files of a format; None where they are only written."""
+    return getattr(import_module(SPLAT_FORMATS[name]), "read", None)
+
+
+def read_splats(path: Path) -> SplatCloud:
+    """Read Gaussians, in the format of the suffix; rows that are not finite are dropped with a warning."""
+    name = path.suffix.lower().removeprefix(".")
+    read = reader_of(name) if name in SPLAT_FORMATS else None
+    if read is None:
+        formats = ", ".join(f".{name}" for name in SPLAT_FORMATS if reader_of(name))
+        raise InputError(f"{path}: no reader for '{path.suffix}'", f"a file {formats}")
+    cloud = read(path)
+    usable = cloud.usable()
+    dropped = len(cloud) - int(usable.sum())
+    if dropped == len(cloud):
+        raise InputError(
+            f"{path} has {len(cloud)} Gaussians, none of which is usable", "finite numbers, rotations not 0"
+        )
+    if dropped:
+        log.warning("%s: dropped %d of %d Gaussians that are not finite or have no rotation", path, dropped, len(cloud))
+        cloud = cloud.part(usable)
+    return cloud

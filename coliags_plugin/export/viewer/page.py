@@ -32,8 +32,8 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.distillation import adjusted_camera, best_frame
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
+from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
-from coliags_plugin.export.splats.files import read_splat_spz, write_spz
 from coliags_plugin.fields.explicit_gaussians import FARTHEST, AttenuatedGaussians, ExplicitGaussians
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -81,8 +81,8 @@ class Layer:
         unit = 2.0 ** math.ceil(math.log2(reach / _REACH)) if reach > 0.0 else 1.0
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "cloud.spz"
-            write_spz(file, cloud.scaled(1.0 / unit))
-            data, drawn = file.read_bytes(), read_splat_spz(file).scaled(unit)
+            spz.write(file, cloud.scaled(1.0 / unit))
+            data, drawn = file.read_bytes(), spz.read(file).scaled(unit)
         packed = {"kind": "gaussians", "unit": unit, "data": b64encode(data).decode("ascii")}
         if cloud.attenuation is not None:
             packed["attenuation"], attenuation = _packed_attenuation(cloud.attenuation)

@@ -21,8 +21,7 @@ from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.exporting import export_cost
-from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
-from coliags_plugin.export.splats.files import read_splats, write_splat_ply, write_splats
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud, read_splats, write_splats
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from tests.commands import refused, run
 from tests.export.splats.clouds import PARTS, random_cloud
@@ -268,7 +267,7 @@ def test_imports_that_cannot_be(wall, tmp_path, capsys):
 )
 def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, seen):
     cloud = random_cloud(200)
-    write_splat_ply(tmp_path / "far.ply", replace(cloud, **change(cloud)))
+    write_splats(tmp_path / "far.ply", replace(cloud, **change(cloud)), "ply")
     with caplog.at_level(logging.WARNING):
         cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
     assert re.search(f"{seen}.*world frame and unit", caplog.text)

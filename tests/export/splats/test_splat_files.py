@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import logging
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -16,22 +17,17 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import read_vertices, write_ply
-from coliags_plugin.export.splats import files
-from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.files import (
-    FORMATS,
-    THICKNESS_SHARE,
-    read_splat_ply,
-    read_splats,
-    write_splat_ply,
-    write_splats,
-)
+from coliags_plugin.export.splats import spz
+from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, read_splats, reader_of, write_splats
 from coliags_plugin.fields import spherical_harmonics
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
+
+DOCUMENTATION = Path(__file__).parents[3] / "docs/export.md"
 
 
 def written(tmp_path, cloud: SplatCloud, name: str):
@@ -133,7 +129,7 @@ def test_spz_is_turned_to_its_own_axes(tmp_path):
     path = written(tmp_path, cloud, "spz")
     assert struct.unpack("<II", gzip.decompress(path.read_bytes())[:8]) == (0x5053474E, 3)
     np.testing.assert_allclose(gsply.read_spz(path).means, cloud.means * [1, -1, -1], atol=2e-4)
-    turned, turn = files._half_turn(cloud), np.diag([1.0, -1.0, -1.0])
+    turned, turn = spz._half_turn(cloud), np.diag([1.0, -1.0, -1.0])
     np.testing.assert_allclose(covariances(turned), turn @ covariances(cloud) @ turn, atol=1e-5)
     directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     seen = [
@@ -178,13 +174,13 @@ def test_glb_follows_the_extension(tmp_path):
 def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog):
     cloud = random_cloud(6)
     cloud.means[1, 2], cloud.quats_wxyz[4] = np.nan, 0.0
-    write_splat_ply(tmp_path / "holes.ply", cloud)
+    write_splats(tmp_path / "holes.ply", cloud, "ply")
     with caplog.at_level(logging.WARNING):
         again = read_splats(tmp_path / "holes.ply")
     assert len(again) == 4 and "dropped 2 of 6" in caplog.text
     np.testing.assert_array_equal(again.means, cloud.means[[0, 2, 3, 5]])
     cloud.means[:] = np.inf
-    write_splat_ply(tmp_path / "bad.ply", cloud)
+    write_splats(tmp_path / "bad.ply", cloud, "ply")
     with pytest.raises(InputError, match="none of which is usable"):
         read_splats(tmp_path / "bad.ply")
 
@@ -192,7 +188,7 @@ def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog
 @pytest.mark.parametrize("activated", [True, False])
 def test_opacities_and_scales_that_were_activated_are_told(tmp_path, caplog, activated):
     cloud = random_cloud(20, degree=0)
-    write_splat_ply(tmp_path / "cloud.ply", cloud)
+    write_splats(tmp_path / "cloud.ply", cloud, "ply")
     if activated:
         columns = read_vertices(tmp_path / "cloud.ply")
         columns |= {"opacity": cloud.opacities, **{f"scale_{axis}": cloud.scales[:, axis] for axis in range(3)}}
@@ -221,10 +217,10 @@ def test_files_of_other_lineage_are_refused_by_name(tmp_path, lines, said):
 
 def test_an_incomplete_set_of_harmonics_is_refused(tmp_path):
     path = tmp_path / "odd.ply"
-    write_splat_ply(path, random_cloud(2))
+    write_splats(path, random_cloud(2), "ply")
     path.write_bytes(path.read_bytes().replace(b"f_rest_44", b"g_rest_44"))
     with pytest.raises(InputError, match="44 properties f_rest"):
-        read_splat_ply(path)
+        read_splats(path)
 
 
 @pytest.mark.parametrize("name", ["ply", "spz"])
@@ -239,14 +235,24 @@ def test_damaged_and_missing_files_are_clear_errors(tmp_path, name):
 
 
 def test_unknown_formats_and_nothing_to_write_are_refused(tmp_path):
-    with pytest.raises(InputError, match="one of ply, spz, glb"):
+    with pytest.raises(InputError, match=f"one of {', '.join(SPLAT_FORMATS)}"):
         write_splats(tmp_path / "a", random_cloud(1), "sog")
     with pytest.raises(InputError, match="no Gaussian"):
         write_splats(tmp_path / "a", random_cloud(0), "ply")
     with pytest.raises(InputError, match="no reader"):
         read_splats(tmp_path / "a.glb")
     assert not list(tmp_path.iterdir())
-    assert set(FORMATS) == {"ply", "spz", "glb"}
+
+
+@pytest.mark.parametrize("name", SPLAT_FORMATS)
+def test_formats_keep_positions_and_are_documented(tmp_path, name):
+    cloud = random_cloud(9)
+    path = written(tmp_path, cloud, name)
+    read = reader_of(name)
+    if read is not None:
+        np.testing.assert_allclose(read(path).means, cloud.means, atol=1.0 / 4096)
+    (row,) = re.findall(rf"^\| `{name}` \|.*\| (.*?) \|$", DOCUMENTATION.read_text(encoding="utf-8"), re.M)
+    assert row.startswith("no" if read is None else "yes")
 
 
 #: Corners of a tetrahedron which no turn and no mirroring brings back onto itself. [4, 3]

@@ -17,8 +17,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import rotation_of_vector
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.export.splats.cloud import field_of_cloud
-from coliags_plugin.export.splats.files import read_splat_spz
+from coliags_plugin.export.splats.cloud import field_of_cloud, read_splats
 from coliags_plugin.export.viewer.page import CameraPath, Layer, page_html
 from coliags_plugin.fields.spherical_harmonics import Y0
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -92,7 +91,7 @@ def test_gaussians_are_an_spz_in_a_unit_of_their_own(tmp_path, size):
     cloud = replace(cloud, means=cloud.means * np.float32(size), scales=cloud.scales * np.float32(size))
     (layer,) = data_of(page_of(gaussians(cloud)))["layers"]
     (tmp_path / "a.spz").write_bytes(b64decode(layer["data"]))
-    read = read_splat_spz(tmp_path / "a.spz")
+    read = read_splats(tmp_path / "a.spz")
     _, drawn = Layer.of_cloud("Gaussians", cloud)
     np.testing.assert_allclose(drawn.means, read.means * layer["unit"], rtol=1e-6)
     np.testing.assert_allclose(drawn.scales, read.scales * layer["unit"], rtol=1e-6)
