@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -298,13 +298,22 @@ def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]
 
 
 def ranked_cells(
-    values: Sequence[float | None], unit: str, direction: Direction | None, spreads: Sequence[float | None] = ()
+    values: Sequence[float | None],
+    unit: str,
+    direction: Direction | None,
+    spreads: Sequence[float | None] = (),
+    text: Callable[[float], str] | None = None,
 ) -> list[TableCell]:
-    """Cells of one column: decimals by the unit, the same for values and spreads; ranks by the printed digits."""
+    """Cells of one column, ranked as printed: values of the same text share a rank.
+
+    Without ``text``, decimals are those of the unit, the same for values and spreads.
+    """
     decimals = column_decimals(unit, values)
-    texts = ["" if value is None else number_text(value, decimals) for value in values]
+    printed = text or (lambda value: number_text(value, decimals))
+    texts = ["" if value is None else printed(value) for value in values]
     shown = ["" if spread is None else number_text(spread, decimals) for spread in spreads or [None] * len(texts)]
-    ranks = ranks_of([float(text) if text else None for text in texts], direction)
+    first = dict(zip(reversed(texts), reversed(values), strict=True))
+    ranks = ranks_of([first[each] for each in texts], direction)
     return [
         TableCell(text, value, spread if text else "", rank)
         for text, value, spread, rank in zip(texts, values, shown, ranks, strict=True)

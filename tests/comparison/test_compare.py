@@ -167,7 +167,7 @@ def test_every_cell_that_begins_and_ends_is_told(bare, tmp_path, caplog):
     told = [
         record.message
         for record in caplog.records
-        if record.name.endswith((".queue", ".compare")) and "cells:" not in record.message
+        if record.name.endswith((".task_queue", ".compare")) and "cells:" not in record.message
     ]
     assert told[:1] + told[2:] == [
         "bare coliags seed 0: started",

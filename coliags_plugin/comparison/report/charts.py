@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from coliags_plugin.comparison.report.study import Part, Study
+from coliags_plugin.comparison.report.study import Study, TestSet, grouped
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.model import Chart, Figures, Folded, Paragraph, Section, Template
@@ -22,6 +23,8 @@ _LOG_DEPTH_FROM, _LOG_LOSS_FROM = 20.0, 8.0
 _MOST_POINTS = 120
 #: Columns of the log against which curves are drawn: group of the charts, and label of the axis.
 _TRAINING_AXES = {"step": ("by-step", "step"), "seconds": ("by-seconds", "training time [s]")}
+#: Columns of the log that are drawn: label of the axis, and title of the chart.
+_TRAINING_CURVES = {"psnr": ("training PSNR [dB]", "PSNR of the training view at each step"), "loss": ("loss", "Loss")}
 #: Training log of a run: method, its style, and the columns.
 _Log = tuple[str, int, Mapping[str, np.ndarray]]
 
@@ -33,37 +36,37 @@ def profile_section(study: Study) -> Section:
         "and the root mean square of the depth error, drawn at the middle of each bin. Bins with less than "
         f"{_SMALLEST_SHARE:.1%} of the pixels are left out. The light of a scope falls with both."
     )
-    figures = [Figures(charts, part.title, study.methods) for part in study.parts if (charts := _profile_charts(part))]
+    charts = {test_set.title: _profile_charts(test_set) for test_set in study.test_sets}
+    figures = [Figures(own, title, study.methods) for title, own in charts.items() if own]
     return Section("Error against distance and angle", [explanation, *figures] if figures else [], screen_only=True)
 
 
-def _profile_charts(part: Part) -> list[Chart]:
-    charts, unit = [], part.study.length_unit
+def _profile_charts(test_set: TestSet) -> list[Chart]:
+    """PSNR and depth error against distance and angle, over the scenes that all methods with profiles have."""
+    charts, study, unit = [], test_set.study, test_set.study.length_unit
     axes = {"distance": f"distance to the camera [{unit}]", "angle": "angle to the optical axis [degrees]"}
     for name, x_label in axes.items():
-        profiles = _profiles(part, name)
+        recorded = [(run, record.profiles[name]) for run, record in test_set.records if name in record.profiles]
+        by_method = {
+            method: grouped(pairs, lambda pair: pair[0].scene)
+            for method, pairs in grouped(recorded, lambda pair: pair[0].method).items()
+        }
+        shared = common_scenes([*by_method.values()])
+        profiles = {
+            method: [profile for scene in shared for _, profile in by_scene[scene]]
+            for method, by_scene in by_method.items()
+        }
         for title, y_label in (("PSNR", "PSNR [dB]"), ("Depth error", f"RMS depth error [{unit}]")):
             lines = [
-                _profile_line(method, part.study.methods.index(method), own, of_depth=title != "PSNR")
-                for method, own in profiles.items()
-                if len({profile.edges for profile in own}) == 1
+                _profile_line(method, study.methods.index(method), pooled, of_depth=title != "PSNR")
+                for method, pooled in profiles.items()
+                if len({profile.edges for profile in pooled}) == 1
             ]
             log = title != "PSNR" and _spans(lines, _LOG_DEPTH_FROM)
             charts.append(
                 Chart(lines, x_label, _log_label(y_label, log), f"{title} against {name}", log_y=log, markers=True)
             )
     return [chart for chart in charts if chart.has_points]
-
-
-def _profiles(part: Part, name: str) -> dict[str, list[ProfileRecord]]:
-    """Profiles of the methods that have some, of the scenes that all of them have: all are of the same pixels."""
-    found: dict[str, dict[str, list[ProfileRecord]]] = {}
-    for run in part.study.runs:
-        record = part.record(run)
-        if record is not None and name in record.profiles:
-            found.setdefault(run.method, {}).setdefault(run.scene, []).append(record.profiles[name])
-    shared = common_scenes([*found.values()])
-    return {method: [each for scene in shared for each in by_scene[scene]] for method, by_scene in found.items()}
 
 
 def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of_depth: bool) -> Series:
@@ -83,36 +86,37 @@ def _profile_line(method: str, style: int, profiles: Sequence[ProfileRecord], of
 def training_section(study: Study) -> Section:
     """Curves of every scene against steps and seconds; says so where there is no log."""
     logs: dict[str, list[_Log]] = {}
-    for style, (method, runs) in enumerate(study.by_method.items()):
+    for style, runs in enumerate(study.by_method.values()):
         for run in runs:
             if run.run is not None and (columns := RunFolder(run.run).history()):
-                logs.setdefault(run.scene, []).append((method, style, columns))
+                logs.setdefault(run.scene, []).append((run.method, style, columns))
     if not logs:
         text = "No training log: only results files are here, or runs without metrics.jsonl."
         return Section("Training", [Paragraph(text)], screen_only=True)
-    figures = {
-        scene: Figures(_training_charts(logs[scene]), legend=study.methods) for scene in study.scenes if scene in logs
-    }
-    folded = [Folded(scene, [own], is_open=index == 0) for index, (scene, own) in enumerate(figures.items())]
     hints = []
-    per_point = math.ceil(max(len(columns["step"]) for own in logs.values() for *_, columns in own) / _MOST_POINTS)
+    per_point = math.ceil(
+        max(len(columns["step"]) for curves in logs.values() for *_, columns in curves) / _MOST_POINTS
+    )
     if per_point > 1:
         hints.append(f"Each point is the mean of up to {per_point} logged steps.")
     if len(study.methods) > 1:
         hints.append("Each method has a loss of its own: compare the shapes of the curves, not their levels.")
-    if any(len({method for method, *_ in own}) < len(own) for own in logs.values()):
+    if any(len({method for method, *_ in curves}) < len(curves) for curves in logs.values()):
         hints.append("One curve for each seed.")
-    shown = folded if len(figures) > 1 else figures.values()
+    folded = [
+        Folded(scene, [Figures(_training_charts(logs[scene]), legend=study.methods)])
+        for scene in study.scenes
+        if scene in logs
+    ]
+    folded[0] = replace(folded[0], is_open=True)
+    shown = folded if len(folded) > 1 else folded[0].blocks
     return Section("Training", [Template("curves.html"), Paragraph(" ".join(hints)), *shown], screen_only=True)
 
 
 def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
     charts = []
     for x, (group, x_label) in _TRAINING_AXES.items():
-        for y, y_label, title in (
-            ("psnr", "training PSNR [dB]", "PSNR of the training view at each step"),
-            ("loss", "loss", "Loss"),
-        ):
+        for y, (y_label, title) in _TRAINING_CURVES.items():
             lines = [
                 Series(method, style, *_smoothed(columns[x], columns[y]))
                 for method, style, columns in logs
@@ -128,8 +132,8 @@ def _smoothed(along: np.ndarray, values: np.ndarray) -> tuple[list[float], list[
     along, values = along[np.isfinite(along)], values[np.isfinite(along)]
     if len(along) > _MOST_POINTS:
         intervals = np.array_split(np.arange(len(along)), _MOST_POINTS)
-        kept = [part for part in (part[np.isfinite(values[part])] for part in intervals) if part.size]
-        along, values = (np.array([every[part].mean() for part in kept]) for every in (along, values))
+        finite = [index for index in (each[np.isfinite(values[each])] for each in intervals) if index.size]
+        along, values = (np.array([column[index].mean() for index in finite]) for column in (along, values))
     return along.tolist(), values.tolist()
 
 
@@ -137,21 +141,20 @@ def frame_charts(study: Study) -> list[Folded]:
     """PSNR of each frame of every scene."""
     folded = []
     for scene in study.scenes:
-        charts = [chart for part in study.parts if (chart := _frame_chart(part, scene)).has_points]
+        charts = [chart for each in study.test_sets if (chart := _frame_chart(each, scene)).has_points]
         if charts:
             figures = Figures(charts, legend=study.methods)
             folded.append(Folded(f"PSNR of each frame of {scene}", [figures], is_open=len(study.scenes) == 1))
     return folded
 
 
-def _frame_chart(part: Part, scene: str) -> Chart:
-    names, lines = list(part.frames(scene)), []
-    for style, method in enumerate(part.study.methods):
-        values = part.frame_means(scene, method, "psnr")
-        if values:
+def _frame_chart(test_set: TestSet, scene: str) -> Chart:
+    names, lines = list(test_set.frames(scene)), []
+    for style, method in enumerate(test_set.study.methods):
+        if values := test_set.frame_means(scene, method, "psnr"):
             along = [float(index) for index in range(len(names))]
             lines.append(Series(method, style, along, [values.get(name, math.nan) for name in names]))
-    return Chart(lines, "frame", "PSNR [dB]", part.title, x_names=names, markers=True)
+    return Chart(lines, "frame", "PSNR [dB]", test_set.title, x_names=names, markers=True)
 
 
 def _log_label(label: str, log: bool) -> str:

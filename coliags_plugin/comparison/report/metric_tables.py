@@ -1,20 +1,23 @@
-"""Tables of metrics: means over all scenes or a single one, and a reference's lead over its rivals with tests."""
+"""Tables with a row per method: means of metrics and of costs, and a reference's lead over its rivals with tests."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Literal
+
+import numpy as np
 
 from coliags_plugin.comparison.report.published import published_for
-from coliags_plugin.comparison.report.study import Part, Study
+from coliags_plugin.comparison.report.study import Study, TestSet, grouped
 from coliags_plugin.core.errors import check_name
-from coliags_plugin.reporting.model import Column, Table, TableCell, ranked_cells
-from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
+from coliags_plugin.reporting.model import Column, Table, TableCell, Value, ranked_cells
+from coliags_plugin.reporting.numbers import column_decimals, counted, duration, number_text, unit_text
 from coliags_plugin.results.comparisons import (
     FEWEST_SCENES,
     LEVELS,
     BySeed,
-    PairedTests,
     RivalComparison,
     Spread,
     common_scenes,
@@ -22,19 +25,19 @@ from coliags_plugin.results.comparisons import (
     smallest_p,
     spread,
 )
-from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
+from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, CostRecord
 
 #: Labels the rows.
 METHOD = Column("method", "Method", words=True)
 #: Shown unless the reader chooses others.
-DEFAULT_COLUMNS = (
+DEFAULT_COLUMNS = [
     *("psnr", "psnr_gain_fitted", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
     *("sparse_depth_median", "sparse_depth_p90"),
-)
+]
 #: Default columns of other sets, whose views leave the path, so that much of what they see was never filmed.
-_BEYOND_THE_PATH = ("psnr", "psnr_seen", "psnr_gain_fitted_seen", *DEFAULT_COLUMNS[2:])
+_BEYOND_THE_PATH = ["psnr", "psnr_seen", "psnr_gain_fitted_seen", *DEFAULT_COLUMNS[2:]]
 #: Metrics shown in place of a default column that no result has.
-_INSTEAD = {"lpips": ("lpips_squeeze",)}
+_INSTEAD = {"lpips": "lpips_squeeze"}
 #: Chooses all.
 ALL_COLUMNS = "all"
 
@@ -62,40 +65,37 @@ def metric_title(metric: str) -> str:
     return f"{title}, seen pixels" if metric != base else title
 
 
-def metric_columns(part: Part, chosen: Sequence[str] = ()) -> list[Column]:
-    """Columns of a part: every metric that it has, or that no part has; those not chosen are there, but not shown.
+def metric_columns(test_set: TestSet, chosen: Sequence[str] = ()) -> list[Column]:
+    """Columns of a test set: every metric that it has, or that no set has; those not chosen are there, but not shown.
 
-    Chosen ones come first, in their order. Unless chosen, metrics that have no value in the part, nor a published one,
+    Chosen ones come first, in their order. Unless chosen, metrics that have no value in the set, nor a published one,
     are not shown either.
     """
-    metrics, parts = part.study.metrics, part.study.parts
-    own = [
-        name
-        for name in metrics
-        if not name.endswith(SEEN_SUFFIX) or part.has(name) or not any(other.has(name) for other in parts)
-    ]
-    wanted = own if ALL_COLUMNS in chosen else chosen or _default_columns(part)
-    shown = [name for name in wanted if name in own]
+    metrics, published = test_set.study.metrics, published_for(test_set)
+    available = {name for name in metrics if test_set.has(name)}
+    elsewhere = {name for name in metrics if any(other.has(name) for other in test_set.study.test_sets)} - available
+    names = [name for name in metrics if not name.endswith(SEEN_SUFFIX) or name not in elsewhere]
+    if not chosen:
+        usual = DEFAULT_COLUMNS if test_set.set_name == MAIN_SET else _BEYOND_THE_PATH
+        usual = [
+            _INSTEAD[name] if name not in available and _INSTEAD.get(name) in available else name for name in usual
+        ]
+        printed = set() if published is None else {name for row in published.methods.values() for name in row}
+        chosen = [name for name in usual if name in available | printed]
+    shown = names if ALL_COLUMNS in chosen else [name for name in chosen if name in names]
     return [
         Column(name, metric_title(name), metrics[name].unit, metrics[name].direction, name in shown)
-        for name in dict.fromkeys([*shown, *own])
+        for name in dict.fromkeys([*shown, *names])
     ]
 
 
-def _default_columns(part: Part) -> list[str]:
-    names = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
-    published = published_for(part)
-    printed = set() if published is None else {name for numbers in published.methods.values() for name in numbers}
-    available = (name if part.has(name) else next(filter(part.has, _INSTEAD.get(name, ())), name) for name in names)
-    return [name for name in available if part.has(name) or name in printed]
-
-
-def method_rows(study: Study, cells: Mapping[str, Sequence[TableCell]]) -> list[dict[str, TableCell]]:
-    """Rows of a table with one method each, of the cells of every method by the keys of the columns."""
-    return [
+def _table(study: Study, columns: Sequence[Column], cells: Mapping[str, Sequence[TableCell]], title: str) -> Table:
+    """Table of one row per method; cells of every method by the keys of the columns."""
+    rows: list[Mapping[str, Value | TableCell]] = [
         {METHOD.key: TableCell(method, style=index), **{key: column[index] for key, column in cells.items()}}
         for index, method in enumerate(study.methods)
     ]
+    return Table(title, [METHOD, *columns], rows)
 
 
 def shared_scenes(values: Mapping[str, BySeed]) -> list[str]:
@@ -109,8 +109,11 @@ def spreads(values: Mapping[str, BySeed]) -> dict[str, Spread]:
     return {method: spread(by_scene, scenes if by_scene else ()) for method, by_scene in values.items()}
 
 
+# Means of metrics
+
+
 def means_table(
-    part: Part,
+    test_set: TestSet,
     columns: Sequence[Column],
     scene: str | None = None,
     stars: Mapping[str, Mapping[str, str]] | None = None,
@@ -119,102 +122,229 @@ def means_table(
 
     Stars are by metric and method; published numbers stand below our means over all scenes.
     """
-    published = published_for(part) if scene is None else None
-    scenes, marks = part.scenes if scene is None else [scene], stars or {}
-    cells = {column.key: _cells(part, column, scenes, marks.get(column.key, {})) for column in columns}
-    rows = method_rows(part.study, cells)
-    if published is not None:
-        rows += [_published_row(method, columns, numbers) for method, numbers in published.methods.items()]
-    frames = counted(sum(len(part.frames(each)) for each in scenes), "frame")
-    several = len(scenes) > 1
-    notes = [] if scene is not None else _summary_notes(part, columns)
-    if any(cell.spread for own in cells.values() for cell in own):
-        notes.append(f"± standard deviation over {'scenes' if several else 'seeds'}")
-    if any(each for own in marks.values() for each in own.values()):
+    published = published_for(test_set) if scene is None else None
+    scenes, marks = test_set.scenes if scene is None else [scene], stars or {}
+    cells = {column.key: _metric_cells(test_set, column, scenes, marks.get(column.key, {})) for column in columns}
+    notes = [] if scene is not None else _summary_notes(test_set, columns)
+    if any(cell.spread for column in cells.values() for cell in column):
+        notes.append(f"± standard deviation over {'scenes' if len(scenes) > 1 else 'seeds'}")
+    if any(mark for by_method in marks.values() for mark in by_method.values()):
         levels = ", ".join(f"{'*' * (index + 1)} p < {f'{level:g}'[1:]}" for index, level in enumerate(LEVELS))
         notes.append(f"Differs from the reference: {levels} (Wilcoxon signed-rank test over scenes, Holm)")
-    return Table(
-        title=part.title if scene is None else f"{scene}, {part.title}",
-        columns=[METHOD, *columns],
+    title = test_set.title if scene is None else f"{scene}, {test_set.title}"
+    table = _table(test_set.study, columns, cells, title)
+    rows = [*table.rows]
+    for method, numbers in published.methods.items() if published else ():
+        label = TableCell(f"{method}, published", published=True)
+        rows.append({METHOD.key: label, **{key: TableCell(text, float(text)) for key, text in numbers.items()}})
+    frames = counted(sum(len(test_set.frames(each)) for each in scenes), "frame")
+    return replace(
+        table,
         rows=rows,
-        notes=[*notes, *([] if published is None else [published.note])],
-        count=f"{counted(len(scenes), 'scene')}, {frames}" if several else frames,
-        name=f"summary-{part.name}" if scene is None else f"scene-{scene}-{part.name}",
+        notes=[*notes, published.note] if published else notes,
+        count=f"{counted(len(scenes), 'scene')}, {frames}" if len(scenes) > 1 else frames,
+        name=f"summary-{test_set.name}" if scene is None else f"scene-{scene}-{test_set.name}",
     )
 
 
-def _cells(part: Part, column: Column, scenes: Sequence[str], stars: Mapping[str, str]) -> list[TableCell]:
+def _metric_cells(
+    test_set: TestSet, column: Column, scenes: Sequence[str], stars: Mapping[str, str]
+) -> list[TableCell]:
     values = {
         method: {scene: seeds for scene, seeds in by_scene.items() if scene in scenes}
-        for method, by_scene in part.values(column.key).items()
+        for method, by_scene in test_set.values(column.key).items()
     }
     found = spreads(values).values()
-    over = [own.over_scenes if own.scenes > 1 else own.over_seeds for own in found]
-    cells = ranked_cells([own.mean for own in found], column.unit, column.direction, over)
+    over = [each.over_scenes if each.scenes > 1 else each.over_seeds for each in found]
+    cells = ranked_cells([each.mean for each in found], column.unit, column.direction, over)
     return [
-        replace(cell, stars=stars.get(method, ""), note=_note(part, column, method, values, scenes))
-        for method, cell in zip(part.study.methods, cells, strict=True)
+        replace(cell, stars=stars.get(method, ""), note=_footnote(test_set, column, method, values, scenes))
+        for method, cell in zip(test_set.study.methods, cells, strict=True)
     ]
 
 
-def _published_row(method: str, columns: Sequence[Column], numbers: Mapping[str, str]) -> dict[str, TableCell]:
-    cells = {column.key: numbers[column.key] for column in columns if column.key in numbers}
-    label = TableCell(f"{method}, published", published=True)
-    return {METHOD.key: label, **{key: TableCell(printed, float(printed)) for key, printed in cells.items()}}
-
-
-def _note(part: Part, column: Column, method: str, values: Mapping[str, BySeed], scenes: Sequence[str]) -> str:
+def _footnote(
+    test_set: TestSet, column: Column, method: str, values: Mapping[str, BySeed], scenes: Sequence[str]
+) -> str:
     """Footnote of a mean over scenes: why it is missing, or what it leaves out; empty where it leaves out nothing."""
-    own = [scene for scene in scenes if part.runs(scene, method)]
-    lacking, shared = [scene for scene in own if scene not in values[method]], shared_scenes(values)
-    if not own:
+    evaluated = [scene for scene in scenes if test_set.evaluated(method, scene)]
+    lacking, shared = [scene for scene in evaluated if scene not in values[method]], shared_scenes(values)
+    if not evaluated:
         return f"{method}: no result"
-    if not values[method]:
-        return f"{column.title}: {part.reason(method, column.key, lacking[0])}"
+    if lacking:
+        reason = test_set.reason(method, column.key, lacking[0])
+        where = f"not available for {', '.join(lacking)}; " if shared and values[method] else ""
+        if where or not values[method]:
+            return f"{column.title}: {where}{reason}"
     if not shared:
         return f"{column.title}: no scene that all methods have"
-    if lacking:
-        reason = part.reason(method, column.key, lacking[0])
-        return f"{column.title}: not available for {', '.join(lacking)}; {reason}"
-    records = [run.result.sets[part.set_name] for scene in shared for run in part.runs(scene, method)]
-    missing = [(None,) * len(record.frames) for record in records]
-    frames = [v for record, none in zip(records, missing, strict=True) for v in record.values.get(column.key, none)]
+    frames = [
+        value
+        for scene in shared
+        for _, record in test_set.evaluated(method, scene)
+        for value in record.values.get(column.key, (None,) * len(record.frames))
+    ]
     if None not in frames:
         return ""
     having = len(frames) - frames.count(None)
-    return f"{column.title}: mean over {having} of {len(frames)} frames; {part.reason(method, column.key)}"
+    reason = test_set.reason(method, column.key)
+    return f"{column.title}: mean over {having} of {len(frames)} frames; {reason}"
 
 
-def _summary_notes(part: Part, columns: Sequence[Column]) -> list[str]:
+def _summary_notes(test_set: TestSet, columns: Sequence[Column]) -> list[str]:
     """Notes: metrics without values and why, scenes that means leave out, and methods whose mean few scenes rule."""
-    empty, left_out = dict[str, list[str]](), dict[tuple[str, ...], list[str]]()
-    ruled = []
+    values = {column.key: test_set.values(column.key) for column in columns}
+    lacking = [column for column in columns if not any(values[column.key].values())]
+    missing = grouped(
+        [column for column in columns if column not in lacking],
+        lambda column: tuple(scene for scene in test_set.scenes if scene not in shared_scenes(values[column.key])),
+    )
+    empty = grouped(
+        [column for column in lacking if not column.shown],
+        lambda column: test_set.reason(test_set.study.methods[0], column.key),
+    )
+    notes = [f"Not shown, without values: {_titles(group)}: {reason}" for reason, group in empty.items()]
+    for scenes, group in missing.items():
+        if scenes:
+            notes.append(
+                f"{'Means' if len(missing) == 1 else f'{_titles(group)}: means'} over "
+                f"{len(test_set.scenes) - len(scenes)} of {len(test_set.scenes)} scenes, without {', '.join(scenes)}, "
+                "which not every method has"
+            )
     for column in columns:
-        values = part.values(column.key)
-        if part.has(column.key):
-            shared = shared_scenes(values)
-            missing = tuple(scene for scene in part.scenes if scene not in shared)
-            left_out.setdefault(missing, []).append(column.title)
-        elif not column.shown:
-            empty.setdefault(part.reason(part.study.methods[0], column.key), []).append(column.title)
-        if column.shown and column.direction == "lower":
-            medians = {method: own.median or 0.0 for method, own in spreads(values).items() if own.ruled_by_few}
-            decimals = column_decimals(column.unit, medians.values())
-            each = ", ".join(f"{method} ({number_text(median, decimals)})" for method, median in medians.items())
+        ruled = {
+            method: each.median or 0.0 for method, each in spreads(values[column.key]).items() if each.ruled_by_few
+        }
+        if column.shown and column.direction == "lower" and ruled:
+            decimals = column_decimals(column.unit, ruled.values())
+            each = ", ".join(f"{method} ({number_text(median, decimals)})" for method, median in ruled.items())
             what = "few scenes rule the mean, which is more than twice the median over scenes, of"
-            ruled += [f"{column.title}: {what} {each}"] if each else []
-    return [
-        *(f"Not shown, without values: {'; '.join(titles)}: {reason}" for reason, titles in empty.items()),
-        *(
-            ("Means" if len(left_out) == 1 else f"{'; '.join(titles)}: means")
-            + f" over {len(part.scenes) - len(missing)} of {len(part.scenes)} scenes, without {', '.join(missing)}, "
-            "which not every method has"
-            for missing, titles in left_out.items()
-            if missing
-        ),
-        *ruled,
-    ]
+            notes.append(f"{column.title}: {what} {each}")
+    return notes
 
+
+def _titles(columns: Sequence[Column]) -> str:
+    return "; ".join(column.title for column in columns)
+
+
+# Costs
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """A cost: its column, how it is read and printed, and the work whose device it depends on."""
+
+    column: Column
+    value: Callable[[CostRecord], float | None]
+    text: Callable[[float], str]
+    work: Literal["training", "rendering"] | None = None
+    missing: str = "not measured"
+
+
+def _mark(mark: str) -> _Cost:
+    column = Column(f"seconds_to_{mark}", f"To {mark} dB", "", "lower")
+    return _Cost(column, lambda cost: cost.seconds_to_psnr.get(mark), duration, "training", "not reached")
+
+
+def _mib(cost: CostRecord) -> float | None:
+    return None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
+
+
+_NO_GAUSSIANS = "not counted, or a radiance field, which has none"
+#: Costs before and behind the PSNR marks.
+_TIMES = [
+    _Cost(Column(key, title, "", "lower"), attrgetter(key), duration, "training")
+    for key, title in (("train_seconds", "Training"), ("processor_seconds", "Processor time"))
+]
+_OTHERS = [
+    _Cost(Column("fps", "Rendering", "views/s", "higher"), attrgetter("render_fps"), "{:.3g}".format, "rendering"),
+    _Cost(Column("memory", "Peak memory", "MiB", "lower"), attrgetter("peak_memory_mib"), "{:,.0f}".format, "training"),
+    _Cost(Column("gaussians", "Gaussians"), attrgetter("gaussians"), "{:,.0f}".format, missing=_NO_GAUSSIANS),
+    _Cost(Column("checkpoint", "Checkpoint", "MiB", "lower"), _mib, "{:,.1f}".format),
+]
+#: Largest number of PSNR marks.
+_MARKS_SHOWN = 3
+
+
+def cost_table(study: Study) -> Table:
+    """Mean costs of every method over the scenes that all methods have, seeds averaged; ranked within one device."""
+    covered = [{run.scene for run in runs} for runs in study.by_method.values()]
+    shared = [scene for scene in study.scenes if all(scene in scenes for scenes in covered)]
+    costs = [run.result.cost for run in study.runs]
+    devices = {
+        "training": dict.fromkeys(map(training_device, costs)),
+        "rendering": dict.fromkeys(map(_rendering_device, costs)),
+    }
+    mixed = [work for work, names in devices.items() if len(names) > 1]
+    marks = [_mark(name) for name in sorted({name for cost in costs for name in cost.seconds_to_psnr}, key=float)]
+    columns, cells = [Column("steps", "Steps")], {"steps": [_steps(study, method) for method in study.methods]}
+    for cost in (*_TIMES, *marks, *_OTHERS):
+        columns.append(replace(cost.column, direction=None) if cost.work in mixed else cost.column)
+        cells[cost.column.key] = _cost_cells(study, shared, replace(cost, column=columns[-1]))
+    # The highest marks that all methods reached, then the lowest that some did.
+    reached = {mark.column.key: [bool(cell.text) for cell in cells[mark.column.key]] for mark in marks}
+    by_all = [key for key in reversed(reached) if all(reached[key])]
+    by_some = [key for key in reached if any(reached[key]) and key not in by_all]
+    hidden = reached.keys() - {*[*by_all, *by_some][:_MARKS_SHOWN]}
+    if "training" in mixed:
+        columns.append(Column("device", "Device", words=True))
+        used = ([training_device(run.result.cost) for run in runs] for runs in study.by_method.values())
+        cells["device"] = [TableCell("; ".join(dict.fromkeys(names))) for names in used]
+    notes = []
+    if len(shared) < len(study.scenes):
+        missing = ", ".join(scene for scene in study.scenes if scene not in shared)
+        notes.append(f"Means over {len(shared)} of {len(study.scenes)} scenes, without {missing}")
+    if mixed:
+        names = "; ".join(sorted({device for work in mixed for device in devices[work]}))
+        notes.append(
+            f"Not ranked: {' and '.join(mixed)} ran on different devices, whose costs are not comparable ({names})"
+        )
+    notes += [f"All {work} on {next(iter(names))}" for work, names in devices.items() if work not in mixed]
+    if marks:
+        notes.append("To N dB: training time until the logged PSNR, smoothed, first reached N dB")
+    notes.append("Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean")
+    plans = dict.fromkeys((run.method, run.result.provenance.get("training", {}).get("plan")) for run in study.runs)
+    return replace(
+        _table(study, [replace(column, shown=column.key not in hidden) for column in columns], cells, "Costs"),
+        notes=notes + [f"{method}: {plan}" for method, plan in plans if plan],
+        count=f"means over {counted(len(shared), 'scene')}" if len(shared) > 1 else "",
+        name="costs",
+    )
+
+
+def _steps(study: Study, method: str) -> TableCell:
+    steps = sorted({run.result.steps for run in study.by_method[method]})
+    return TableCell(f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}", steps[-1])
+
+
+def _cost_cells(study: Study, shared: Sequence[str], cost: _Cost) -> list[TableCell]:
+    """Mean over scenes of the means over seeds; missing unless it is known of every run."""
+    means, notes = list[float | None](), list[str]()
+    for runs in study.by_method.values():
+        by_scene = [[cost.value(run.result.cost) for run in runs if run.scene == scene] for scene in shared]
+        scene_means = np.array([np.mean(np.array(values, np.float64)) for values in by_scene])  # NaN where one is None
+        count = np.count_nonzero(np.isfinite(scene_means))
+        is_known = bool(shared) and count == len(shared)
+        means.append(float(scene_means.mean()) if is_known else None)
+        where = f"; known of {count} of {len(shared)} scenes" if count else ""
+        missing = f"{cost.column.title}: {cost.missing}{where}" if shared else "no scene that all methods have"
+        notes.append("" if is_known else missing)
+    cells = ranked_cells(means, "", cost.column.direction, text=cost.text)
+    return [replace(cell, note=note) for cell, note in zip(cells, notes, strict=True)]
+
+
+def training_device(cost: CostRecord) -> str:
+    """Device of a run's training, with its threads."""
+    return cost.device if cost.threads is None else f"{cost.device}, {counted(cost.threads, 'thread')}"
+
+
+def _rendering_device(cost: CostRecord) -> str:
+    """Device that rendered the test views, with its threads."""
+    same = {} if cost.render_device is None else {"device": cost.render_device, "threads": cost.render_threads}
+    return training_device(cost.model_copy(update=same))
+
+
+# Leads and their tests
 
 #: The reference where it is among the methods.
 PREFERRED = "coliags"
@@ -227,14 +357,27 @@ EXPLANATION = (
     "correlation, 1 where the reference is better on every scene."
 )
 _SMALLEST_PRINTED = 1e-4
-_TESTS = {
-    "smallest": "Smallest p",
-    "wilcoxon": "Wilcoxon p",
-    "wilcoxon_holm": "Holm",
-    "t_test": "t-test p",
-    "t_test_holm": "Holm",
-    "cohen_dz": "Cohen's d",
-    "rank_biserial": "Rank-biserial",
+
+
+def p_text(p: float, digits: int = 2) -> str:
+    """A p-value with significant digits, without a leading zero; ``1`` and ``< .0001`` at the ends."""
+    return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.{digits}g}".removeprefix("0")
+
+
+def _signed(value: float, decimals: int = 2) -> str:
+    text = number_text(value, decimals)
+    return f"+{text}" if value > 0 and text.strip("0.") else text
+
+
+#: Columns of the tests by key: title, text of a number, and the number of a comparison.
+_TESTS: dict[str, tuple[str, Callable[[float], str], Callable[[RivalComparison], float | None]]] = {
+    "smallest": ("Smallest p", lambda p: p_text(p, 3), lambda row: smallest_p(len(row.scenes))),
+    "wilcoxon": ("Wilcoxon p", p_text, attrgetter("tests.wilcoxon")),
+    "wilcoxon_holm": ("Holm", p_text, attrgetter("tests.wilcoxon_holm")),
+    "t_test": ("t-test p", p_text, attrgetter("tests.t_test")),
+    "t_test_holm": ("Holm", p_text, attrgetter("tests.t_test_holm")),
+    "cohen_dz": ("Cohen's d", _signed, attrgetter("tests.cohen_dz")),
+    "rank_biserial": ("Rank-biserial", _signed, attrgetter("tests.rank_biserial")),
 }
 
 
@@ -243,115 +386,84 @@ def choose_reference(study: Study, chosen: str | None) -> str:
     if chosen is not None:
         check_name("method", chosen, study.methods)
     decided = None if study.decided is None else study.decided.reference
-    return next((name for name in (chosen, decided, PREFERRED) if name in study.methods), None) or _best_method(study)
-
-
-def _best_method(study: Study) -> str:
-    """The method that is best by the first metric; the first one where none has a value."""
-    column = metric_columns(study.parts[0])[0]
-    found = spreads(study.parts[0].values(column.key))
-    means = {method: own.mean for method, own in found.items() if own.mean is not None}
+    preferred = next((name for name in (chosen, decided, PREFERRED) if name in study.methods), None)
+    if preferred is not None:
+        return preferred
+    column = metric_columns(study.test_sets[0])[0]
+    found = spreads(study.test_sets[0].values(column.key))
     sign = 1.0 if column.direction == "higher" else -1.0
-    return max(means, key=lambda method: sign * means[method]) if means else study.methods[0]
+    means = {method: -np.inf if each.mean is None else sign * each.mean for method, each in found.items()}
+    return max(study.methods, key=means.__getitem__)
 
 
-def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
+def compare(test_set: TestSet, column: Column, reference: str) -> list[RivalComparison]:
     """Paired comparisons of the reference with every method by one metric; empty where it has no value."""
-    values = part.values(column.key)
+    values = test_set.values(column.key)
     if column.direction is None or not values[reference]:
         return []
     rivals = {method: by_scene for method, by_scene in values.items() if by_scene}
-    return compare_with_rivals(rivals, reference, column.direction == "higher", part.study.rivals(reference))
+    return compare_with_rivals(rivals, reference, column.direction == "higher", test_set.study.rivals(reference))
 
 
-def stars(study: Study, metric: str, reference: str, row: RivalComparison) -> str:
-    """Stars of a comparison, if its reference and metric were decided before the first run; else none."""
-    decided = study.decided
-    is_decided = decided is not None and decided.reference == reference and metric in decided.primary
-    return row.stars if is_decided else ""
-
-
-def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
+def lead_table(test_set: TestSet, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
     """Lead of the reference by one metric over each rival, with tests where there are enough scenes."""
-    unit = unit_text(column.unit)
-    columns = [
-        Column("over", "Over", words=True),
-        Column("scenes", "Scenes"),
-        Column("lead", "Lead", column.unit),
-        Column("better", "Better on"),
-    ]
+    study, unit = test_set.study, unit_text(column.unit)
+    columns = [Column("over", "Over", words=True), Column("scenes", "Scenes")]
+    columns += [Column("lead", "Lead", column.unit), Column("better", "Better on")]
     if any(row.tests for row in compared):
         columns.append(Column("interval", "95 % t interval", column.unit))
-        columns += [Column(key, title) for key, title in _TESTS.items()]
+        columns += [Column(key, title) for key, (title, *_) in _TESTS.items()]
     decimals = column_decimals(column.unit, [row.lead for row in compared])
-    untested = TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")
-    rows: list[dict[str, TableCell | int]] = []
+    rows = []
     for row in compared:
-        cells = {each.key: untested for each in columns[4:]}
-        if row.tests is not None:
-            cells = _test_cells(row.tests, len(row.scenes), decimals, stars(part.study, column.key, reference, row))
-        own: dict[str, TableCell | int] = {
-            "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
+        lead = TableCell(note="no scene in common")
+        if row.lead is not None:
+            lead = TableCell(_signed(row.lead, decimals), row.lead)
+        cells: dict[str, Value | TableCell] = {
+            "over": TableCell(row.rival, style=study.methods.index(row.rival)),
             "scenes": len(row.scenes),
-            "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
+            "lead": lead,
             "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
+            **dict.fromkeys(("interval", *_TESTS), TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")),
         }
-        rows.append({**own, **cells})
+        if row.tests is not None:
+            ends = row.tests.interval
+            cells["interval"] = TableCell(" to ".join(_signed(end, decimals) for end in ends), ends[0])
+            for key, (_, text, value) in _TESTS.items():
+                p = value(row)
+                cells[key] = TableCell(note="all differences are equal") if p is None else TableCell(text(p), p)
+            holm, marks = row.tests.wilcoxon_holm, row.stars if study.is_decided(reference, column.key) else ""
+            cells["wilcoxon_holm"] = TableCell(p_text(holm), holm, stars=marks)
+        rows.append(cells)
     return Table(
         title=f"{column.title}: lead of {reference}",
         columns=columns,
         rows=rows,
-        count=part.title + (f", {unit}" if unit else ""),
-        name=f"lead-{part.name}-{column.key}",
+        count=test_set.title + (f", {unit}" if unit else ""),
+        name=f"lead-{test_set.name}-{column.key}",
     )
 
 
-def _test_cells(tests: PairedTests, scenes: int, decimals: int, marks: str) -> dict[str, TableCell]:
-    low, high = (_signed(end, decimals) for end in tests.interval)
-    undefined = TableCell(note="all differences are equal")
-    t_tests = {"t_test": tests.t_test, "t_test_holm": tests.t_test_holm}
-    return {
-        "interval": TableCell(f"{low.text} to {high.text}", low.value),
-        "smallest": TableCell(p_text(smallest_p(scenes), digits=3), smallest_p(scenes)),
-        "wilcoxon": TableCell(p_text(tests.wilcoxon), tests.wilcoxon),
-        "wilcoxon_holm": TableCell(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=marks),
-        **{name: undefined if p is None else TableCell(p_text(p), p) for name, p in t_tests.items()},
-        "cohen_dz": undefined if tests.cohen_dz is None else _signed(tests.cohen_dz, 2),
-        "rank_biserial": _signed(tests.rank_biserial, 2),
-    }
-
-
-def _signed(value: float, decimals: int) -> TableCell:
-    text = number_text(value, decimals)
-    return TableCell(f"+{text}" if value > 0 and text.strip("0.") else text, value)
-
-
 def statistics_text(study: Study, compared: Sequence[RivalComparison], reference: str) -> str:
-    """Sentences on the tests of one metric: unit, scenes, smallest p, family, stars; empty without a common scene."""
+    """Sentences on the tests of one metric: unit, smallest p, family, stars; empty without a common scene."""
     most = max((len(row.scenes) for row in compared), default=0)
+    smallest, rivals = smallest_p(most), study.rivals(reference)
     if not most:
         return ""
-    smallest = p_text(smallest_p(most), digits=3)
     if most < FEWEST_SCENES:
         return (
             f"No test is run: {counted(most, 'scene')} cannot tell methods apart. The unit is the scene, not the "
             f"frame, and of {counted(most, 'difference')} the two-sided Wilcoxon test cannot give less than p = "
-            f"{smallest}; tests are run from {FEWEST_SCENES} scenes on "
-            f"(p = {p_text(smallest_p(FEWEST_SCENES), digits=3)})."
+            f"{p_text(smallest, 3)}; tests are run from {FEWEST_SCENES} scenes on "
+            f"(p = {p_text(smallest_p(FEWEST_SCENES), 3)})."
         )
-    rivals, decided = study.rivals(reference), "nothing"
+    decided = "nothing"
     if study.decided is not None:
         metrics = ", ".join(map(metric_title, study.decided.primary))
         decided = f"{study.decided.reference} against the others by {metrics}, on {study.decided.date}"
     return (
-        f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
-        f"two-sided Wilcoxon signed-rank test can give is {smallest}, or "
-        f"{p_text(min(1.0, rivals * smallest_p(most)), digits=3)} after Holm's adjustment for "
+        f"Two-sided Wilcoxon signed-rank tests, paired over {counted(most, 'scene')}, not over frames, give no p below "
+        f"{p_text(smallest, 3)}, or {p_text(min(1.0, rivals * smallest), 3)} after Holm's adjustment for "
         f"{counted(rivals, 'rival')}: every method that was planned or given. Stars are for what was decided before "
-        f"the first run ({decided}); all other p-values are exploratory."
+        f"the first run ({decided})."
     )
-
-
-def p_text(p: float, digits: int = 2) -> str:
-    """A p-value with significant digits, without a leading zero; ``1`` and ``< .0001`` at the ends."""
-    return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.{digits}g}".removeprefix("0")

@@ -8,20 +8,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from coliags_plugin.comparison.report.charts import frame_charts, profile_section, training_section
-from coliags_plugin.comparison.report.costs import cost_table, training_device
 from coliags_plugin.comparison.report.metric_tables import (
     ALL_COLUMNS,
     EXPLANATION,
     choose_reference,
     compare,
+    cost_table,
     lead_table,
     means_table,
     metric_columns,
-    stars,
     statistics_text,
+    training_device,
 )
-from coliags_plugin.comparison.report.sources import cautions, code_of, read_study, scene_provenance
-from coliags_plugin.comparison.report.study import MissingResult, Part, Study, StudyRun
+from coliags_plugin.comparison.report.sources import cautions, read_study
+from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun, grouped
 from coliags_plugin.comparison.report.views import view_section
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import check_name
@@ -38,6 +38,7 @@ from coliags_plugin.reporting.model import (
     Table,
     TableCell,
     Template,
+    Value,
     leaves,
     record,
 )
@@ -91,22 +92,14 @@ def report_page(study: Study, options: ReportOptions, screen: bool = False, scen
     title = f"{study.methods[0]} on" if len(study.methods) == 1 else f"{len(study.methods)} methods compared on"
     where = study.scenes[0] if len(study.scenes) == 1 else counted(len(study.scenes), "scene")
     sections = [_metrics(study, options, reference), _missing(study.missing)]
+    costs, scenes = Section("Costs", [cost_table(study)]), _scenes(study, options)
     if screen:
-        sections += [
-            view_section(study, reference, options.frames),
-            *([scene] if scene else []),
-            profile_section(study),
-        ]
-    sections.append(Section("Costs", [cost_table(study)]))
-    if screen:
-        sections.append(training_section(study))
-    sections.append(_scenes(study, options))
-    if screen:
-        sections += [_frames(study), _provenance(study)]
+        sections += [view_section(study, reference, options.frames), *([scene] if scene else [])]
+        sections += [profile_section(study), costs, training_section(study), scenes, _frames(study), _provenance(study)]
     return Page(
         title=options.title if options.title is not None else f"{title} {where}",
-        sections=sections,
-        facts=[*_facts(study), Fact("How the metrics are computed", study.protocol.description, wide=True)],
+        sections=sections if screen else [*sections, costs, scenes],
+        facts=_facts(study),
         note=options.note or "",
         cautions=cautions(study),
     )
@@ -117,8 +110,8 @@ def _facts(study: Study) -> list[Fact]:
     sizes = dict.fromkeys(result.scene.size for result in results)
     versions = dict.fromkeys(str(result.software.get("package_version") or "") for result in results)
     seeds = sorted({result.seed for result in results})
-    frames = {part.title: sum(len(part.frames(scene)) for scene in part.scenes) for part in study.parts}
-    splits = dict.fromkeys(part.split for part in study.parts)
+    frames = {each.title: sum(len(each.frames(scene)) for scene in each.scenes) for each in study.test_sets}
+    splits = dict.fromkeys(result.scene.split for result in results)
     facts = {
         "Scene" if len(scenes) == 1 else "Scenes": ", ".join(scenes) if len(scenes) <= _LISTED else str(len(scenes)),
         "Methods": ", ".join(study.methods),
@@ -129,7 +122,8 @@ def _facts(study: Study) -> list[Fact]:
         "Protocol": f"{study.protocol.name}, version {study.protocol.version}",
         "Evaluated with": ", ".join(f"coliags_plugin {version}" for version in versions if version),
     }
-    return [Fact(name, value) for name, value in facts.items()]
+    description = Fact("How the metrics are computed", study.protocol.description, wide=True)
+    return [*(Fact(name, value) for name, value in facts.items()), description]
 
 
 def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
@@ -140,36 +134,34 @@ def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
     if len(study.methods) > 1:
         text += " Best in bold, second underlined, by the printed digits; equal values share a rank."
     blocks: list[Block] = [Paragraph(text)]
-    for part in study.parts:
-        # What holds for several parts is said once.
-        blocks += [block for block in _part_blocks(part, options, reference) if block not in blocks]
+    for test_set in study.test_sets:
+        columns = metric_columns(test_set, options.columns)
+        compared = {column.key: compare(test_set, column, reference) for column in columns}
+        stars = {
+            metric: {row.rival: row.stars for row in rows}
+            for metric, rows in compared.items()
+            if study.is_decided(reference, metric)
+        }
+        blocks.append(means_table(test_set, columns, stars=stars))
+        shown = [column for column in columns if column.shown and compared[column.key]]
+        text = statistics_text(study, compared[shown[0].key], reference) if shown else ""
+        if text and Paragraph(text) not in blocks:  # what holds for several sets is said once
+            blocks.append(Paragraph(text))
+        if shown and len(test_set.scenes) > 1:
+            leads = [lead_table(test_set, column, compared[column.key], reference) for column in shown]
+            title = f"Lead of {reference} over each method, {test_set.title}"
+            blocks.append(Folded(title, [Paragraph(EXPLANATION), *leads]))
     return Section("Metrics", blocks)
 
 
-def _part_blocks(part: Part, options: ReportOptions, reference: str) -> list[Block]:
-    columns = metric_columns(part, options.columns)
-    compared = {column.key: compare(part, column, reference) for column in columns}
-    marks = {
-        metric: {row.rival: stars(part.study, metric, reference, row) for row in rows}
-        for metric, rows in compared.items()
-    }
-    blocks: list[Block] = [means_table(part, columns, stars=marks)]
-    shown = [column for column in columns if column.shown and compared[column.key]]
-    if shown and (text := statistics_text(part.study, compared[shown[0].key], reference)):
-        blocks.append(Paragraph(text))
-    if shown and len(part.scenes) > 1:
-        leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
-        blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))
-    return blocks
-
-
 def _scenes(study: Study, options: ReportOptions) -> Section:
-    tables: dict[str, list[Table]] = {scene: [] for scene in study.scenes}
-    for part in study.parts if len(tables) > 1 else ():
-        columns = metric_columns(part, options.columns)
-        for scene in part.scenes:
-            tables[scene].append(means_table(part, columns, scene))
-    return Section("Every scene", [Folded(scene, own) for scene, own in tables.items() if own])
+    sets = study.test_sets if len(study.scenes) > 1 else []
+    columns = [metric_columns(test_set, options.columns) for test_set in sets]
+    tables = {
+        scene: [means_table(one, its, scene) for one, its in zip(sets, columns, strict=True) if scene in one.scenes]
+        for scene in study.scenes
+    }
+    return Section("Every scene", [Folded(scene, blocks) for scene, blocks in tables.items() if blocks])
 
 
 def _frames(study: Study) -> Section:
@@ -194,19 +186,17 @@ def per_frame_csv(study: Study) -> str:
 
 def _missing(missing: Sequence[MissingResult]) -> Section:
     blocks: list[Block] = [Paragraph("Means and tests leave these out.")] if missing else []
-    unfinished = Counter(one.method for one in missing if one.reason is None)
+    unfinished = Counter(cell.method for cell in missing if cell.reason is None)
     if unfinished:
-        each = ", ".join(f"{method} ({count})" for method, count in unfinished.items())
-        blocks.append(Paragraph(f"{counted(unfinished.total(), 'cell')} not finished: {each}."))
-    failed = [one for one in missing if one.reason is not None]
-    if failed:
-        columns = [
-            Column("method", "Method", words=True),
-            Column("scene", "Scene", words=True),
-            Column("seed", "Seed"),
-            Column("reason", "Reason", words=True),
-        ]
-        rows = [{"method": one.method, "scene": one.scene, "seed": one.seed, "reason": one.reason} for one in failed]
+        counts = ", ".join(f"{method} ({count})" for method, count in unfinished.items())
+        blocks.append(Paragraph(f"{counted(unfinished.total(), 'cell')} not finished: {counts}."))
+    rows: list[dict[str, Value]] = [
+        {"method": cell.method, "scene": cell.scene, "seed": cell.seed, "reason": cell.reason}
+        for cell in missing
+        if cell.reason is not None
+    ]
+    if rows:
+        columns = [Column(name, name.capitalize(), words=name != "seed") for name in rows[0]]
         blocks.append(Table("Failed", columns, rows, count=counted(len(rows), "cell"), name="failed"))
     return Section("Cells without a result", blocks)
 
@@ -214,17 +204,15 @@ def _missing(missing: Sequence[MissingResult]) -> Section:
 def _provenance(study: Study) -> Section:
     """Records of every scene, of one run of every method, and of all runs in a table."""
     blocks: list[Block] = []
-    for scene in study.scenes:
-        runs = [run for run in study.runs if run.scene == scene]
-        records = [scene_provenance(run.result) for run in runs]
-        differ = any(leaves(own) != leaves(records[0]) for own in records)
-        for run, own in zip(runs if differ else runs[:1], records, strict=False):
-            blocks.append(record(f"Data of {scene}{f', {run.method}' if differ else ''}", own))
+    for scene, runs in grouped(study.runs, lambda run: run.scene).items():
+        differ = any(leaves(run.data) != leaves(runs[0].data) for run in runs)
+        for run in runs if differ else runs[:1]:
+            blocks.append(record(f"Data of {scene}{f', {run.method}' if differ else ''}", run.data))
     for method, runs in study.by_method.items():
         run, result = runs[0], runs[0].result
         values = {"run": run.stamp, "steps": result.steps, "seed": result.seed, "software": result.software}
-        recorded = {name: value for name, value in result.provenance.items() if name != "scene"}
-        blocks.append(record(method, {**values, **recorded, "config": result.config}))
+        provenance = {name: value for name, value in result.provenance.items() if name != "scene"}
+        blocks.append(record(method, {**values, **provenance, "config": result.config}))
     rows = [_run_row(run, study.methods.index(run.method)) for run in study.runs]
     note = (
         f"Key: of all that determines the result. Values, predictions, truth: the first {_DIGITS} digits of their "
@@ -237,10 +225,10 @@ def _provenance(study: Study) -> Section:
 
 def _run_row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
     result = run.result
-    predictions, truth = (
-        " ".join(dict.fromkeys(getattr(part, name)[:_DIGITS] for part in result.sets.values()))
-        for name in ("predictions_sha256", "truth_sha256")
-    )
+    hashes = {
+        name: " ".join(dict.fromkeys(getattr(part, f"{name}_sha256")[:_DIGITS] for part in result.sets.values()))
+        for name in ("predictions", "truth")
+    }
     return {
         "Method": TableCell(run.method, style=style),
         "Scene": run.scene,
@@ -250,9 +238,9 @@ def _run_row(run: StudyRun, style: int) -> dict[str, TableCell | str | float]:
         "Run": run.stamp,
         "Device": training_device(result.cost),
         "Version": str(result.software.get("package_version") or ""),
-        "Code": code_of(result),
+        "Code": run.code,
         "Key": result.key,
         "Values": result.metrics_sha256[:_DIGITS],
-        "Predictions": predictions,
-        "Truth": truth,
+        "Predictions": hashes["predictions"],
+        "Truth": hashes["truth"],
     }

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import attrgetter
 from typing import Any
 
 import cv2
@@ -14,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from coliags_plugin.comparison.report.metric_tables import metric_title
-from coliags_plugin.comparison.report.study import Part, Study, StudyRun
+from coliags_plugin.comparison.report.study import Study, StudyRun, TestSet, grouped
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.reporting.colormaps import (
@@ -26,8 +24,8 @@ from coliags_plugin.reporting.colormaps import (
     rgb_error,
 )
 from coliags_plugin.reporting.image_files import encode_jpeg, encode_webp, read_depth_tiff
-from coliags_plugin.reporting.model import ColorBar, EncodedImage, Paragraph, Section, Template
-from coliags_plugin.reporting.numbers import column_decimals, linear_ticks, number_text, round_up, unit_text
+from coliags_plugin.reporting.model import Block, ColorBar, EncodedImage, Paragraph, Section, Template
+from coliags_plugin.reporting.numbers import column_decimals, number_text, round_up, unit_text
 
 #: Wider images are reduced by an integer factor, to limit the size of the report, px.
 _WIDEST = 640
@@ -41,7 +39,7 @@ _SCALE_PERCENTILE = 95.0
 _SMALLEST_SCALE = 1e-6
 #: Errors of an image that enter the percentile.
 _SAMPLED = 20_000
-#: Metrics shown under an image, where available.
+#: Metrics shown under an image, where available; the mean depth error stands for the mean squared one.
 _CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
 #: Metrics by which views can be sorted.
 _SORTED_BY = ("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error")
@@ -54,32 +52,32 @@ _Tile = tuple[EncodedImage | None, str]
 class _Frame:
     """A frame to show."""
 
-    part: Part
+    test_set: TestSet
     scene: str
     position: int  # its index among the frames of the set
     name: str
     why: str  # why it is shown; empty for one of those spread along the video
 
     def values(self, run: StudyRun) -> dict[str, float]:
-        """Metrics of one run."""
-        values = {name: own[self.position] for name, own in run.result.sets[self.part.set_name].values.items()}
+        """Metrics of one run, without those that the frame lacks."""
+        values = {name: each[self.position] for name, each in run.result.sets[self.test_set.set_name].values.items()}
         return {name: value for name, value in values.items() if value is not None}
 
 
 def _choose_frames(study: Study, reference: str, count: int) -> Iterator[_Frame]:
     """Frames of every scene and set: ``count`` spread evenly, first and last included, and the reference's worst."""
     for scene in study.scenes:
-        for part in (part for part in study.parts if scene in part.scenes):
-            names, worst_by = part.frames(scene), dict[int, list[str]]()
+        for test_set in study.test_sets:
+            names, worst_by = test_set.frames(scene), dict[int, list[str]]()
             for metric in _WORST_OF:
-                values = part.frame_means(scene, reference, metric)
+                values = test_set.frame_means(scene, reference, metric)
                 if len(values) > 1:
                     sign = 1.0 if study.metrics[metric].direction == "higher" else -1.0
                     worst = min(values, key=lambda frame: sign * values[frame])
                     worst_by.setdefault(names.index(worst), []).append(metric_title(metric))
             for position in sorted({*evenly(len(names), count), *worst_by}):
                 why = f"worst {' and '.join(worst_by[position])} of {reference}" if position in worst_by else ""
-                yield _Frame(part, scene, position, names[position], why)
+                yield _Frame(test_set, scene, position, names[position], why)
 
 
 def evenly(length: int, count: int) -> list[int]:
@@ -92,56 +90,64 @@ def evenly(length: int, count: int) -> list[int]:
 
 
 @dataclass(frozen=True)
-class _View:
-    """A frame and its renderings: one render, error and expected depth per run.
+class _Rendering:
+    """A frame as one run rendered it.
 
-    Errors are absolute: of depth, mm, NaN where the truth is unknown, and None where there is none to compare; of
+    Its error is absolute: of depth, mm, NaN where the truth is unknown, and None where there is none to compare; of
     colours, levels of 255, where no run has depth to compare.
     """
 
+    run: StudyRun
+    rgb: Rgb
+    error: Map | None
+    expected: Map | None  # expected depth, NaN where nearly transparent; None where there is none
+
+
+@dataclass(frozen=True)
+class _View:
+    """A frame and its renderings, one for each run."""
+
     frame: _Frame
-    runs: Sequence[StudyRun]  # one run of every method
     truth: Rgb
     true_depth: Map | None  # mm, NaN where unknown; None where the frame has none
-    renders: Sequence[Rgb]
-    errors: Sequence[Map | None]
-    of_depth: bool
-    expected: Sequence[Map | None]  # NaN where nearly transparent; None where there is none
+    renderings: Sequence[_Rendering]  # of one run of every method
+    of_depth: bool  # whether the errors are of depth
 
     @property
     def in_row(self) -> bool:
         """Tell whether all images are in one row: of one method, without true depth."""
-        return len(self.runs) == 1 and self.true_depth is None
+        return len(self.renderings) == 1 and self.true_depth is None
 
 
 def _read_view(frame: _Frame, runs: Sequence[StudyRun]) -> _View:
     """Read a frame of one or more runs of one scene, each with a run folder."""
-    truth = _read(runs[0], "truth", frame)
-    factor = _reduction(truth.shape[1])
+    whole_truth = _read(runs[0], "truth", frame)
+    factor = _reduction(whole_truth.shape[1])
+    truth = _reduced_rgb(whole_truth, factor)
 
     def depths(kind: str) -> list[Map | None]:
-        whole = (_read(run, kind, frame, truth, is_depth=True) for run in runs)
-        return [None if depth is None else _reduced_map(depth, factor) for depth in whole]
+        maps = (_read(run, kind, frame, whole_truth) for run in runs)
+        return [None if depth is None else _reduced_map(depth, factor) for depth in maps]
 
-    small_truth = _reduced_rgb(truth, factor)
-    renders = [_reduced_rgb(_read(run, "renders", frame, truth), factor) for run in runs]
+    renders = [_reduced_rgb(_read(run, "renders", frame, whole_truth), factor) for run in runs]
     true_depth = next((depth for depth in depths("true_depth") if depth is not None), None)
-    errors: list[Map | None] = []
+    errors: list[Map | None] = [None]
     if true_depth is not None:
         errors = [None if depth is None else _depth_error(depth, true_depth) for depth in depths("depth")]
     of_depth = any(error is not None for error in errors)
     if not of_depth:
-        errors = [(rgb_error(render, small_truth)[0] * 255.0).astype(np.float32) for render in renders]
-    return _View(frame, runs, small_truth, true_depth, renders, errors, of_depth, depths("expected_depth"))
+        errors = [(rgb_error(render, truth)[0] * 255.0).astype(np.float32) for render in renders]
+    renderings = map(_Rendering, runs, renders, errors, depths("expected_depth"))
+    return _View(frame, truth, true_depth, [*renderings], of_depth)
 
 
-def _read(run: StudyRun, kind: str, frame: _Frame, like: Rgb | None = None, is_depth: bool = False) -> Any:
+def _read(run: StudyRun, kind: str, frame: _Frame, like: Rgb | None = None) -> Any:
     """An image of a run, of the size of the true one; None for depth that is not there."""
-    reader, suffix = (read_depth_tiff, ".tiff") if is_depth else (read_rgb, ".png")
+    reader, suffix = (read_depth_tiff, ".tiff") if kind.endswith("depth") else (read_rgb, ".png")
     assert run.evaluation is not None
-    path = run.evaluation / kind / frame.part.set_name / f"{frame.name}{suffix}"
+    path = run.evaluation / kind / frame.test_set.set_name / f"{frame.name}{suffix}"
     if not path.is_file():
-        if is_depth:
+        if suffix == ".tiff":
             return None
         raise InputError(
             f"{path} is missing, though the results file lists its frame",
@@ -166,8 +172,6 @@ def _reduction(width: int) -> int:
 
 
 def _reduced_rgb(rgb: Rgb, factor: int) -> Rgb:
-    if factor == 1:
-        return rgb
     height, width = rgb.shape[0] // factor, rgb.shape[1] // factor
     whole = np.ascontiguousarray(rgb[: height * factor, : width * factor])
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
@@ -186,111 +190,112 @@ def view_section(study: Study, reference: str, count: int) -> Section:
         raise InputError(f"{count} frames to show", "at least one")
     title, views = "Held-out views", list[_View]()
     for frame in _choose_frames(study, reference, count):
-        seeds = ([run for run in frame.part.runs(frame.scene, method) if run.run] for method in study.methods)
+        seeds = (
+            [run for run, _ in frame.test_set.evaluated(method, frame.scene) if run.run] for method in study.methods
+        )
         if runs := [with_images[0] for with_images in seeds if with_images]:
             views.append(_read_view(frame, runs))
     if not views:
         text = "No images: only results files are here, without the run folders."
         return Section(title, [Paragraph(text)], screen_only=True)
-    ends = {
-        of_depth: error_limit([error for view in own for error in view.errors if error is not None])
-        for of_depth in (True, False)
-        if (own := [view for view in views if view.of_depth is of_depth])
-    }
-    expected = [depth for view in views for depth in view.expected if depth is not None]
-    depth_range = _depth_limits(view.true_depth for view in views if view.true_depth is not None)
-    if depth_range is None and expected:
-        depth_range = common_limits(expected)
-    bars, unit = [], study.length_unit
-    if True in ends:
-        bars.append(ColorBar((0.0, ends[True]), unit, "error", "|depth error|", "error-scale"))
-    if False in ends:
-        bars.append(ColorBar((0.0, ends[False]), "levels of 255", "error", "|colour error|", "colour-error-scale"))
-    if depth_range is not None:
-        bars.append(ColorBar(depth_range, unit, "depth", "depth", "depth-scale"))
-    scenes = [
-        (
-            scene,
-            [
-                (part.title, [_shown(view, ends, depth_range, reference) for view in same])
-                for part, same in groupby(in_scene, attrgetter("frame.part"))
-            ],
-        )
-        for scene, in_scene in groupby(views, attrgetter("frame.scene"))
+    scales = _Scales.of(views)
+    unit = study.length_unit
+    bars = [
+        ColorBar((0.0, end), unit, "error", "|depth error|", "error-scale")
+        if of_depth
+        else ColorBar((0.0, end), "levels of 255", "error", "|colour error|", "colour-error-scale")
+        for of_depth, end in scales.error_ends.items()
     ]
+    if scales.depth is not None:
+        bars.append(ColorBar(scales.depth, unit, "depth", "depth", "depth-scale"))
     values = {
         "bars": bars,
-        "hatch": None if depth_range is None else _webp(hatch(14, 34)),
+        "hatch": None if scales.depth is None else _webp(hatch(14, 34)),
         "reference": reference,
         "orders": {name: metric_title(name) for name in _SORTED_BY if name in study.metrics},
-        "scenes": scenes,
+        "scenes": [
+            (
+                scene,
+                [
+                    (test_set.title, [_template_values(view, scales, reference) for view in same])
+                    for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
+                ],
+            )
+            for scene, in_scene in grouped(views, lambda view: view.frame.scene).items()
+        ],
     }
-    explanation = Paragraph(_explanation(study, views, reference))
-    return Section(title, [explanation, Template("views.html", values)], screen_only=True, name="views")
+    factor = max(_reduction(run.result.scene.size[0]) for run in study.runs)
+    explanation = (
+        f"Frames spread along each video, and the worst of {reference}. With each rendering, its absolute error, of "
+        "depth, or where there is no true depth of colour (the mean of red, green and blue), and the expected depth, "
+        "hatched where alpha is below 0.5. One scale serves every method, frame and scene of this page; it ends at the "
+        f"smallest 1, 2 or 5 times a power of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. "
+        "Errors beyond it, and missing depth where the truth has one, take its last colour. Of several seeds, the "
+        "first is shown. Photographs are JPEG here; the run folders keep them as PNG."
+    ) + (f" Images are shown at 1/{factor} of their size." if factor > 1 else "")
+    blocks: list[Block] = [Paragraph(explanation), Template("views.html", values)]
+    return Section(title, blocks, screen_only=True, name="views")
 
 
-def _explanation(study: Study, views: Sequence[_View], reference: str) -> str:
-    factor = max(_reduction(view.runs[0].result.scene.size[0]) for view in views)
-    place = "Beside" if all(view.in_row for view in views) else "Below"
-    texts = {
-        f"Frames spread along each video, and the worst of {reference}.": True,
-        "Under each rendering, its absolute depth error.": any(view.of_depth for view in views),
-        "Views without true depth show the absolute colour error, the mean of red, green and blue.": not all(
-            view.of_depth for view in views
-        ),
-        f"{place} it the expected depth, hatched where alpha is below 0.5.": any(
-            depth is not None for view in views for depth in view.expected
-        ),
-        "One scale serves every method, frame and scene of this page; it ends at the smallest 1, 2 or 5 times a power "
-        f"of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. Errors beyond it, and missing depth "
-        "where the truth has one, take its last colour.": True,
-        f"Images are shown at 1/{factor} of their size.": factor > 1,
-        "Of several seeds, the first is shown.": len({run.result.seed for run in study.runs}) > 1,
-        "Photographs are JPEG here; the run folders keep them as PNG.": True,
-    }
-    return " ".join(text for text, is_true in texts.items() if is_true)
+@dataclass(frozen=True)
+class _Scales:
+    """Colour scales that all views share."""
+
+    error_ends: Mapping[bool, float]  # ends of the scales of depth errors (True) and colour errors, where there are any
+    depth: tuple[float, float] | None  # limits of depth; None where there is none
+
+    @classmethod
+    def of(cls, views: Sequence[_View]) -> _Scales:
+        """Scales of the errors and depths of all views; of expected depth where there is no true one."""
+        shown = [(view.of_depth, each) for view in views for each in view.renderings]
+        ends = {
+            kind: error_limit([each.error for of_depth, each in shown if of_depth is kind and each.error is not None])
+            for kind in (True, False)
+            if any(of_depth is kind for of_depth, _ in shown)
+        }
+        depths = [view.true_depth for view in views if view.true_depth is not None]
+        depths = depths or [each.expected for _, each in shown if each.expected is not None]
+        return cls(ends, common_limits(depths) if depths else None)
 
 
-def _shown(
-    view: _View, ends: dict[bool, float], depth_range: tuple[float, float] | None, reference: str
-) -> dict[str, Any]:
+def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, Any]:
     """Values of a view for the template.
 
     The script sorts by ``data``: the position along the video, and for each metric a number that is larger the worse
     the reference is.
     """
     frame, where = view.frame, f"frame {view.frame.name}"
-    study = frame.part.study
-    own = frame.part.runs(frame.scene, reference)
-    values = frame.values(own[0]) if own else {}
-    signs = {name: -1.0 if study.metrics[name].direction == "higher" else 1.0 for name in values}
+    study, test_set = frame.test_set.study, frame.test_set
     truth = _jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
-    if view.true_depth is not None and depth_range is not None:
-        tiles.append((_webp(colorize_depth(view.true_depth, depth_range)), f"{where}, true depth"))
+    if view.true_depth is not None and scales.depth is not None:
+        tiles.append((_webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
         caption = ["above: camera image", "below: true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
     cells: list[tuple[str, int | None, list[_Tile], list[str]]] = [("truth", None, tiles, caption)]
     kind = "depth" if view.of_depth else "colour"
-    for run, render, error, expected in zip(view.runs, view.renders, view.errors, view.expected, strict=True):
-        name = run.method
-        tiles = [(_jpeg(render), f"{where}, rendered by {name}")]
-        if error is None:
+    for rendering in view.renderings:
+        name = rendering.run.method
+        tiles = [(_jpeg(rendering.rgb), f"{where}, rendered by {name}")]
+        if rendering.error is None:
             tiles.append((None, "no depth to compare"))
         else:
-            drawn = colorize_error(error, ~np.isnan(error), ends[view.of_depth])
+            drawn = colorize_error(rendering.error, ~np.isnan(rendering.error), scales.error_ends[view.of_depth])
             tiles.append((_webp(drawn), f"{where}, absolute {kind} error of {name}"))
-            if expected is not None and depth_range is not None:
-                drawn = colorize_depth(expected, depth_range, hatched=True)
+            if rendering.expected is not None and scales.depth is not None:
+                drawn = colorize_depth(rendering.expected, scales.depth, hatched=True)
                 tiles.append((_webp(drawn), f"{where}, expected depth of {name}"))
-        cells.append((name, study.methods.index(name), tiles, _caption(frame, run)))
+        cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
+    runs = test_set.evaluated(reference, frame.scene)
+    values = frame.values(runs[0][0]) if runs else {}
+    signs = {name: -1.0 if study.metrics[name].direction == "higher" else 1.0 for name in values}
+    count = f"{frame.position + 1} of {len(test_set.frames(frame.scene))}"
     return {
-        "title": f"{frame.scene} · {frame.part.set_name} · {frame.name}",
+        "title": f"{frame.scene} · {test_set.set_name} · {frame.name}",
         "where": where,
-        "count": f"{frame.position + 1} of {len(frame.part.frames(frame.scene))}"
-        + (f" · {frame.why}" if frame.why else ""),
+        "count": f"{count} · {frame.why}" if frame.why else count,
         "data": {
             "position": frame.position,
             **{name.replace("_", "-"): signs[name] * values[name] for name in _SORTED_BY if name in values},
@@ -303,35 +308,20 @@ def _shown(
 
 def _caption(frame: _Frame, run: StudyRun) -> list[str]:
     values, texts = frame.values(run), []
-    shown = [name for name in _CAPTION_METRICS if name in values]
-    if "depth_mae" in shown and "depth_mse" in shown:
-        shown.remove("depth_mse")
-    for name in shown:
-        unit = frame.part.study.metrics[name].unit
-        number = number_text(values[name], column_decimals(unit, [values[name]]))
-        texts.append(f"{metric_title(name)} {number} {unit_text(unit)}".rstrip())
+    for name in _CAPTION_METRICS:
+        if name in values and not (name == "depth_mse" and "depth_mae" in values):
+            unit = frame.test_set.study.metrics[name].unit
+            number = number_text(values[name], column_decimals(unit, [values[name]]))
+            texts.append(f"{metric_title(name)} {number} {unit_text(unit)}".rstrip())
     return texts or ["no metrics for this frame"]
 
 
 def error_limit(errors: Sequence[np.ndarray]) -> float:
     """The 95th percentile of all finite errors together, rounded up to 1, 2 or 5 times a power of ten."""
     samples = [values.ravel()[:: math.ceil(values.size / _SAMPLED) or 1] for values in errors]
-    pooled = np.concatenate(samples) if samples else np.zeros(0)
+    pooled = np.concatenate([*samples, np.zeros(0)])
     finite = pooled[np.isfinite(pooled)]
     return round_up(max(float(np.percentile(finite, _SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0
-
-
-def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
-    """Range of the depths shown, widened to the next ticks."""
-    finite = [own for depth in depths if (own := depth[np.isfinite(depth)]).size]
-    if not finite:
-        return None
-    low, high = min(float(own.min()) for own in finite), max(float(own.max()) for own in finite)
-    if low == high:
-        low, high = low - 0.5, high + 0.5
-    ticks = linear_ticks(low, high)
-    step = ticks[1] - ticks[0] if len(ticks) > 1 else round_up(high - low)
-    return math.floor(low / step) * step, math.ceil(high / step) * step
 
 
 def _jpeg(rgb: np.ndarray) -> EncodedImage:

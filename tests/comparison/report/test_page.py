@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.published import _C3VD_FRAMES
+from coliags_plugin.comparison.report.published import C3VD_FRAMES
 from coliags_plugin.comparison.report.report import per_frame_csv, report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.comparison.report.study import MissingResult
@@ -228,9 +228,9 @@ def test_reference(study_of):
                "5 differences the two-sided Wilcoxon test cannot give less than p = .0625; tests are run from 6 scenes "
                "on (p = .0312)."),
         (1, 1, "No test is run: 1 scene cannot tell"),
-        (6, 1, "can give is .0312, or .0312 after Holm's adjustment for 1 rival: every"),
-        (6, 2, "can give is .0312, or .0625 after Holm's adjustment for 2 rivals: every"),
-        (8, 6, "can give is .00781, or .0469 after Holm's adjustment for 6 rivals: every"),
+        (6, 1, "no p below .0312, or .0312 after Holm's adjustment for 1 rival: every"),
+        (6, 2, "no p below .0312, or .0625 after Holm's adjustment for 2 rivals: every"),
+        (8, 6, "no p below .00781, or .0469 after Holm's adjustment for 6 rivals: every"),
     ],
 )  # fmt: skip
 def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
@@ -266,7 +266,7 @@ def stars(page, metric, name="summary-test"):
 def test_only_what_was_decided_before_the_first_run_has_stars(study_of):
     study = study_of(made_scenes({"coliags": 9.0, "3dgs": 0.0, "2dgs": 4.0}))
     page = report_page(study, ReportOptions())
-    assert "before the first run (nothing); all other p-values are exploratory." in paragraphs(page)
+    assert "before the first run (nothing)." in paragraphs(page)
     assert not stars(page, "psnr") and page.cautions == []
     page = report_page(decided(study, "depth_mse"), ReportOptions())
     assert stars(page, "depth_mse") == {"3dgs": "*", "2dgs": "*"} and not stars(page, "psnr")
@@ -304,8 +304,8 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
         (
             [OURS, result_of("3dgs", steps=80, software={"code": "c2", "git": "def5678"}, data={"calibration": "x"})],
             [
-                "The results come from different code: c1 (commit abc1234): coliags; c2 (commit def5678): 3dgs.",
-                "The runs were trained for different numbers of steps: coliags 40, 3dgs 80.",
+                "The results differ in code: c1: coliags; c2: 3dgs.",
+                "The results differ in steps of training: 40: coliags; 80: 3dgs.",
                 "Runs of one scene record different data, see Provenance: calibration.",
             ],
         ),
@@ -317,7 +317,7 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
                 coded("r", "c2", code="c1", code_changes=[{"at_step": 3, "code": "c2"}]),
             ],
             [
-                "The results come from different code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
+                "The results differ in code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
                 "c1, then c2, evaluated by c2: coliags (1 of 3)."
             ],
         ),
@@ -339,7 +339,10 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
         ),
         (
             [result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))],
-            ["The scenes have images of different sizes: 16 x 12, 32 x 24 px."],
+            [
+                "The results differ in image size: 16 x 12 px: a (1 of 2), b (1 of 2); "
+                "32 x 24 px: a (1 of 2), b (1 of 2)."
+            ],
         ),
         (
             [changed(OURS, untrained_views={"poses": "poses are moved"}), result_of("3dgs", software={"code": "c1"})],
@@ -380,7 +383,7 @@ def test_cells_without_a_result(tmp_path, study_of):
 def c3vd_sequences(**changes):
     """All 22 sequences, under other names."""
     sequences = []
-    for index, frames in enumerate(_C3VD_FRAMES.values()):
+    for index, frames in enumerate(C3VD_FRAMES.values()):
         names = [f"{frame:04d}" for frame in range(frames)]
         facts = {"frames": {"test": tuple(names[::8])}, "train": [name for i, name in enumerate(names) if i % 8]}
         facts |= {"size": (338, 270), "data": {"dataset": "c3vd"}}
@@ -416,7 +419,7 @@ def test_another_benchmark_has_none(study_of):
 
 
 def test_endogslam_and_rotatecolon(study_of):
-    names = list(_C3VD_FRAMES)[:10]
+    names = list(C3VD_FRAMES)[:10]
     options = {"split": "endogslam", "frames": {"test": ("7",)}, "data": {"dataset": "c3vd-endogslam"}}
     rows, _ = published(study_of, [result_of("coliags", name, **options) for name in names])
     assert [entry.text for entry in rows["ColIAGS, published"][:4]] == ["35.58", "0.91", "0.23", "0.122"]

@@ -95,9 +95,9 @@ def compared(tmp_path):
 
 
 def holm_of(study):
-    (part,) = [part for part in study.parts if part.set_name == "test"]
+    (test_set,) = [each for each in study.test_sets if each.set_name == "test"]
     column = Column("psnr", direction="higher")
-    return {row.rival: row.tests.wilcoxon_holm for row in compare(part, column, "coliags")}
+    return {row.rival: row.tests.wilcoxon_holm for row in compare(test_set, column, "coliags")}
 
 
 def test_the_family_is_all_that_was_planned_shown_or_not(compared):
@@ -177,7 +177,7 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, kind, content, match):
         ({"size": (32, 24)}, "16 x 12 and 32 x 24 px"),
         ({"scene": "sigmoid"}, "coliags has cecum by split 'every-8th', the other methods have sigmoid by"),
         ({"split": "block"}, "coliags has cecum by split 'every-8th', the other methods have cecum by split 'block'"),
-        ({"train": ("0001", "0003")}, "trained on different frames"),
+        ({"train": ("0001", "0003")}, r"training set has 2 and 2 frames, which differ in 0002, 0003"),
         ({"frames": FRAMES | {"test": (*FRAMES["test"][:-1], "0037")}}, "5 and 5 frames, which differ in 0036, 0037"),
         ({"frames": {"test": ("0004",)}}, "5 and 1 frames"),
         ({"frames": {"test": FRAMES["test"]}}, "set 'rotation' has 2 and 0 frames"),
@@ -199,8 +199,11 @@ def test_another_scene_may_have_another_size_and_other_sets(study_of):
     results = [result_of(method, **options) for method in ("a", "b") for options in ({}, OTHER_SCENE)]
     study = study_of(results)
     assert study.scenes == ["cecum", "sigmoid"]
-    assert study.parts[1].scenes == ["cecum"]
-    assert [(part.split, part.set_name) for part in study.parts] == [("every-8th", "test"), ("every-8th", "rotation")]
+    assert study.test_sets[1].scenes == ["cecum"]
+    assert [(each.split, each.set_name) for each in study.test_sets] == [
+        ("every-8th", "test"),
+        ("every-8th", "rotation"),
+    ]
 
 
 OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
@@ -209,7 +212,7 @@ OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
 def test_splits_are_parts_of_their_own(study_of):
     study = study_of([result_of(method, split=split) for split in ("every-8th", "block") for method in ("a", "b")])
     expected = [(split, name) for split in ("every-8th", "block") for name in ("test", "rotation")]
-    assert [(part.split, part.set_name) for part in study.parts] == expected
+    assert [(each.split, each.set_name) for each in study.test_sets] == expected
     assert study.methods == ["a", "b"]
 
 
