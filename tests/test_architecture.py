@@ -27,7 +27,7 @@ LAYERS = (
     {"surface"},
     {"export"},
     {"checks", "comparison"},
-    {"pipeline"},
+    {"pipeline", "testing"},
     {"api"},
     {"cli"},
 )

@@ -18,7 +18,6 @@ import pytest
 import yaml
 
 from coliags_plugin import cli
-from coliags_plugin.checks.method.check import CHECKS
 from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
@@ -33,6 +32,7 @@ from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.results.reading import find_results
 from coliags_plugin.surface.coverage.visibility import CoverageSettings
+from coliags_plugin.testing import METHOD_CHECKS, name_of_check
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -339,7 +339,7 @@ def test_every_key_of_a_method_is_in_the_table():
 
 def test_the_table_of_checks_is_the_list():
     assert [row[0] for row in table_rows("configs.md", "| check | what must hold |")] == [
-        check.name for check in CHECKS
+        name_of_check(check) for check in METHOD_CHECKS
     ]
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 
-from coliags_plugin.checks.method.check import CHECKS, check_method
 from coliags_plugin.config.components import is_auto
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_files, method_folder
+from coliags_plugin.testing import METHOD_CHECKS, CheckContext, CheckSkippedError, name_of_check
 
-FOLDER = method_folder()
-METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
+METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(method_folder()))
 
 #: Methods of the quick suite; ``make test-thorough`` checks the others, which take longer or differ by few options.
 QUICK = {"coliags", "3dgs"}
@@ -23,23 +24,24 @@ SMALL_NETWORKS = {
 }
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(name, marks=() if name in QUICK else pytest.mark.thorough) for name in METHODS]
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=[pytest.mark.thorough] * (name not in QUICK)) for name in METHODS]
 )
-def test_the_contract(method, tmp_path):
-    config = load_method(method).config
-    overrides = SMALL_NETWORKS.get(config.field.name, ())
-    results = {result.name: result for result in check_method(method, tmp_path, overrides)}
-    assert [f"{result.name}: {result.detail}" for result in results.values() if result.status == "failed"] == []
+def context(request, tmp_path_factory):
+    overrides = SMALL_NETWORKS.get(load_method(request.param).config.field.name, ())
+    return CheckContext(request.param, tmp_path_factory.mktemp("check"), overrides)
+
+
+@pytest.mark.parametrize("check", METHOD_CHECKS, ids=name_of_check)
+def test_the_contract(context, check):
+    config = context.loaded.config
     automatic = is_auto("renderers", config.renderer.name)  # which chooses among renderers of Gaussians
-    inapplicable = {
+    is_inapplicable = {
         "pixels": automatic or not config.renderer.target.renders_pixels,
         "rows": config.strategy.target.serves is None,
     }
-    assert {name for name, result in results.items() if result.status == "skipped"} == {
-        name for name, holds in inapplicable.items() if holds
-    }
-    assert list(results) == [check.name for check in CHECKS]
+    with pytest.raises(CheckSkippedError) if is_inapplicable.get(name_of_check(check)) else nullcontext():
+        context.run(check)
 
 
 def test_there_are_methods_to_check():

@@ -6,8 +6,9 @@ import ctypes
 import importlib
 import os
 import platform
-import traceback
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from coliags_plugin._version import __version__
-from coliags_plugin.checks.results import CheckFailedError, CheckResult
+from coliags_plugin.checks.results import CheckFailedError, CheckResult, CheckSkippedError, fail_if, run_check
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import is_auto, make_component
 from coliags_plugin.core.cameras import Camera
@@ -52,39 +53,39 @@ def check_installation(device: str = "auto") -> list[CheckResult]:
     """Check what training and evaluation depend on; a missing optional part has status ``skipped``.
 
     Args:
-        device: Whose renderers are tried on views: ``cpu``, ``cuda`` or ``cuda:N``; ``auto``: of the first CUDA device,
-            or none without.
+        device: Device whose renderers are tried on views: ``cpu``, ``cuda`` or ``cuda:N``; ``auto``: the first CUDA
+            device, or none without.
 
     Raises:
         InputError: There is no such device.
     """
     chosen = find_device(device)
-    threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs"
-    results = [
-        CheckResult("coliags_plugin", "passed", __version__),
-        CheckResult("python", "passed", f"{platform.python_version()} on {platform.machine()}"),
-        CheckResult("torch", "passed", f"{torch.__version__}, {threads}"),
-        *_cuda(),
-    ]
-    results += [_library(name, module) for name, module in LIBRARIES.items()]
     tried = choose_device(str(chosen)) if chosen.type == "cuda" or device == "cpu" else None
-    results += [_renderer(name, chosen, tried) for name in registry.renderers]
-    results += [_lpips(net) for net in DEFAULT_NETS]
-    return results
+    threads = f"{torch.get_num_threads()} threads of {os.cpu_count()} CPUs"
+    checks: dict[str, Callable[[], str]] = {
+        "coliags_plugin": lambda: __version__,
+        "python": lambda: f"{platform.python_version()} on {platform.machine()}",
+        "torch": lambda: f"{torch.__version__}, {threads}",
+        "cuda": _cuda,
+        **{f"cuda:{index}": partial(_cuda_device, index) for index in range(torch.cuda.device_count())},
+        **{name: partial(_library, name, module) for name, module in LIBRARIES.items()},
+        **{f"renderer {name}": partial(_renderer, name, chosen, tried) for name in registry.renderers},
+        **{f"weights of LPIPS {net}": partial(_lpips, net) for net in DEFAULT_NETS},
+    }
+    return [run_check(name, check) for name, check in checks.items()]
 
 
-def _cuda() -> list[CheckResult]:
-    """Versions, and a line for each device."""
+def _cuda() -> str:
+    """Versions of CUDA or ROCm."""
     if not torch.cuda.is_available():
-        return [CheckResult("cuda", "skipped", _NO_CUDA)]
+        raise CheckSkippedError(_NO_CUDA)
     built = f"CUDA {torch.version.cuda}" if torch.version.cuda else f"ROCm {torch.version.hip}"
-    versions = f"PyTorch for {built}; the driver serves CUDA {_driver_version() or 'of unknown version'}"
-    results = [CheckResult("cuda", "passed", versions)]
-    for index in range(torch.cuda.device_count()):
-        found = torch.cuda.get_device_properties(index)
-        told = f"{found.name}, compute capability {found.major}.{found.minor}, {found.total_memory / 2**30:.1f} GiB"
-        results.append(CheckResult(f"cuda:{index}", "passed", told))
-    return results
+    return f"PyTorch for {built}; the driver serves CUDA {_driver_version() or 'of unknown version'}"
+
+
+def _cuda_device(index: int) -> str:
+    device = torch.cuda.get_device_properties(index)
+    return f"{device.name}, compute capability {device.major}.{device.minor}, {device.total_memory / 2**30:.1f} GiB"
 
 
 def _driver_version() -> str | None:
@@ -97,50 +98,50 @@ def _driver_version() -> str | None:
     return None if status else f"{number.value // 1000}.{number.value % 1000 // 10}"
 
 
-def _library(name: str, module: str) -> CheckResult:
+def _library(name: str, module: str) -> str:
+    """Version of a library that loads."""
     try:
         installed = version(name)
         importlib.import_module(module)
     except PackageNotFoundError:
-        return CheckResult(name, "failed", "is not installed: pip install coliags_plugin")
+        raise CheckFailedError("is not installed: pip install coliags_plugin") from None
     except (ImportError, OSError) as error:
         hint = "; apt-get install libusb-1.0-0" if "libusb" in str(error) else ""
-        return CheckResult(name, "failed", f"{installed} does not load: {error}{hint}")
-    return CheckResult(name, "passed", installed)
+        raise CheckFailedError(f"{installed} does not load: {error}{hint}") from None
+    return installed
 
 
-def _renderer(name: str, device: torch.device, tried: torch.device | None) -> CheckResult:
-    """Whether a renderer can run here, and what its trial on a device came to; None: no trial."""
-    component, title = make_component("renderers", name), f"renderer {name}"
+def _renderer(name: str, device: torch.device, tried: torch.device | None) -> str:
+    """Availability of a renderer, and the result of its trial on a device; None: no trial."""
+    component = make_component("renderers", name)
     if is_auto(component.kind, component.name):
         chosen = choose_renderer(component, "gaussians3d", device)
-        return CheckResult(title, "passed", f"would use {chosen.name} ({chosen.reason})")
+        return f"would use {chosen.name} ({chosen.reason})"
     available = component.target.availability()
     if not available.ok:
-        return CheckResult(title, "skipped", f"cannot run here: {available.reason}")
+        raise CheckSkippedError(f"cannot run here: {available.reason}")
     can_run = f"can run here: {available.reason}"
     if tried is None or tried.type not in component.target.devices or not isinstance(component.settings, CutSettings):
-        return CheckResult(title, "passed", can_run)
+        return can_run
     try:
-        return CheckResult(title, "passed", f"{can_run}; {try_renderer(component.target, tried)}")
+        return f"{can_run}; {try_renderer(component.target, tried)}"
     except CheckFailedError as error:
-        return CheckResult(title, "failed", f"{error}. {_HINT}")
+        raise CheckFailedError(f"{error}. {_HINT}") from None
     except Exception as error:  # of a driver, a compiler or a kernel: the reason in every case
         first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
-        told = f"{type(error).__name__}: {first[:300]}".rstrip(" .:")
-        detail = f"{told}. {_HINT}; the traceback is in `coliags doctor --json`"
-        return CheckResult(title, "failed", detail, traceback=traceback.format_exc())
+        reason = f"{type(error).__name__}: {first[:300]}".rstrip(" .:")
+        raise CheckFailedError(f"{reason}. {_HINT}; the traceback is in `coliags doctor --json`") from error
 
 
-def _lpips(net: str) -> CheckResult:
-    """Weights are no requirement: without them LPIPS is left out, and nothing else."""
+def _lpips(net: str) -> str:
+    """Files of the weights, which are no requirement: without them LPIPS is left out, and nothing else."""
     try:
         backbone, heads = find_weights(net)
     except UnavailableError as error:
         folders = ", ".join(map(str, searched_folders()))
         detail = f"{error}. Looked in {folders}; {WEIGHTS_VARIABLE} can name a folder that has them"
-        return CheckResult(f"weights of LPIPS {net}", "skipped", detail)
-    return CheckResult(f"weights of LPIPS {net}", "passed", f"{backbone} and {heads}")
+        raise CheckSkippedError(detail) from None
+    return f"{backbone} and {heads}"
 
 
 #: Largest errors of outputs and gradients that pass, each relative to its own largest value.
@@ -161,20 +162,19 @@ def try_renderer(renderer_class: type[SplattingRenderer], device: torch.device) 
     value of the output or gradient; CheckFailedError where one is larger than its tolerance.
     """
     renderer, exact = _without_thresholds(renderer_class), _without_thresholds(TorchRenderer)
-    told, wrong = [], []
+    results, wrong = [], []
     for primitive in sorted(renderer_class.primitives):
         wants = [name for name in OUTPUTS if name in renderer.outputs_of(primitive)]
-        found = _values(renderer, primitive, wants, device, torch.float32)
+        values = _values(renderer, primitive, wants, device, torch.float32)
         true = _values(exact, primitive, wants, torch.device("cpu"), torch.float64)
-        errors = {name: float((found[name] - true[name]).abs().max() / true[name].abs().max()) for name in true}
+        errors = {name: float((values[name] - true[name]).abs().max() / true[name].abs().max()) for name in true}
         for name, error in errors.items():
             if not error <= (OUTPUT_TOLERANCE if name in wants else GRADIENT_TOLERANCE):  # NaN is wrong
                 wrong.append(f"{name} of {primitive} by {error:.1e}")
-        worst = max(errors.values())
-        told.append(f"{primitive}: error at most {worst:.1e}, {_speed(renderer, primitive, device):.4g} frames/s")
-    if wrong:
-        raise CheckFailedError(f"wrong: {', '.join(wrong)}")
-    return "; ".join(told)
+        speed = _speed(renderer, primitive, device)
+        results.append(f"{primitive}: error at most {max(errors.values()):.1e}, {speed:.4g} frames/s")
+    fail_if(wrong, "wrong")
+    return "; ".join(results)
 
 
 def _without_thresholds(kind: Any) -> SplattingRenderer:

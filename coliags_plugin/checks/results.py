@@ -1,10 +1,15 @@
-"""Results of checks, their text, and the exceptions that end a check which has not passed."""
+"""Outcomes of checks, and their text: the lines of ``coliags check`` and ``coliags doctor``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
+from unittest import SkipTest
+
+from coliags_plugin.core.errors import InterruptedRunError
 
 Status = Literal["passed", "failed", "skipped"]
 
@@ -12,23 +17,48 @@ _TICKS: dict[Status, str] = {"passed": "\u2713", "failed": "\u2717", "skipped": 
 _WORDS: dict[Status, str] = {"passed": "ok  ", "failed": "FAIL", "skipped": "-   "}
 
 
+class CheckFailedError(AssertionError):
+    """A check found a fault; the message says which."""
+
+
+class CheckSkippedError(SkipTest):
+    """The check does not apply, or lacks what it needs; the message says why. pytest skips the test."""
+
+
+def fail_if(faults: str | Sequence[str], what: str, advice: str = "") -> None:
+    """Fail the check if there are faults: a difference, or names that share the fault ``what``."""
+    if faults:
+        names = faults if isinstance(faults, str) else ", ".join(faults)
+        raise CheckFailedError(f"{what}: {names}{'; ' if advice else ''}{advice}")
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """Outcome of one check."""
 
-    name: str  # of the check
-    status: Status  # how it ended
-    detail: str  # one line: what was measured, what is wrong, or why it was skipped
-    seconds: float = 0.0  # how long it took
+    name: str  # short and unique
+    status: Status
+    detail: str  # one line: what holds, what is wrong, or why the check was skipped
+    seconds: float = 0.0  # duration of the check
     traceback: str = ""  # of an exception that ended it; empty without
 
 
-class CheckFailedError(Exception):
-    """A check found a fault; the message says which."""
-
-
-class CheckSkippedError(Exception):
-    """The check does not apply to the method; the message says why."""
+def run_check(name: str, check: Callable[[], str], describe: Callable[[Exception], str] = str) -> CheckResult:
+    """Run a check, which returns what holds or raises; ``describe`` puts an unexpected exception into one line."""
+    start = time.monotonic()
+    status: Status = "failed"
+    trace = ""
+    try:
+        status, detail = "passed", check()
+    except CheckSkippedError as reason:
+        status, detail = "skipped", str(reason)
+    except CheckFailedError as error:
+        detail, trace = "; ".join(str(error).split("\n")), traceback.format_exc() if error.__cause__ else ""
+    except InterruptedRunError as error:
+        raise KeyboardInterrupt from error
+    except Exception as error:
+        detail, trace = describe(error), traceback.format_exc()
+    return CheckResult(name, status, detail, time.monotonic() - start, trace)
 
 
 def line(result: CheckResult, width: int, encoding: str) -> str:
@@ -46,10 +76,10 @@ def line(result: CheckResult, width: int, encoding: str) -> str:
 
 
 def summary(results: Sequence[CheckResult]) -> str:
-    """How many passed, failed and were skipped, and in what time."""
+    """Numbers of checks that passed, failed and were skipped, and their time."""
     counts = {status: sum(result.status == status for result in results) for status in _TICKS}
-    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count or status != "skipped")
-    return f"{told} in {sum(result.seconds for result in results):.1f} s"
+    parts = ", ".join(f"{count} {status}" for status, count in counts.items() if count or status != "skipped")
+    return f"{parts} in {sum(result.seconds for result in results):.1f} s"
 
 
 def tracebacks(results: Sequence[CheckResult], encoding: str) -> list[str]:

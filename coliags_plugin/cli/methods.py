@@ -111,15 +111,16 @@ class CheckCommand:
 
     def _print_results(self, folder: Path) -> bool:
         """Whether a check failed."""
-        from coliags_plugin.checks.method.check import CHECKS, check_method
         from coliags_plugin.checks.results import line, summary, tracebacks
+        from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
 
-        encoding, width = sys.stdout.encoding or "ascii", max(len(check.name) for check in CHECKS)
+        encoding, width = sys.stdout.encoding or "ascii", max(len(name_of_check(check)) for check in METHOD_CHECKS)
+        context = CheckContext(self.method, folder, self.set, self.data, self.data_format, self.steps)
         results = []
-        for result in check_method(self.method, folder, self.set, self.data, self.data_format, self.steps):
-            results.append(result)
+        for check in METHOD_CHECKS:
+            results.append(context.outcome(check))
             if not self.json:
-                print(in_flags(line(result, width, encoding)), flush=True)
+                print(in_flags(line(results[-1], width, encoding)), flush=True)
         text = summary(results)
         if self.traceback:
             text += "\n" + "".join(tracebacks(results, encoding))

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.checks.method.check import CHECKS
 from coliags_plugin.checks.results import CheckResult, line, summary
 from coliags_plugin.config import registry
+from coliags_plugin.testing import METHOD_CHECKS, name_of_check
 from tests.commands import refused, run
 from tests.scenes import write_wall
 
@@ -37,8 +37,8 @@ def test_a_sound_method(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert run("check", "3dgs", *SMALL) == 0
     *lines, last = capsys.readouterr().out.splitlines()
-    names = sorted((check.name for check in CHECKS), key=len, reverse=True)
-    assert [re.match(rf"[✓-] ({'|'.join(names)}) ", text)[1] for text in lines] == [check.name for check in CHECKS]
+    names = sorted(map(name_of_check, METHOD_CHECKS), key=len, reverse=True)
+    assert [re.match(rf"[✓-] ({'|'.join(names)}) ", text)[1] for text in lines] == [*map(name_of_check, METHOD_CHECKS)]
     assert re.fullmatch(r"20 passed, 0 failed, 1 skipped in \d+\.\d s", last)
     assert not list(tmp_path.glob("coliags-check-*"))
 

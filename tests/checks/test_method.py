@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from coliags_plugin.checks.method.check import CHECKS, check_method
 from coliags_plugin.config import registry
-from tests.checks.method import parts
+from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
+from tests.checks import components
 
 SPLATS = """
 datamanager: auto
@@ -30,13 +30,13 @@ optimizers: {near: {lr: 0.05}, far: {lr: 0.05}}
 BROKEN = [
     (["field=DoublesItsSize"], "resolves", "read again, it has another field"),
     (["losses.colour={name: AcceptsAnyOption, weight: 1.0}"], "options", "losses.colour.no_such_option=1"),
-    (["field=CrashesWhenMade"], "builds", r"ZeroDivisionError: division by zero \(tests/checks/method/parts.py:\d+\)"),
+    (["field=CrashesWhenMade"], "builds", r"ZeroDivisionError: division by zero \(tests/checks/components.py:\d+\)"),
     (["optimizers.means=null"], "builds", "optimizers lacks the parameter groups means"),
     (["optimizers.mirrors={lr: 0.1}"], "builds", "optimizers names mirrors"),
     (["field=HasAnUngroupedParameter"], "groups", "never trained: field.forgotten"),
     (["field=SharesAParameter", "strategy=none"], "groups", "in more than one parameter group: field.means"),
     (["losses.colour={name: TurnsNaN, weight: 1.0}"], "trains", "step 5, .*'colour' is nan"),
-    (["field=CrashesInALibrary"], "trains", r"RuntimeError: .*\(tests/checks/method/parts.py:\d+\)"),
+    (["field=CrashesInALibrary"], "trains", r"RuntimeError: .*\(tests/checks/components.py:\d+\)"),
     (["losses.late={name: Colour, weight: 1.0, from_step: 29990}"], "terms", r"'late' \(after step 29990 of 30000\)"),
     (["losses.colour={name: Maximised, weight: 1.0}"], "learns", "it should fall"),
     (["field=HasADetachedGroup"], "gradients", "no gradient but 0 in 20 steps: means;"),
@@ -48,15 +48,15 @@ BROKEN = [
     (["renderer=FixedSize"], "renders", "another size of 29 x 23 pixels"),
     (["modules.free=CrashesForFreeCameras"], "renders", "AttributeError: 'NoneType'"),
     (["field=RendersWithChance"], "renders again", "two renderings of frame .* differs in"),
-    (["renderer=IgnoresUnknownOutputs"], "requests", "output 'no_such_output': not refused by Drawing"),
+    (["renderer=IgnoresUnknownOutputs"], "requests", "output 'no_such_output' by Drawing: not refused"),
     (["renderer=CrashesForUnknownOutputs"], "requests", "KeyError instead of InputError"),
-    (["renderer=IgnoresPixels"], "requests", "single pixels: not refused"),
+    (["renderer=IgnoresPixels"], "requests", "single pixels by Drawing: not refused"),
     (["field=ForgetsABuffer"], "loads", "must be a parameter or a buffer"),
     (["losses.colour={name: DiffersFromRunToRun, weight: 1.0}"], "repeats", "two runs of 10 steps"),
     (["losses.colour={name: TakesGlobalRandomNumbers, weight: 1.0}"], "resumes", "resumed for 10: field/.* differs in"),
     (["sampler=ForgetsItsPlace"], "resumes", "resumed for 10"),
     (["strategy=HasAHiddenCounter"], "resumes", "field/logits differs"),
-    (["field=ReadsWhatIsThere"], "checkpoints", "without the field's 'means' was read"),
+    (["field=ReadsWhatIsThere"], "checkpoints", "without the field's 'means': not refused"),
     (["strategy=ForgetsAGroup"], "rows", "492 to 495 rows: parameter group 'logits' has 494"),
     (["strategy=ForgetsTheBuffer"], "rows", "492 to 495 rows: buffer 'ages' has 492"),
     (["strategy=ForgetsTheCounter"], "rows", "492 to 495 rows: counter 'steps' of the strategy has 492"),
@@ -64,8 +64,8 @@ BROKEN = [
     (["strategy=ForgetsAfterAnEvent"], "rows", "resumed after the event of step 4"),
     (["protocol=wants-albedo"], "evaluates", "outputs needed by protocol 'wants-albedo': albedo"),
     (["renderer=HasNoExpectedDepth"], "images", "depth_expected"),
-    (["losses.colour={name: AssumesDepth, weight: 1.0}"], "other data", "without depth: AttributeError: .*parts"),
-    (["sampler=CrashesAlone"], "other data", "with one frame: RuntimeError: .*parts"),
+    (["losses.colour={name: AssumesDepth, weight: 1.0}"], "other data", "without depth: AttributeError: .*components"),
+    (["sampler=CrashesAlone"], "other data", "with one frame: RuntimeError: .*components"),
     (["losses.colour={name: CountsMaskedPixels, weight: 1.0}"], "ignored pixels", "masked pixels: colour"),
     (["renderer={name: SwapsPixels, samples: 16}"], "pixels", "rgb of single pixels"),
 ]  # fmt: skip
@@ -76,32 +76,31 @@ QUICK = {"builds", "trains", "renders", "resumes"}
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    """The components of parts.py under the names of their classes, the protocol under its own."""
+    """The components of components.py under the names of their classes, the protocol under its own."""
     kinds = {
-        parts.GaussianField: registry.fields,
-        parts.RadianceField: registry.fields,
-        parts.Loss: registry.losses,
-        parts.Strategy: registry.strategies,
-        parts.Sampler: registry.samplers,
-        parts.ViewModule: registry.modules,
-        parts.CpuRenderer: registry.renderers,
-        parts.VolumeRenderer: registry.renderers,
-        parts.Protocol: registry.protocols,
+        components.GaussianField: registry.fields,
+        components.RadianceField: registry.fields,
+        components.Loss: registry.losses,
+        components.Strategy: registry.strategies,
+        components.Sampler: registry.samplers,
+        components.ViewModule: registry.modules,
+        components.CpuRenderer: registry.renderers,
+        components.VolumeRenderer: registry.renderers,
+        components.Protocol: registry.protocols,
     }
-    for name, found in vars(parts).items():
+    for name, target in vars(components).items():
         for base, kind in kinds.items():
-            if isinstance(found, type) and issubclass(found, base) and found.__module__ == parts.__name__:
+            if isinstance(target, type) and issubclass(target, base) and target.__module__ == components.__name__:
                 kind.names()  # so that nothing is discovered later
-                known = found.name if kind is registry.protocols else name
-                monkeypatch.setitem(kind._targets, known, found)
-                monkeypatch.setitem(kind._sources, known, "a test")
+                key = target.name if kind is registry.protocols else name
+                monkeypatch.setitem(kind._targets, key, target)
+                monkeypatch.setitem(kind._sources, key, "a test")
 
 
-def check(tmp_path, text, overrides=()):
+def outcomes(tmp_path, text, overrides=()):
     (tmp_path / "made-up.yaml").write_text(text)
-    results = list(check_method(str(tmp_path / "made-up.yaml"), tmp_path, overrides))
-    assert [result.name for result in results] == [check.name for check in CHECKS]
-    return results
+    context = CheckContext(str(tmp_path / "made-up.yaml"), tmp_path, overrides)
+    return [context.outcome(check) for check in METHOD_CHECKS]
 
 
 def failed(results):
@@ -110,7 +109,7 @@ def failed(results):
 
 @pytest.mark.parametrize(("text", "skipped"), [(SPLATS, {"pixels"}), (FOG, {"rows"})], ids=["splats", "fog"])
 def test_sound_components_pass(tmp_path, text, skipped):
-    results = check(tmp_path, text)
+    results = outcomes(tmp_path, text)
     assert failed(results) == {}
     assert {result.name for result in results if result.status == "skipped"} == skipped
 
@@ -127,11 +126,11 @@ def test_sound_components_pass(tmp_path, text, skipped):
 )
 def test_a_broken_component_fails_the_check_that_is_about_it(tmp_path, overrides, name, line):
     text = FOG if name == "pixels" else SPLATS
-    found = failed(check(tmp_path, text, overrides))
-    assert found.keys() == {name}, found
-    assert re.search(line, found[name]), found[name]
-    assert "\n" not in found[name]
+    failures = failed(outcomes(tmp_path, text, overrides))
+    assert failures.keys() == {name}, failures
+    assert re.search(line, failures[name]), failures[name]
+    assert "\n" not in failures[name]
 
 
 def test_every_check_has_a_component_that_fails_it():
-    assert {name for _, name, _ in BROKEN} == {check.name for check in CHECKS}
+    assert {name for _, name, _ in BROKEN} == {name_of_check(check) for check in METHOD_CHECKS}
