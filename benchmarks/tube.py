@@ -58,7 +58,7 @@ def _frame(index: int, frames: int, width: int, height: int) -> Frame:
     pattern = 0.5 + 0.4 * torch.sin(surface * torch.tensor([0.9, 1.1, 0.7]))
     rgb = (pattern * (15.0 / distance) ** (2 / 2.2)).clamp(0, 1)
     depth = torch.where(z < DEPTH_LIMIT, z, torch.nan)
-    return Frame(
+    return Frame.of(
         f"{index:04d}", index, (rgb * 255).round().byte(), camera, depth, sparse_depth=_at_every_eighth_pixel(depth)
     )
 

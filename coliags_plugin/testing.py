@@ -464,14 +464,15 @@ def _few_frames(context: CheckContext) -> TrainedRun:
 # Scenes that lack something, and pixels that are to be ignored
 
 _VARIANTS: dict[str, Callable[[Scene], Scene]] = {
-    "without depth": lambda scene: replace(scene, train=[_without_depth(frame.to("cpu")) for frame in scene.train]),
+    "without depth": lambda scene: replace(scene, train=[_without_depth(frame) for frame in scene.train]),
     "without points": lambda scene: replace(scene, points=PointCloud(torch.zeros(0, 3))),
     "with one frame": lambda scene: replace(scene, train=scene.train[:1]),
 }
 
 
 def _without_depth(frame: Frame) -> Frame:
-    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None, depth_confidence=None)
+    bare = frame.with_maps(depth=None, depth_at_least=None, depth_confidence=None)
+    return replace(bare, sparse_depth=None)
 
 
 def check_other_data(context: CheckContext) -> None:
@@ -497,7 +498,7 @@ def check_ignored_pixels(context: CheckContext) -> None:
     context.result_of(check_repeats)
     runs: list[tuple[list[dict[str, Any]], dict[str, Tensor]]] = []
     for spoilt in (False, True):
-        frames = [_masked(frame.to("cpu"), spoilt) for frame in context.scene.train]
+        frames = [_masked(frame, spoilt) for frame in context.scene.train]
         trainer = context.build("masked", replace(context.scene, train=frames))
         runs.append((_take_steps(trainer), trainer.model.state_dict()))
     (rows, first), (spoilt_rows, second) = runs
@@ -513,11 +514,11 @@ def _masked(frame: Frame, spoilt: bool) -> Frame:
     height, width = frame.image.shape[:2]
     ignored = torch.zeros(height, width, dtype=torch.bool)
     ignored[height // 4 : height // 2, width // 4 : width // 2] = True
-    masked = replace(frame, mask=frame.valid & ~ignored)
+    masked = frame.with_maps(mask=frame.valid & ~ignored)
     if not spoilt:
         return masked
     depth = None if frame.depth is None else frame.depth.masked_fill(ignored, torch.nan)
-    return replace(masked, image=torch.where(ignored[..., None], 255 - frame.image, frame.image), depth=depth)
+    return masked.with_maps(image=torch.where(ignored[..., None], 255 - frame.image, frame.image), depth=depth)
 
 
 def _take_steps(trainer: Trainer) -> list[dict[str, Any]]:

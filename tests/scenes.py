@@ -32,7 +32,7 @@ def plain_frame(image: torch.Tensor, depth: torch.Tensor | None = None, mask: to
     """A frame of these pixels, of a camera at the origin."""
     height, width = image.shape[:2]
     camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
-    return Frame("0007", 7, image, camera, depth, mask)
+    return Frame.of("0007", 7, image, camera, depth, mask)
 
 
 def wall_color(points: torch.Tensor) -> torch.Tensor:
@@ -53,7 +53,7 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
         distance = (points - camera.center).norm(dim=-1, keepdim=True)
         rgb = wall_color(points) * ((18.0 / distance) ** (2 / 2.2) if lamp else 1.0)
         image = (rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-        made.append(Frame(f"{index:04d}", index, image, camera, z.float() if depth else None))
+        made.append(Frame.of(f"{index:04d}", index, image, camera, z.float() if depth else None))
     test = [frame for frame in made if frame.index % 8 == 0]
     train = [frame for frame in made if frame.index % 8]
     grid = torch.stack(torch.meshgrid(torch.arange(-12.0, 16, 0.5), torch.arange(-10.0, 12, 0.5), indexing="ij"), -1)

@@ -60,14 +60,14 @@ def test_train_is_the_command(scene, trained, tmp_path):
     ("change", "warnings"),
     [
         (lambda frame: frame, []),
-        (lambda frame: replace(frame, depth=frame.depth / 3.0), ["depth and poses are in different units"]),
-        (lambda frame: replace(frame, depth=30.0 / frame.depth), ["frames do not agree on the surface"]),
+        (lambda frame: frame.with_maps(depth=frame.depth / 3.0), ["depth and poses are in different units"]),
+        (lambda frame: frame.with_maps(depth=30.0 / frame.depth), ["frames do not agree on the surface"]),
         (
             lambda frame: replace(frame, camera=replace(frame.camera, camera_to_world=frame.camera.world_to_camera)),
             ["poses agree with depth when read as: world-to-camera"],
         ),
-        (lambda frame: replace(frame, image=torch.full_like(frame.image, 90)), ["images repeat"]),
-        (lambda frame: replace(frame, depth=torch.full_like(frame.depth, 20.0)), ["depth is the same everywhere"]),
+        (lambda frame: frame.with_maps(image=torch.full_like(frame.image, 90)), ["images repeat"]),
+        (lambda frame: frame.with_maps(depth=torch.full_like(frame.depth, 20.0)), ["depth is the same everywhere"]),
     ],
     ids=["sound", "scaled-depth", "inverse-depth", "inverse-poses", "repeats", "flat-depth"],
 )

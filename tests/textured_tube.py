@@ -57,7 +57,7 @@ def tube_frames(
         points = c2w[:3, 3] + depth[..., None] * rays
         image = np.rint(texture(points / coarseness)).astype(np.uint8)
         frames.append(
-            Frame(f"{index:04d}", index, torch.from_numpy(image), camera, torch.from_numpy(depth.astype(np.float32)))
+            Frame.of(f"{index:04d}", index, torch.from_numpy(image), camera, torch.from_numpy(depth.astype(np.float32)))
         )
     return frames
 

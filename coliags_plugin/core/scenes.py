@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
-from copy import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.tensors import pixel_ids, sent
@@ -55,51 +56,105 @@ class View:
     trained: bool
 
 
-class _ImageAndMask(Protocol):
-    @property
-    def image(self) -> UInt8[Tensor, "H W 3"]: ...
-    @property
-    def mask(self) -> Bool[Tensor, "H W"] | None: ...
+@dataclass(frozen=True)
+class PixelMap:
+    """Schema of one kind of per-pixel values of frames."""
+
+    dtype: torch.dtype
+    high: float = 1.0  # largest value; the least is 0, which is no depth
+    is_smooth: bool = False  # resized by area averaging or interpolation; others by nearest neighbour
+    is_length: bool = False  # scales with the world
+    #: Value in a batch of pixels for a frame without this map; None: the map is not part of training targets.
+    fill: float | None = None
 
 
-class _MaskedImage:
-    """Float colours and a complete mask of classes with an image and an optional mask."""
+#: All per-pixel maps of frames by name; :class:`PixelMaps` has a typed property for each.
+PIXEL_MAPS: Mapping[str, PixelMap] = {
+    "image": PixelMap(torch.uint8, high=255.0, is_smooth=True, fill=0.0),
+    "mask": PixelMap(torch.bool, fill=1.0),
+    "depth": PixelMap(torch.float32, high=bounds.LENGTH, is_length=True, fill=math.nan),
+    "depth_at_least": PixelMap(torch.float32, high=bounds.LENGTH, is_length=True),
+    "depth_confidence": PixelMap(torch.float32, fill=1.0),
+    "seen": PixelMap(torch.bool),
+}
+
+
+class PixelMaps(ABC):
+    """Typed access to per-pixel maps by name; the image is always there, others may be None."""
+
+    @abstractmethod
+    def read(self, name: str) -> Tensor | None:
+        """See :class:`PixelSource`."""
 
     @property
-    def rgb(self: _ImageAndMask) -> Float[Tensor, "H W 3"]:
+    def image(self) -> UInt8[Tensor, "H W 3"]:
+        """RGB. [H, W, 3]"""
+        return cast(Tensor, self.read("image"))
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        """False where a pixel is to be ignored; None means every pixel counts. [H, W]"""
+        return self.read("mask")
+
+    @property
+    def depth(self) -> Float[Tensor, "H W"] | None:
+        """z-depth, mm; NaN where unknown. [H, W]"""
+        return self.read("depth")
+
+    @property
+    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
+        """Depth that the sensor clipped at, mm: the surface lies there or beyond, and ``depth`` is NaN.
+
+        NaN elsewhere. [H, W]
+        """
+        return self.read("depth_at_least")
+
+    @property
+    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
+        """Probability in [0, 1] that the relative error of estimated depth is below 5 %; 0 where it is a mere prior.
+
+        None where ``depth`` is true: measured or rendered. [H, W]
+        """
+        return self.read("depth_confidence")
+
+    @property
+    def seen(self) -> Bool[Tensor, "H W"] | None:
+        """True where a training frame sees the same surface; of test views with ground-truth geometry. [H, W]"""
+        return self.read("seen")
+
+    @property
+    def rgb(self) -> Float[Tensor, "H W 3"]:
         """The image in [0, 1], float32. [H, W, 3]"""
         return self.image.to(torch.float32) / 255.0
 
     @property
-    def valid(self: _ImageAndMask) -> Bool[Tensor, "H W"]:
+    def valid(self) -> Bool[Tensor, "H W"]:
         """The mask, all True where there is none. [H, W]"""
-        image, mask = self.image, self.mask
+        mask, image = self.mask, self.image
         return torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
 
 
 @dataclass(frozen=True)
-class Target(_MaskedImage):
+class Target(PixelMaps):
     """Ground truth of a training step: a frame, or P pixels of frames as P rows and one column.
 
     Attributes:
-        name: Of the frame, or of the frames.
-        image: RGB. [H, W, 3]
-        mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
-        depth: z-depth, mm; NaN where unknown. None where there is none. [H, W]
+        name: Name of the frame, or of the frames.
+        maps: Per-pixel maps that have a :attr:`PixelMap.fill`, by name.
         sparse_depth: Depth at single points of a whole frame; None where there is none.
-        index: Of a whole frame in the video.
+        index: Index of a whole frame in the video.
         chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
-        depth_confidence: How far ``depth`` can be trusted, see :class:`Frame`; None where it is true. [H, W]
     """
 
     name: str
-    image: UInt8[Tensor, "H W 3"]
-    mask: Bool[Tensor, "H W"] | None = None
-    depth: Float[Tensor, "H W"] | None = None
+    maps: Mapping[str, Tensor]
     sparse_depth: SparseDepth | None = None
     index: int = 0
     chosen: Int[Tensor, "H W"] | None = None
-    depth_confidence: Float[Tensor, "H W"] | None = None
+
+    def read(self, name: str) -> Tensor | None:
+        """See :class:`PixelMaps`."""
+        return self.maps.get(name)
 
     @property
     def ids(self) -> Int[Tensor, "H W"]:
@@ -110,59 +165,105 @@ class Target(_MaskedImage):
         return pixel_ids(self.index, torch.arange(height * width, device=self.image.device).view(height, width))
 
 
+class PixelSource(ABC):
+    """Where the per-pixel maps of a frame come from: memory or files."""
+
+    @abstractmethod
+    def read(self, name: str) -> Tensor | None:
+        """The map of a name in :data:`PIXEL_MAPS`; None where there is none. [H, W, ...]"""
+
+    def read_all(self) -> dict[str, Tensor]:
+        """All maps there are, by name; files are read once."""
+        return {name: values for name in PIXEL_MAPS if (values := self.read(name)) is not None}
+
+    @abstractmethod
+    def scaled(self, factor: float) -> PixelSource:
+        """The source in a world whose lengths are ``factor`` times as large; it reads nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PixelTensors(PixelSource):
+    """Per-pixel maps in memory, by name."""
+
+    maps: Mapping[str, Tensor]
+
+    def read(self, name: str) -> Tensor | None:
+        """See :class:`PixelSource`."""
+        return self.maps.get(name)
+
+    def scaled(self, factor: float) -> PixelTensors:
+        """See :class:`PixelSource`."""
+        lengths = {name: factor * values for name, values in self.maps.items() if PIXEL_MAPS[name].is_length}
+        return PixelTensors({**self.maps, **lengths})
+
+
 @dataclass(frozen=True)
-class Frame(_MaskedImage):
-    """One posed image. Tensors stay on the CPU until :meth:`to` moves them.
+class Frame(PixelMaps):
+    """One posed image. Its maps stay on the CPU until :meth:`to` moves them.
 
     Attributes:
         name: Unique within the scene; the file's stem where there is one.
-        index: Of the frame in the video, counted from 0.
-        image: RGB. [H, W, 3]
+        index: Index in the video, counted from 0.
+        source: Source of the per-pixel maps.
         camera: Camera that took it.
-        depth: z-depth, mm; NaN where unknown. None where the dataset has none. [H, W]
-        mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
-        seen: For test views with ground-truth geometry: True where a training frame sees the same surface. [H, W]
-        depth_at_least: Where the depth sensor clipped, the z-depth it clipped at, mm: the surface lies there or beyond
-            and ``depth`` is NaN. NaN elsewhere; None where nothing is clipped. [H, W]
         sparse_depth: Depth at single points; None where the dataset has none.
-        depth_confidence: Of estimated depth, the estimated probability in [0, 1] that its relative error is below 5 %;
-            0 where it follows a prior only. None where ``depth`` is true: measured or rendered. [H, W]
     """
 
     name: str
     index: int
-    image: UInt8[Tensor, "H W 3"]
+    source: PixelSource = field(repr=False)
     camera: Camera
-    depth: Float[Tensor, "H W"] | None = None
-    mask: Bool[Tensor, "H W"] | None = None
-    seen: Bool[Tensor, "H W"] | None = None
-    depth_at_least: Float[Tensor, "H W"] | None = None
     sparse_depth: SparseDepth | None = None
-    depth_confidence: Float[Tensor, "H W"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        index: int,
+        image: UInt8[Tensor, "H W 3"],
+        camera: Camera,
+        depth: Float[Tensor, "H W"] | None = None,
+        mask: Bool[Tensor, "H W"] | None = None,
+        sparse_depth: SparseDepth | None = None,
+        **maps: Tensor | None,
+    ) -> Frame:
+        """A frame in memory; ``maps`` are further per-pixel maps, by the names in :data:`PIXEL_MAPS`."""
+        frame = cls(name, index, PixelTensors({"image": image}), camera, sparse_depth)
+        return frame.with_maps(depth=depth, mask=mask, **maps)
+
+    def with_maps(self, **maps: Tensor | None) -> Frame:
+        """The frame with other per-pixel maps of these names, all of them in memory; None removes one."""
+        if unknown := maps.keys() - PIXEL_MAPS.keys():
+            raise TypeError(f"no per-pixel map is called {', '.join(sorted(unknown))}")
+        changed = {**self.source.read_all(), **maps}
+        kept = {name: values for name, values in changed.items() if values is not None}
+        return replace(self, source=PixelTensors(kept))
+
+    def read(self, name: str) -> Tensor | None:
+        """See :class:`PixelMaps`; files are read at each call unless their source keeps them."""
+        return self.source.read(name)
+
+    @property
+    def valid(self) -> Bool[Tensor, "H W"]:
+        """See :class:`PixelMaps`; reads no image."""
+        mask, camera = self.mask, self.camera
+        size, device = (camera.height, camera.width), camera.camera_to_world.device
+        return torch.ones(size, dtype=torch.bool, device=device) if mask is None else mask
 
     @property
     def target(self) -> Target:
         """The whole frame as a target."""
-        return Target(
-            self.name,
-            self.image,
-            self.mask,
-            self.depth,
-            self.sparse_depth,
-            self.index,
-            depth_confidence=self.depth_confidence,
-        )
+        return Target(self.name, self._target_maps(lambda values: values), self.sparse_depth, self.index)
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
         """Some pixels, by columns and rows, as a target."""
-        column, row = pixels.to(self.image.device).unbind(1)
+        column, row = pixels.to(self.camera.camera_to_world.device).unbind(1)
+        maps = self._target_maps(lambda values: values[row, column][:, None])
+        return Target(self.name, maps, chosen=pixel_ids(self.index, row * self.camera.width + column)[:, None])
 
-        def taken(values: Tensor | None) -> Tensor | None:
-            return None if values is None else values[row, column][:, None]
-
-        image, mask, depth = self.image[row, column][:, None], taken(self.mask), taken(self.depth)
-        chosen = pixel_ids(self.index, row * self.image.shape[1] + column)[:, None]
-        return Target(self.name, image, mask, depth, chosen=chosen, depth_confidence=taken(self.depth_confidence))
+    def _target_maps(self, select: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        maps = {name: self.read(name) for name, schema in PIXEL_MAPS.items() if schema.fill is not None}
+        return {name: select(values) for name, values in maps.items() if values is not None}
 
     @property
     def true_depth(self) -> Float[Tensor, "H W"] | None:
@@ -170,29 +271,24 @@ class Frame(_MaskedImage):
         return self.depth if self.depth_confidence is None else None
 
     def with_near_plane(self, near_plane: float) -> Frame:
-        """Return the frame with another near plane of its camera, scene units; images are read as lazily as before."""
-        frame = copy(self)
-        object.__setattr__(frame, "camera", replace(self.camera, near_plane=near_plane))
-        return frame
+        """The frame with another near plane of its camera, scene units."""
+        return replace(self, camera=replace(self.camera, near_plane=near_plane))
 
     def scaled(self, factor: float) -> Frame:
-        """Return the frame in a world whose lengths are ``factor`` times as large; images are read lazily as before."""
-        sparse, depths = self.sparse_depth, {"depth": self.depth, "depth_at_least": self.depth_at_least}
-        scaled: dict[str, Any] = {name: None if depth is None else factor * depth for name, depth in depths.items()}
-        scaled["sparse_depth"] = None if sparse is None else sparse.scaled(factor)
-        return replace(self, camera=self.camera.scaled(factor), **scaled)
+        """The frame in a world whose lengths are ``factor`` times as large."""
+        sparse = None if self.sparse_depth is None else self.sparse_depth.scaled(factor)
+        camera, source = self.camera.scaled(factor), self.source.scaled(factor)
+        return replace(self, camera=camera, source=source, sparse_depth=sparse)
 
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
         return View(self.name, float(self.index), trained)
 
     def to(self, device: torch.device | str) -> Frame:
-        """Return the frame on another device."""
-        names = ("image", "depth", "mask", "seen", "depth_at_least", "depth_confidence")
-        moved: dict[str, Any] = {name: getattr(self, name) for name in names}
-        moved = {name: values if values is None else sent(values, device) for name, values in moved.items()}
+        """The frame in the memory of a device."""
+        maps = PixelTensors({name: sent(values, device) for name, values in self.source.read_all().items()})
         sparse = None if self.sparse_depth is None else self.sparse_depth.to(device)
-        return Frame(self.name, self.index, camera=self.camera.to(device), sparse_depth=sparse, **moved)
+        return replace(self, source=maps, camera=self.camera.to(device), sparse_depth=sparse)
 
 
 @dataclass(frozen=True)
@@ -318,27 +414,21 @@ class Scene:
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:
-    """Pixel batches of several frames, of P_i rows and one column each, as one.
-
-    A missing mask is all True; beside others, missing depth is all NaN and missing confidence all 1.
-    """
+    """Pixel batches of several frames, of P_i rows and one column each, as one; missing maps are filled."""
     if len(parts) == 1:
         return parts[0]
-    masks = None if all(part.mask is None for part in parts) else torch.cat([part.valid for part in parts])
-    depths = _joined(parts, [part.depth for part in parts], torch.nan)
-    confidences = _joined(parts, [part.depth_confidence for part in parts], 1.0)
-    images, chosen = torch.cat([part.image for part in parts]), torch.cat([part.ids for part in parts])
-    name = ", ".join(part.name for part in parts)
-    return Target(name, images, masks, depths, chosen=chosen, depth_confidence=confidences)
+    maps = {
+        name: torch.cat([_filled(part, name) for part in parts])
+        for name in PIXEL_MAPS
+        if any(name in part.maps for part in parts)
+    }
+    chosen, name = torch.cat([part.ids for part in parts]), ", ".join(part.name for part in parts)
+    return Target(name, maps, chosen=chosen)
 
 
-def _joined(parts: Sequence[Target], maps: Sequence[Tensor | None], instead: float) -> Tensor | None:
-    """One map of several targets, concatenated; a constant for targets without it, None where no target has it."""
-    if all(own is None for own in maps):
-        return None
-    return torch.cat(
-        [
-            torch.full(part.image.shape[:2], instead, device=part.image.device) if own is None else own
-            for part, own in zip(parts, maps, strict=True)
-        ]
-    )
+def _filled(part: Target, name: str) -> Tensor:
+    """A map of a target, or its :attr:`PixelMap.fill` everywhere."""
+    if name in part.maps:
+        return part.maps[name]
+    schema, image = PIXEL_MAPS[name], part.image
+    return torch.full(image.shape[:2], cast(float, schema.fill), dtype=schema.dtype, device=image.device)

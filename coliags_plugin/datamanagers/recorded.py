@@ -25,7 +25,7 @@ from coliags_plugin.core.provenance import PointsRecord, Provenance, SplitRecord
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, first_few, parallel_map
-from coliags_plugin.datamanagers.recording import Recording, Shot, StoredFrame, portable_name
+from coliags_plugin.datamanagers.recording import Recording, Shot, StoredPixels, portable_name
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
 from coliags_plugin.datamanagers.scene_settings import (
     FACTORS,
@@ -122,7 +122,8 @@ class RecordedDataManager(DataManager):
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
-            parallel_map(StoredFrame.read, [*video, *others], "read images", progress)
+            stored = [frame.source for frame in (*video, *others) if isinstance(frame.source, StoredPixels)]
+            parallel_map(StoredPixels.preload, stored, "read images", progress)
         points, described = self._initial_points(recording, path, train, progress)
         split = SplitRecord(
             name=settings.split,
@@ -148,9 +149,8 @@ class RecordedDataManager(DataManager):
         }
         if self._is_told:
             self._tell(recording, path)
-        tests: dict[str, list[Frame]] = {name: [*frames] for name, frames in test_sets.items()}
         folder = path.resolve()
-        return Scene(folder.name, [*train], tests, points, Provenance(**facts), folder).scaled(FACTORS[unit])
+        return Scene(folder.name, train, test_sets, points, Provenance(**facts), folder).scaled(FACTORS[unit])
 
     def _tell(self, recording: Recording, path: Path) -> None:
         """Log what is read: doubts about it, sizes where images are downscaled by default, and the number of frames."""
@@ -200,9 +200,14 @@ class RecordedDataManager(DataManager):
             )
         return {}
 
-    def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen: Mapping[int, Path]) -> list[StoredFrame]:
-        keep = self.settings.keep_pixels
-        return [StoredFrame(replace(shots[index], seen=seen.get(index)), index, keep) for index in indices]
+    def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen: Mapping[int, Path]) -> list[Frame]:
+        frames = []
+        for index in indices:
+            shot = replace(shots[index], seen=seen.get(index))
+            camera = shot.rectification.camera(shot.camera_to_world)
+            source = StoredPixels(shot, self.settings.keep_pixels)
+            frames.append(Frame(shot.name, index, source, camera, shot.sparse_depth))
+        return frames
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
         """Indices of training frames and of test frames."""

@@ -5,20 +5,18 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
-from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_alpha, read_rgb
-from coliags_plugin.core.scenes import Frame, PointCloud, SparseDepth
+from coliags_plugin.core.scenes import PIXEL_MAPS, PixelSource, PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.files import numbered
 from coliags_plugin.datamanagers.reading.images import DepthFormat, all_of, read_gray, read_mask
 from coliags_plugin.datamanagers.rectification import Rectification
@@ -140,156 +138,116 @@ def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, 
     return masks
 
 
-class StoredFrame(Frame):
-    """A lazily read frame, cached in the stored data types: 5 bytes per pixel with 16-bit depth.
+@dataclass(frozen=True, eq=False)
+class StoredPixels(PixelSource):
+    """The per-pixel maps of a shot, read when they are used and cached in the stored data types.
 
-    Thread-safe. Pixel attributes raise InputError if a file is damaged or has the wrong format or size. Without
-    ``keep``, every attribute access reads its file; use :meth:`to` to get several attributes at once.
+    That takes 5 bytes per pixel with 16-bit depth. Thread-safe. Reading raises InputError if a file is damaged or has
+    the wrong format or size.
+
+    Attributes:
+        keep: Whether maps are cached; otherwise, every access reads its file.
+        scale: Factor from lengths of the shot to those of the maps.
     """
 
-    def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
-        camera = shot.rectification.camera(shot.camera_to_world)
-        values = {"name": shot.name, "index": index, "camera": camera, "sparse_depth": shot.sparse_depth}
-        for name, value in {**values, "_shot": shot, "_kept": {} if keep else None, "_scale": 1.0}.items():
-            object.__setattr__(self, name, value)
+    shot: Shot
+    keep: bool = True
+    scale: float = 1.0
+    _cache: dict[str, np.ndarray | None] = field(default_factory=dict, repr=False)
 
     @property
-    def shot(self) -> Shot:
-        """Files, pose and camera of the frame, the pose in the frame's world."""
-        pose = self._shot.camera_to_world.copy()
-        pose[:3, 3] *= self._scale
-        return replace(self._shot, camera_to_world=pose)
+    def camera_to_world(self) -> Float[np.ndarray, "4 4"]:
+        """Pose of the shot in the world of the maps, OpenCV axes."""
+        pose = self.shot.camera_to_world.copy()
+        pose[:3, 3] *= self.scale
+        return pose
 
-    def scaled(self, factor: float) -> Frame:
-        """See :class:`Frame`."""
-        frame, sparse = copy(self), self.sparse_depth
-        changes: dict[str, Any] = {"camera": self.camera.scaled(factor), "_scale": factor * self._scale}
-        changes["sparse_depth"] = None if sparse is None else sparse.scaled(factor)
-        for name, value in changes.items():
-            object.__setattr__(frame, name, value)
-        return frame
+    def scaled(self, factor: float) -> StoredPixels:
+        """See :class:`PixelSource`."""
+        return replace(self, scale=factor * self.scale)
 
-    @property
-    def image(self) -> UInt8[Tensor, "H W 3"]:
-        """See :class:`Frame`."""
-        return cast(Tensor, self._tensor("image"))
-
-    @property
-    def depth(self) -> Float[Tensor, "H W"] | None:
-        """See :class:`Frame`; decoded each time."""
-        stored, form = self._stored("depth"), self._shot.depth_format
-        if stored is None or form is None:
+    def read(self, name: str) -> Tensor | None:
+        """See :class:`PixelSource`; depth and its confidence are decoded each time."""
+        stored = self._stored("depth" if name == "depth_at_least" else name)
+        if stored is None:
             return None
-        depth = form.z_depth(stored) * np.float32(self._scale)
-        if ((depth <= 0.0) | (depth > bounds.LENGTH)).any():  # NaN is unknown
+        values, schema = self._decoded(name, stored), PIXEL_MAPS[name]
+        if schema.is_length and values is not None and ((values <= 0.0) | (values > schema.high)).any():  # not of NaN
             raise InputError(
-                f"{self._shot.depth}: depth reaches from {np.nanmin(depth):g} to {np.nanmax(depth):g} scene units",
-                f"above 0, and at most {bounds.LENGTH:g}",
+                f"{self.shot.depth}: depth reaches from {np.nanmin(values):g} to {np.nanmax(values):g} scene units",
+                f"above 0, and at most {schema.high:g}",
                 "Correct the scale of depth",
             )
-        return torch.from_numpy(depth)
+        return None if values is None else torch.from_numpy(values)
 
-    @property
-    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
-        """See :class:`Frame`; decoded each time."""
-        stored, form = self._stored("depth"), self._shot.depth_format
-        bound = None if stored is None or form is None else form.clipped_at(stored)
-        return None if bound is None else torch.from_numpy(bound * np.float32(self._scale))
+    def read_all(self) -> dict[str, Tensor]:
+        """See :class:`PixelSource`."""
+        return super().read_all() if self.keep else replace(self, keep=True, _cache={}).read_all()
 
-    @property
-    def mask(self) -> Bool[Tensor, "H W"] | None:
-        """See :class:`Frame`."""
-        return self._tensor("mask")
+    def preload(self) -> None:
+        """Fill the cache."""
+        for name in _READERS:
+            self._stored(name)
 
-    @property
-    def valid(self) -> Bool[Tensor, "H W"]:
-        """See :class:`Frame`."""
-        mask = self.mask
-        return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool) if mask is None else mask
+    def _decoded(self, name: str, stored: Shaped[np.ndarray, "H W ..."]) -> Shaped[np.ndarray, "H W ..."] | None:
+        form = self.shot.depth_format
+        if name == "depth" and form is not None:
+            return form.z_depth(stored) * np.float32(self.scale)
+        if name == "depth_at_least" and form is not None:
+            bound = form.clipped_at(stored)
+            return None if bound is None else bound * np.float32(self.scale)
+        return stored.astype(np.float32) / np.float32(255.0) if name == "depth_confidence" else stored
 
-    @property
-    def seen(self) -> Bool[Tensor, "H W"] | None:
-        """See :class:`Frame`."""
-        return self._tensor("seen")
-
-    @property
-    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
-        """See :class:`Frame`; 8-bit values in [0, 1], decoded each time."""
-        stored = self._stored("confidence")
-        return None if stored is None else torch.from_numpy(stored.astype(np.float32) / np.float32(255.0))
-
-    def to(self, device: torch.device | str) -> Frame:
-        """Decoded frame on a device; files are read once."""
-        frame = self if self._kept is not None else StoredFrame(self._shot, self.index).scaled(self._scale)
-        parts = ("image", "depth", "mask", "seen", "depth_at_least", "depth_confidence")
-        tensors = {part: getattr(frame, part) for part in parts}
-        return Frame(self.name, self.index, camera=self.camera, sparse_depth=self.sparse_depth, **tensors).to(device)
-
-    def read(self) -> None:
-        """Read all files, and keep what is in them if the frame keeps anything."""
-        for part in _READERS:
-            self._stored(part)
-
-    def __repr__(self) -> str:
-        return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"
-
-    def _stored(self, part: str) -> Shaped[np.ndarray, "H W ..."] | None:
-        """A part of the working size, in the stored data type."""
-        if self._kept is None:
-            return _READERS[part](self)
+    def _stored(self, name: str) -> Shaped[np.ndarray, "H W ..."] | None:
+        """A map at the working size, in the stored data type."""
+        if not self.keep:
+            return _READERS[name](self)
         # If two threads read at the same time, the second overwrites the cache with equal data.
-        if part not in self._kept:
-            self._kept[part] = _READERS[part](self)
-        return self._kept[part]
-
-    def _tensor(self, part: str) -> Tensor | None:
-        stored = self._stored(part)
-        return None if stored is None else torch.from_numpy(stored)
-
-    _shot: Shot
-    _kept: dict[str, np.ndarray | None] | None  # by part; None if nothing is kept
-    _scale: float  # of the frame's lengths, relative to those of the shot
+        if name not in self._cache:
+            self._cache[name] = _READERS[name](self)
+        return self._cache[name]
 
 
-def _image(frame: StoredFrame) -> UInt8[np.ndarray, "H W 3"]:
-    shot = frame._shot
+def _image(pixels: StoredPixels) -> UInt8[np.ndarray, "H W 3"]:
+    shot = pixels.shot
     return shot.rectification.image(shot.rectification.checked(shot.image, read_rgb(shot.image)))
 
 
-def _mask(frame: StoredFrame) -> Bool[np.ndarray, "H W"] | None:
-    shot, rectification = frame._shot, frame._shot.rectification
-    given = None if shot.mask is None else rectification.sampled(shot.mask, read_mask(shot.mask))
+def _mask(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
+    shot, rectification = pixels.shot, pixels.shot.rectification
+    mask = None if shot.mask is None else rectification.sampled(shot.mask, read_mask(shot.mask))
     shown = shot.shown()
     if shown is not None:  # working pixels that mix in the colour of a hidden one are hidden, too
         shown = rectification.image(shown.astype(np.uint8) * 255) == 255
-    return all_of(rectification.valid, given, shown)
+    return all_of(rectification.valid, mask, shown)
 
 
-def _depth(frame: StoredFrame) -> Shaped[np.ndarray, "H W"] | None:
-    shot = frame._shot
+def _depth(pixels: StoredPixels) -> Shaped[np.ndarray, "H W"] | None:
+    shot = pixels.shot
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), frame._stored("mask")
+    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), pixels._stored("mask")
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 
-def _seen(frame: StoredFrame) -> Bool[np.ndarray, "H W"] | None:
-    shot = frame._shot
+def _seen(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
+    shot = pixels.shot
     return None if shot.seen is None else shot.rectification.sampled(shot.seen, read_mask(shot.seen))
 
 
-def _confidence(frame: StoredFrame) -> UInt8[np.ndarray, "H W"] | None:
-    shot = frame._shot
+def _confidence(pixels: StoredPixels) -> UInt8[np.ndarray, "H W"] | None:
+    shot = pixels.shot
     if shot.confidence is None:
         return None
     stored = read_gray(shot.confidence, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
     return shot.rectification.sampled(shot.confidence, stored)
 
 
-_READERS: dict[str, Callable[[StoredFrame], np.ndarray | None]] = {
+#: Readers of the maps that files hold, by name.
+_READERS: Mapping[str, Callable[[StoredPixels], np.ndarray | None]] = {
     "image": _image,
     "depth": _depth,
     "mask": _mask,
     "seen": _seen,
-    "confidence": _confidence,
+    "depth_confidence": _confidence,
 }

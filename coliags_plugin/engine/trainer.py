@@ -303,8 +303,7 @@ class Trainer:
 
 def _size(frame: Frame) -> int:
     """Bytes of a frame's pixels."""
-    kept = (frame.image, frame.depth, frame.depth_at_least, frame.mask, frame.seen, frame.depth_confidence)
-    return sum(tensor.nbytes for tensor in kept if tensor is not None)
+    return sum(tensor.nbytes for tensor in frame.source.read_all().values())
 
 
 def _check_finite(sums: dict[str, float], terms: dict[str, float], step: int, frame: str) -> None:

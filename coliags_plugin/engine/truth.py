@@ -55,7 +55,7 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     sets = {"test": [found[frame.name] for frame in own.test_sets.get("test", [])]}
     sets |= {name: frames for name, frames in other.test_sets.items() if name != "test"}
     if not same_split:  # seen masks tell what the other scene's training frames show
-        sets = {name: [replace(frame.to("cpu"), seen=None) for frame in frames] for name, frames in sets.items()}
+        sets = {name: [frame.with_maps(seen=None) for frame in frames] for name, frames in sets.items()}
     split = (other if same_split else own).provenance.split
     provenance = other.provenance.model_copy(update={"split": split})
     held_out = {name: frames for name, frames in sets.items() if frames}

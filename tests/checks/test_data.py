@@ -54,10 +54,11 @@ def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Sce
             frame.camera if pose is None else replace(frame.camera, camera_to_world=pose(frame.camera.camera_to_world))
         )
         return replace(
-            frame,
+            frame.with_maps(
+                depth=frame.depth if depth is None else depth(frame.depth),
+                image=frame.image if image is None else image(frame.image, frame.index),
+            ),
             camera=own if camera is None else camera(own),
-            depth=frame.depth if depth is None else depth(frame.depth),
-            image=frame.image if image is None else image(frame.image, frame.index),
         )
 
     return each(scene, of)
@@ -124,7 +125,7 @@ def estimate(scene):
         depth = frame.depth * (1.0 + 0.03 * torch.randn(frame.depth.shape, generator=generator))
         confidence = torch.full_like(depth, 0.9)
         depth[:80, :100], confidence[:80, :100] = 7.0, 0.3
-        return replace(frame, depth=depth, depth_confidence=confidence)
+        return frame.with_maps(depth=depth, depth_confidence=confidence)
 
     return each(scene, of)
 
@@ -135,7 +136,7 @@ def test_estimated_depth_is_judged_where_it_is_confident(estimate):
     assert check.findings == []
     assert 0.02 < check.agreement["given"].depth_error < 0.04
     assert "confidence of 0.8 or more" in page_text(check_page(check))
-    true = each(estimate, lambda frame: replace(frame, depth_confidence=None))
+    true = each(estimate, lambda frame: frame.with_maps(depth_confidence=None))
     assert "frames do not agree on the surface" in whats(true)
 
 
@@ -161,7 +162,7 @@ def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
 
 @pytest.mark.thorough
 def test_depth_that_is_not_confident_anywhere_leaves_poses_to_the_images(estimate):
-    check = check_scene(each(estimate, lambda frame: replace(frame, depth_confidence=0.0 * frame.depth_confidence)))
+    check = check_scene(each(estimate, lambda frame: frame.with_maps(depth_confidence=0.0 * frame.depth_confidence)))
     assert (check.findings, check.agreement, check.matched_by) == ([], {}, "features")
 
 
@@ -178,7 +179,7 @@ def test_everything_in_metres(scene):
 
 
 def test_depth_of_other_frames(frames):
-    mixed = [replace(frame, depth=frames[7 * frame.index % len(frames)].depth) for frame in frames]
+    mixed = [frame.with_maps(depth=frames[7 * frame.index % len(frames)].depth) for frame in frames]
     assert "frames do not agree on the surface" in whats(Scene("mixed", mixed, {}, PointCloud(torch.zeros(0, 3))))
 
 
@@ -227,7 +228,7 @@ def test_carrying_a_plane_is_exact(tmp_path):
         pose = torch.eye(4, dtype=torch.float64)
         pose[2, 3] = z
         camera, image = Camera(60.0, 60.0, 40.0, 30.0, 80, 60, pose), torch.full((60, 80, 3), 90, dtype=torch.uint8)
-        frames.append(Frame(f"{index:04d}", index, image, camera, torch.full((60, 80), 20.0 - z)))
+        frames.append(Frame.of(f"{index:04d}", index, image, camera, torch.full((60, 80), 20.0 - z)))
     write_frames(tmp_path / "plane", frames)
     plane = C3VDDataManager(C3VDSettings(split="all-train")).load(tmp_path / "plane")
     pairs = [Pair(a, b) for a, b in video_pairs(plane.train)]
@@ -249,7 +250,7 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
         noise = torch.from_numpy(rng.integers(0, 2, frame.image.shape, dtype=np.uint8))
         camera = replace(frame.camera, camera_to_world=pose)
         name, index, image = f"{len(video):04d}", len(video), frame.image + noise
-        video.append(replace(frame, name=name, index=index, camera=camera, depth=None, image=image))
+        video.append(replace(frame.with_maps(depth=None, image=image), name=name, index=index, camera=camera))
     return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)))
 
 
@@ -284,7 +285,7 @@ def test_a_camera_that_hardly_moves_is_undecided(frames):
 def lit(frames: list[Frame]) -> list[Frame]:
     """The frames under a lamp at the camera: brightness falls with the square of the depth."""
     factors = [(18.0 / frame.depth.clamp(min=18.0)).square()[..., None] for frame in frames]
-    return [replace(frame, image=(frame.image * factor).byte()) for frame, factor in zip(frames, factors, strict=True)]
+    return [frame.with_maps(image=(frame.image * factor).byte()) for frame, factor in zip(frames, factors, strict=True)]
 
 
 @pytest.mark.thorough
@@ -295,10 +296,10 @@ def test_reversed_depth_contradicts_the_lamp(frames):
     def only_points(frame):
         pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(frame.index)) * torch.tensor([160, 128])
         column, row = pixels.long().unbind(1)
-        return replace(frame, depth=None, sparse_depth=SparseDepth(pixels, frame.depth[row, column]))
+        return replace(frame.with_maps(depth=None), sparse_depth=SparseDepth(pixels, frame.depth[row, column]))
 
     sound = lit(frames)
-    reverse = [replace(frame, depth=600.0 / frame.depth) for frame in sound]
+    reverse = [frame.with_maps(depth=600.0 / frame.depth) for frame in sound]
     assert lamp_facts(sound)["correlation"] < -0.5
     assert lamp_facts(reverse)["correlation"] > 0.5
     assert lamp_facts([only_points(frame) for frame in sound])["correlation"] < -0.5
@@ -307,7 +308,7 @@ def test_reversed_depth_contradicts_the_lamp(frames):
     assert "rank correlation -" in page_text(check_page(check))
     assert "the far is brighter" in whats(scene_of(reverse))
     assert "the far is brighter" in whats(scene_of([only_points(frame) for frame in reverse]))
-    assert lamp_facts([replace(frame, depth=None) for frame in sound]) is None
+    assert lamp_facts([frame.with_maps(depth=None) for frame in sound]) is None
 
 
 def test_the_moving_step_leaves_out_pauses_and_jumps():

@@ -31,7 +31,7 @@ def gained(gains, every=5, **options):
     """The wall, lit by a lamp at the camera, with the images of the training frames multiplied by gains."""
     scene = wall(every, width=64, height=48, **options)
     train = [
-        replace(frame, image=(frame.rgb * gain * 255).round().to(torch.uint8))
+        frame.with_maps(image=(frame.rgb * gain * 255).round().to(torch.uint8))
         for frame, gain in zip(scene.train, gains, strict=True)
     ]
     return replace(scene, train=train)
@@ -48,17 +48,17 @@ def test_wrong_depth_and_masked_or_clipped_pixels_do_not_count():
     image[20:30] = 255
     depth = spoilt[2].depth.clone()
     depth[30:36], image[30:36] = 11.0, 90
-    spoilt[2] = replace(spoilt[2], image=image, mask=mask, depth=depth)
+    spoilt[2] = spoilt[2].with_maps(image=image, mask=mask, depth=depth)
     found = fit_light(replace(scene, train=spoilt)).log_gains
     torch.testing.assert_close(found, GAINS.log() - GAINS.log().mean(), atol=0.015, rtol=0.0)
 
 
 def test_frames_that_show_nothing_known():
     scene = gained(GAINS, every=12)
-    black = replace(scene.train[3], image=torch.zeros_like(scene.train[3].image))
+    black = scene.train[3].with_maps(image=torch.zeros_like(scene.train[3].image))
     found = fit_light(replace(scene, train=[*scene.train[:3], black, *scene.train[4:]])).log_gains
     assert found.isfinite().all() and found.abs().max() < 1.0
-    hidden = [replace(frame, mask=torch.zeros(48, 64, dtype=torch.bool)) for frame in scene.train]
+    hidden = [frame.with_maps(mask=torch.zeros(48, 64, dtype=torch.bool)) for frame in scene.train]
     found = fit_light(replace(scene, train=hidden))
     assert found.log_gains.tolist() == [0.0] * 7 and found.cosine_exponents.tolist() == [0.0] * 3
 
@@ -67,12 +67,12 @@ def test_masked_pixels_have_no_influence_to_the_bit():
     scene = gained(GAINS, every=12)
     mask = torch.ones(48, 64, dtype=torch.bool)
     mask[10:30, 5:40] = False
-    masked = [replace(frame, mask=mask) for frame in scene.train]
+    masked = [frame.with_maps(mask=mask) for frame in scene.train]
     painted = []
     for frame in masked:
         image, depth = frame.image.clone(), frame.depth.clone()
         image[~mask], depth[~mask] = 200, torch.nan
-        painted.append(replace(frame, image=image, depth=depth))
+        painted.append(frame.with_maps(image=image, depth=depth))
     first, second = (fit_light(replace(scene, train=frames)) for frames in (masked, painted))
     assert torch.equal(first.log_gains, second.log_gains)
     assert torch.equal(first.cosine_exponents, second.cosine_exponents)
@@ -121,7 +121,7 @@ def lit_wall(offset, frames=24):
         light = (lengths / 14.0) ** (-2 / 2.2) * (rays[..., 2:] / lengths) ** exponents["cosine"]
         rgb = 0.6 * gain * wall_color(points) * light * facing ** exponents["incidence"]
         image = (rgb.clamp(0.0, 1.0) * 255).round().to(torch.uint8)
-        train.append(Frame(f"{index:04d}", index, image, camera, depth.float()))
+        train.append(Frame.of(f"{index:04d}", index, image, camera, depth.float()))
     return replace(scene, train=train), gains.log() - gains.log().mean()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -91,13 +90,13 @@ def test_targets_have_the_confidence_of_their_pixels():
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (5, 6, 3), generator=generator, dtype=torch.uint8)
     depth, confidence = torch.rand(2, 5, 6, generator=generator)
-    frame = Frame("0001", 1, image, camera_at(0.0, 0.0, 0.0, 6, 5), 20 + depth, depth_confidence=confidence)
+    frame = Frame.of("0001", 1, image, camera_at(0.0, 0.0, 0.0, 6, 5), 20 + depth, depth_confidence=confidence)
     pixels = torch.tensor([[0, 0], [5, 4]])
     target, expected = frame.target_at(pixels), confidence[pixels[:, 1], pixels[:, 0]][:, None]
     assert torch.equal(target.depth_confidence, expected)
     assert torch.equal(frame.to("cpu").target_at(pixels).depth_confidence, expected)
     # True depth is trusted beside estimates.
-    true = replace(frame, depth_confidence=None).target_at(pixels)
+    true = frame.with_maps(depth_confidence=None).target_at(pixels)
     both = concatenate_targets([target, true])
     assert torch.equal(both.depth_confidence, torch.cat([expected, torch.ones(2, 1)]))
     assert concatenate_targets([true, true]).depth_confidence is None

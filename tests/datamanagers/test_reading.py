@@ -274,7 +274,7 @@ def frame(depth, index=0, mask=None):
     c2w[:3, 3] = torch.tensor([5.0, -3.0, float(index)])
     camera = Camera(9.0, 7.0, 2.25, 4.5, width, height, c2w)
     image = torch.arange(height * width * 3).remainder(256).to(torch.uint8).reshape(height, width, 3)
-    return Frame(f"{index:04d}", index, image, camera, torch.as_tensor(depth, dtype=torch.float32), mask)
+    return Frame.of(f"{index:04d}", index, image, camera, torch.as_tensor(depth, dtype=torch.float32), mask)
 
 
 def read_points(path, count, generator):

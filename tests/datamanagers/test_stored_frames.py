@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, PixelTensors
 from coliags_plugin.datamanagers import recording
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.reading.images import DepthSteps
-from coliags_plugin.datamanagers.recording import StoredFrame
+from coliags_plugin.datamanagers.recording import StoredPixels
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses
 
 
@@ -44,9 +44,11 @@ def reads(monkeypatch):
     return read
 
 
-def frame_of(folder: Path, index: int, keep: bool = True) -> StoredFrame:
-    found = manager("c3vd").open(folder)
-    return StoredFrame(replace(found.shots[index], seen=found.seen["video"].get(index)), index, keep)
+def frame_of(folder: Path, index: int, keep: bool = True) -> Frame:
+    recording = manager("c3vd").open(folder)
+    shot = replace(recording.shots[index], seen=recording.seen["video"].get(index))
+    camera = shot.rectification.camera(shot.camera_to_world)
+    return Frame(shot.name, index, StoredPixels(shot, keep), camera)
 
 
 load = partial(load_scene, "c3vd")
@@ -54,8 +56,8 @@ load = partial(load_scene, "c3vd")
 
 def test_a_frame_reads_nothing_until_asked_and_then_once(folder, reads):
     frame = frame_of(folder, 3)
-    assert (frame.name, frame.camera.width) == ("0003_color", WIDTH) and "0003_color.png" in repr(frame)
-    pose = frame.scaled(2.0).shot.camera_to_world
+    assert (frame.name, frame.camera.width) == ("0003_color", WIDTH)
+    pose = frame.scaled(2.0).source.camera_to_world
     np.testing.assert_allclose(pose[:3, 3], 2.0 * poses(FRAMES)[3][:3, 3], rtol=1e-6)
     assert reads == []
     for _ in range(3):
@@ -95,7 +97,7 @@ def test_frames_of_a_lens_share_its_mask(walls):
 def test_to_a_device(folder, reads, keep):
     frame = frame_of(folder, 8, keep)
     moved = frame.to("cpu")
-    assert type(moved) is Frame and (moved.name, moved.index) == (frame.name, frame.index)
+    assert type(moved.source) is PixelTensors and (moved.name, moved.index) == (frame.name, frame.index)
     assert sorted(reads) == ["0008_color.png", "0008_depth.png"]
     for part in ("image", "depth", "seen"):
         assert torch.equal(getattr(moved, part), getattr(frame, part))
@@ -109,8 +111,8 @@ def test_to_a_device(folder, reads, keep):
 def test_what_is_kept_is_as_small_as_on_disk_and_goes_with_the_frame(folder):
     frame = frame_of(folder, 8)
     assert frame.depth.dtype == torch.float32
-    frame.read()
-    parts = frame._kept
+    frame.source.preload()
+    parts = frame.source._cache
     assert parts["depth"].dtype == np.uint16 and parts["mask"] is None
     assert sum(parts[name].nbytes for name in ("image", "depth", "seen")) == WIDTH * HEIGHT * (3 + 2 + 1)
     kept = weakref.ref(parts["image"])

@@ -85,7 +85,7 @@ def test_a_loss_may_need_any_attribute_of_a_target(monkeypatch):
     losses, scene = {"l1": L1Loss(L1Loss.Settings(weight=1.0))}, wall_scene()
     with pytest.raises(InputError, match="needs mask, and no training frame"):
         _check_data(scene, losses)
-    train = [replace(frame, mask=frame.valid) for frame in scene.train]
+    train = [frame.with_maps(mask=frame.valid) for frame in scene.train]
     _check_data(replace(scene, train=train), losses)
 
 
@@ -108,7 +108,7 @@ def test_a_term_that_would_never_count_is_refused():
 
 def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     scene, points = wall_scene(), SparseDepth(torch.tensor([[3.5, 2.5]]), torch.tensor([20.0]))
-    bare = [replace(frame, depth=None) for frame in scene.train]
+    bare = [frame.with_maps(depth=None) for frame in scene.train]
     with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth estimate") as caught:
         start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=bare))
     assert "coliags-sparse-depth" not in str(caught.value)
@@ -118,7 +118,7 @@ def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
     assert start(tmp_path / "run", method="coliags-sparse-depth", scene=replace(scene, train=sparse))
     with pytest.raises(InputError, match=r"'depth' needs depth at single points.*losses\.depth=null"):
         start(tmp_path / "run", method="coliags-sparse-depth")
-    estimated = [replace(frame, depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
+    estimated = [frame.with_maps(depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
     for method, warned in (("coliags", True), ("coliags-in-vivo", False), ("scaffold-gs", False)):
         caplog.clear()
         start(tmp_path / "run", method=method, scene=replace(scene, train=estimated))

@@ -48,7 +48,7 @@ def frame(model):
     image = (model.render(camera).rgb.clamp(0, 1) * 255).round().to(torch.uint8)
     mask = torch.ones(52, 64, dtype=torch.bool)
     mask[40:] = False
-    return Frame("0001", 1, torch.where(mask[..., None], image, 0), camera, mask=mask)
+    return Frame.of("0001", 1, torch.where(mask[..., None], image, 0), camera, mask=mask)
 
 
 def errors(camera, other):
@@ -71,7 +71,7 @@ def test_a_known_perturbation_is_undone(model, frame):
 @pytest.mark.thorough
 def test_its_scores_are_better(model, frame):
     scorer = Scorer("paper", ["psnr", "ssim"])
-    darker = replace(frame, image=(frame.image * 0.8).to(torch.uint8))
+    darker = frame.with_maps(image=(frame.image * 0.8).to(torch.uint8))
     wrong = replace(darker, camera=frame.camera.moved(torch.zeros(3), torch.tensor([0.5, 0.0, 0.0]), 40.0))
     given = scorer.score(scorer.compare(model, wrong, torch.device("cpu"))).values
     refined, fitted = (scorer.score(view).values for view in scorer.refined(model, wrong))

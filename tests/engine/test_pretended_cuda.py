@@ -78,7 +78,7 @@ def rich_scene(width=16, height=12):
         mask = torch.ones(frame.image.shape[:2], dtype=torch.bool)
         mask[:5, :4] = False
         points = SparseDepth(torch.tensor([[10.5, 10.5], [12.2, 5.1]]), torch.tensor([19.0, 19.0]))
-        return replace(frame, mask=mask, sparse_depth=points, depth_confidence=torch.ones(mask.shape))
+        return replace(frame.with_maps(mask=mask, depth_confidence=torch.ones(mask.shape)), sparse_depth=points)
 
     scene = wall_scene(width=width, height=height)
     tests = {name: [enriched(frame) for frame in frames] for name, frames in scene.test_sets.items()}

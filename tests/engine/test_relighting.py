@@ -44,7 +44,7 @@ def lit_wall(frames: int = 10) -> Scene:
         density = squared / (math.pi * (cosine**2 * (squared - 1) + 1) ** 2)
         mirrored = F0 * density / (4 * (cosine * (1 - k) + k) ** 2)
         light = arriving * (wall_albedo(points) * (1 - F0) / math.pi + mirrored)
-        made.append(Frame(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
+        made.append(Frame.of(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
     x, y = torch.meshgrid(torch.arange(-22.0, 22, 0.8), torch.arange(-16.0, 16, 0.8), indexing="ij")
     points = torch.stack([x, y, torch.full_like(x, 20.0)], -1).reshape(-1, 3)
     return Scene("lit", made, {"test": made[:1]}, PointCloud(points), Provenance(fingerprint="lit"))

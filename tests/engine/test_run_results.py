@@ -34,7 +34,7 @@ def scene():
     made = wall_scene()
     left = torch.zeros(24, 32, dtype=torch.bool)
     left[:, :16] = True
-    turned = [replace(frame, name=f"turned-{frame.name}", seen=left) for frame in made.test_sets["test"]]
+    turned = [replace(frame.with_maps(seen=left), name=f"turned-{frame.name}") for frame in made.test_sets["test"]]
     provenance = made.provenance.model_copy(update={"held_out_used": {"points": ["0000"]}})
     return replace(made, test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
 
@@ -178,7 +178,7 @@ def test_another_model_has_other_predictions_and_the_same_truth(loaded, result):
 
 def test_other_truth_has_another_hash(loaded, result, whole, scene):
     frames = scene.test_sets["rotation"]
-    everything = [replace(frame, seen=torch.ones(24, 32, dtype=torch.bool)) for frame in frames]
+    everything = [frame.with_maps(seen=torch.ones(24, 32, dtype=torch.bool)) for frame in frames]
     other = replace(whole, scene=replace(scene, test_sets={"rotation": everything}))
     found = read_result(evaluate(other, "paper") / RESULT_FILE).sets["rotation"]
     assert found.predictions_sha256 == result.sets["rotation"].predictions_sha256

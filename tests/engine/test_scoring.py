@@ -50,7 +50,7 @@ def test_views_that_show_nothing_within_their_masks_are_counted():
     for index, (mask, alpha) in enumerate(views):
         camera = Camera(16.0, 16.0, 8.0, 8.0, 16, 16, torch.eye(4))
         image = torch.zeros(16, 16, 3, dtype=torch.uint8)
-        evaluated.add(Frame(f"{index}", index, image, camera, mask=mask), comparison(), alpha)
+        evaluated.add(Frame.of(f"{index}", index, image, camera, mask=mask), comparison(), alpha)
     record = evaluated.record()
     assert record.blank == 2 and record.transparency_warning.startswith("2 of 5 views show nothing")
 

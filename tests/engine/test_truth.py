@@ -32,7 +32,7 @@ def true():
     made = wall_scene()
     seen = torch.zeros(24, 32, dtype=torch.bool)
     seen[:, :16] = True
-    turned = [replace(frame, name=f"turned-{frame.name}", seen=seen) for frame in made.test_sets["test"]]
+    turned = [replace(frame.with_maps(seen=seen), name=f"turned-{frame.name}") for frame in made.test_sets["test"]]
     provenance = Provenance(fingerprint="true", split=SplitRecord(name="every-8th"))
     return replace(made, name="phantom", test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
 
@@ -42,7 +42,8 @@ def estimated(true):
     def change(frame):
         confidence = torch.full_like(frame.depth, 0.5)
         points = SparseDepth(torch.tensor([[5.5, 5.5], [20.0, 12.0]]), torch.tensor([20.0, 20.0]))
-        return replace(frame, depth=1.03 * frame.depth, depth_confidence=confidence, sparse_depth=points, seen=None)
+        estimate = frame.with_maps(depth=1.03 * frame.depth, depth_confidence=confidence, seen=None)
+        return replace(estimate, sparse_depth=points)
 
     sets = {"test": true.test_sets["test"]}
     own = SplitRecord(name="own")

@@ -114,7 +114,7 @@ def moved(scene, factor, shift):
     def placed(frame):
         pose = frame.camera.camera_to_world.clone()
         pose[:3, 3] = factor * pose[:3, 3] + shift
-        return replace(frame, camera=replace(frame.camera, camera_to_world=pose), depth=frame.depth * factor)
+        return replace(frame.with_maps(depth=frame.depth * factor), camera=replace(frame.camera, camera_to_world=pose))
 
     points = PointCloud(factor * scene.points.positions.double() + shift)
     return replace(scene, train=[placed(frame) for frame in scene.train], points=points)
@@ -248,7 +248,7 @@ def sphere_scene():
         color = torch.where(nearest[..., None] < 1, 0.5 + 0.4 * points, 0.0)
         depth = torch.where(nearest < 1, reach / camera.rays().norm(dim=-1), torch.nan).float()
         image = (255 * color.clamp(0, 1)).round().to(torch.uint8)
-        frames.append(Frame(f"{index:04d}", index, image, camera, depth))
+        frames.append(Frame.of(f"{index:04d}", index, image, camera, depth))
     train, test = [f for f in frames if f.index % 6], [f for f in frames if f.index % 6 == 0]
     points = torch.cat([f.camera.unproject(f.depth.double())[f.depth.isfinite()] for f in train])
     return Scene("ball", train, {"test": test}, PointCloud(points), Provenance(fingerprint="ball"))

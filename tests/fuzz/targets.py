@@ -165,7 +165,7 @@ def _methods(folder: Path) -> None:
 
 def _prior(folder: Path) -> None:
     camera = Camera(50.0, 50.0, 32.0, 25.5, 64, 51, torch.eye(4, dtype=torch.float64))
-    frames = [Frame(f"{index:04d}", index, torch.zeros(51, 64, 3, dtype=torch.uint8), camera) for index in range(3)]
+    frames = [Frame.of(f"{index:04d}", index, torch.zeros(51, 64, 3, dtype=torch.uint8), camera) for index in range(3)]
     known, weight = np.full((51, 64), np.log(30.0), np.float32), np.ones((51, 64), np.float32)
     for part in ("npy", "png"):
         prior = FilePrior.of(folder / part, frames)

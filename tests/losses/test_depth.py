@@ -33,7 +33,7 @@ def case():
     rendered = rendered.requires_grad_()
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_accumulated=rendered, ray_lengths=lengths)
     frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), depth, mask)
-    return output, replace(frame, depth_confidence=confidence), rendered
+    return output, frame.with_maps(depth_confidence=confidence), rendered
 
 
 def penalties(name, output, frame):
@@ -64,11 +64,11 @@ def test_pixels_are_weighted_by_their_confidence(name, case):
     torch.testing.assert_close(found, wanted)
     # Without confidence nothing changes, to the bit.
     expected = masked_mean(penalties(name, output, frame), known)
-    plain, value, found, wanted = compared(replace(frame, depth_confidence=None), expected)
+    plain, value, found, wanted = compared(frame.with_maps(depth_confidence=None), expected)
     assert plain == value and torch.equal(found, wanted)
-    certain = replace(frame, depth_confidence=torch.ones(HEIGHT, WIDTH))
+    certain = frame.with_maps(depth_confidence=torch.ones(HEIGHT, WIDTH))
     assert make(name)(output, certain).item() == pytest.approx(plain, rel=1e-12)
-    nothing = replace(frame, depth_confidence=torch.zeros(HEIGHT, WIDTH))
+    nothing = frame.with_maps(depth_confidence=torch.zeros(HEIGHT, WIDTH))
     term, _, found, _ = compared(nothing, 0.0 * rendered.sum())
     assert term == 0.0 and not found.any()
 
@@ -88,7 +88,7 @@ def test_it_is_hubers_loss_of_the_relative_error(case, floor):
     assert term.item() == pytest.approx(expected.item(), rel=1e-12)
     (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
     torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], wanted)
-    plain, sure = (replace(frame, depth_confidence=each) for each in (None, torch.ones(HEIGHT, WIDTH)))
+    plain, sure = (frame.with_maps(depth_confidence=each) for each in (None, torch.ones(HEIGHT, WIDTH)))
     certain = make("estimated-depth")(output, sure).item()
     assert make("estimated-depth")(output, plain).item() == pytest.approx(certain, rel=1e-12)
 

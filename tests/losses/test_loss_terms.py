@@ -80,9 +80,9 @@ def evaluate(model):
         rows = {name: values.to(dtype).requires_grad_() for name, values in rows.items()}
         image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8)
         points = SparseDepth(torch.rand(400, 2, generator=generator) * HEIGHT, torch.rand(400, generator=generator) + 1)
-        frame = make_frame(image, pixels("depth").detach() + 1, mask)
-        known = {"depth": frame.depth, "sparse_depth": points}
-        frame = replace(frame, **{key: value if key in loss.needs else None for key, value in known.items()})
+        depth = pixels("depth").detach() + 1 if "depth" in loss.needs else None
+        frame = make_frame(image, depth, mask)
+        frame = replace(frame, sparse_depth=points) if "sparse_depth" in loss.needs else frame
         output = make_output(scales=rows.pop("scales"), **drawn)
         splats = replace(output.splats, gaussians=replace(output.splats.gaussians, features=rows))
         output = replace(output, camera=frame.camera, splats=splats)

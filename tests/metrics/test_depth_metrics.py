@@ -157,7 +157,7 @@ def test_a_protocol_interpolates_at_usable_points(frame, output):
     known = torch.tensor([20.75 / 1.1, 23.5 / 0.8, 27.0, 20.0, 0.0])  # errors of 10 %, 20 %, 0; ignored; no surface
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[0, 0] = False
-    at = replace(frame, mask=mask, sparse_depth=SparseDepth(pixels, known))
+    at = replace(frame.with_maps(mask=mask), sparse_depth=SparseDepth(pixels, known))
     comparison = registry.protocols.get("paper")().compare(output, at)
     torch.testing.assert_close(comparison.point_depth, torch.tensor([20.75, 23.5, 27.0]))
     scores = Scorer("paper").score(comparison)
@@ -179,7 +179,7 @@ def test_without_points_or_without_anything_drawn_it_is_unavailable(frame, outpu
 @pytest.mark.parametrize("name", ["paper", "authors-code"])
 def test_estimated_depth_is_no_truth(name, frame, output):
     depth = torch.full((HEIGHT, WIDTH), 21.0)
-    estimated = replace(frame, depth=depth, depth_confidence=torch.ones(HEIGHT, WIDTH))
+    estimated = frame.with_maps(depth=depth, depth_confidence=torch.ones(HEIGHT, WIDTH))
     comparison = registry.protocols.get(name)().compare(output, estimated)
     assert comparison.estimated
     assert comparison.depth is comparison.true_depth is comparison.depth_valid is None
@@ -187,5 +187,5 @@ def test_estimated_depth_is_no_truth(name, frame, output):
         make("depth_mse")(comparison)
     assert (
         "depth_mse"
-        in Scorer(name).score(registry.protocols.get(name)().compare(output, replace(frame, depth=depth))).values
+        in Scorer(name).score(registry.protocols.get(name)().compare(output, frame.with_maps(depth=depth))).values
     )

@@ -77,7 +77,7 @@ def test_each_kind_of_depth_has_its_protocol(name, kind, scene):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_frame_without_depth_has_images_only(name, scene):
     output, frame = scene
-    comparison = protocol(name).compare(output, replace(frame, depth=None))
+    comparison = protocol(name).compare(output, frame.with_maps(depth=None))
     assert comparison.depth is comparison.true_depth is comparison.depth_valid is None
     assert score(name, "psnr", comparison) > 0
     with pytest.raises(UnavailableError, match="no ground-truth depth"):
@@ -92,7 +92,7 @@ def test_paper_compares_floats_where_truth_is_known(scene):
     comparison = protocol("paper").compare(output, frame)
     assert torch.equal(comparison.rgb, output.rgb.detach())
     assert torch.equal(comparison.valid, frame.mask)
-    assert protocol("paper").compare(output, replace(frame, mask=None)).valid.all()
+    assert protocol("paper").compare(output, frame.with_maps(mask=None)).valid.all()
     assert torch.equal(comparison.depth, output["depth_accumulated"])
     assert (~comparison.depth_valid).nonzero().tolist() == [[2, 3], [5, 6]]
     assert score("paper", "depth_mse", comparison) == 1.0
@@ -128,7 +128,7 @@ def test_authors_code_scores_clipped_depth_against_the_sensors_limit(scene):
     output, frame = scene
     bound = torch.full((HEIGHT, WIDTH), torch.nan)
     bound[2, 3] = 100.0
-    comparison = protocol("authors-code").compare(output, replace(frame, depth_at_least=bound))
+    comparison = protocol("authors-code").compare(output, frame.with_maps(depth_at_least=bound))
     assert comparison.true_depth[2, 3] == 100.0
     assert comparison.true_depth[0, 0] == pytest.approx(20.0, abs=0.0016)
 
@@ -158,7 +158,7 @@ def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(scene):
 
 def test_authors_code_wraps_surfaces_beyond_150_mm_and_true_depth_beyond_100_mm(scene):
     _, frame = scene
-    frame = replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
+    frame = frame.with_maps(depth=torch.full((HEIGHT, WIDTH), 101.0))
     far = torch.full((HEIGHT, WIDTH), 1 / 160.0)
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=far)
     comparison = protocol("authors-code").compare(output, frame)

@@ -110,7 +110,7 @@ def test_known_gains_are_found(tmp_path):
     scene = wall_scene(frames=10, width=48, height=36, lamp=False)
     gains = torch.exp(torch.rand(len(scene.train), generator=generator) * 0.4 - 0.3)
     train = [
-        replace(frame, image=(frame.rgb * gain * 255).round().to(torch.uint8))
+        frame.with_maps(image=(frame.rgb * gain * 255).round().to(torch.uint8))
         for frame, gain in zip(scene.train, gains, strict=True)
     ]
     overrides = ["schedule.steps=400", "datamanager.points_count=1000", "strategy=none", "field.sh_degree=0"]
@@ -131,7 +131,8 @@ def rendering(level):
 
 def with_depths(scene, depths):
     """The scene with one depth throughout each training frame."""
-    train = [replace(frame, depth=torch.full((24, 32), float(z))) for frame, z in zip(scene.train, depths, strict=True)]
+    pairs = zip(scene.train, depths, strict=True)
+    train = [frame.with_maps(depth=torch.full((24, 32), float(z))) for frame, z in pairs]
     return replace(scene, train=train)
 
 
@@ -175,7 +176,7 @@ def fitted_response(answer, noise, kind, gap, seed):
     gains = answer * brightness + error
     rendered = brightness + (-error if kind == "opposite" else rng.normal(0.0, noise, 120))
     scene = wall_scene(1)
-    frame = replace(scene.test_sets["test"][0], mask=None)
+    frame = scene.test_sets["test"][0].with_maps(mask=None)
     frames = [replace(frame, name=f"{index:04d}", index=index) for index in time]
     module = make(
         scene=with_depths(replace(scene, train=frames, test_sets={}), 20.0 * np.exp(-near)), untrained="metered"
@@ -197,7 +198,7 @@ def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer
 def test_depth_that_tells_nothing_of_the_brightness_gives_no_response():
     module, scene, _ = exposed()
     depths = np.full(len(scene.train), 20.0), np.random.default_rng(0).uniform(10.0, 30.0, len(scene.train))
-    bare = replace(scene, train=[replace(frame, depth=None) for frame in scene.train])
+    bare = replace(scene, train=[frame.with_maps(depth=None) for frame in scene.train])
     for other in (*(with_depths(scene, each) for each in depths), bare):
         metered = make(scene=other, untrained="metered")
         metered.metering.brightness.copy_(module.metering.brightness)

@@ -23,7 +23,7 @@ def pose(yaw=0.3):
 def view(camera, depth, rgb_error=0.1, depth_error=2.0, mask=None, depth_valid=None):
     """A frame of this true depth and its rendering with these errors."""
     image = torch.full((camera.height, camera.width, 3), 100, dtype=torch.uint8)
-    frame = Frame("f", 0, image, camera, depth, mask)
+    frame = Frame.of("f", 0, image, camera, depth, mask)
     known = torch.isfinite(depth) if depth_valid is None else depth_valid
     compared = Comparison(
         frame.rgb + rgb_error, frame.rgb, frame.valid, depth + depth_error, depth, known & frame.valid
@@ -120,5 +120,5 @@ def test_a_depth_that_is_not_finite_leaves_its_bin_without_a_value():
 
 
 def test_without_true_depth_there_is_no_profile():
-    frame = Frame("f", 0, torch.zeros(1, 1, 3, dtype=torch.uint8), Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose()))
+    frame = Frame.of("f", 0, torch.zeros(1, 1, 3, dtype=torch.uint8), Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose()))
     assert profiles((Comparison(frame.rgb, frame.rgb, frame.valid), frame)) == profiles() == {}

@@ -22,7 +22,7 @@ from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.reading.images import all_of, read_mask
-from coliags_plugin.datamanagers.recording import StoredFrame
+from coliags_plugin.datamanagers.recording import StoredPixels
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
@@ -146,15 +146,16 @@ def recorded_views(scene: Scene) -> list[CoverageView]:
 
 
 def _view(frame: Frame) -> CoverageView:
-    if not isinstance(frame, StoredFrame):
+    stored = frame.source
+    if not isinstance(stored, StoredPixels):
         camera = frame.camera
         mask = None if frame.mask is None else frame.mask.numpy()
         pose = camera.camera_to_world.double().numpy()
         return CoverageView(frame.name, pose, PinholeLens.of(camera.intrinsics), mask, frame.image.numpy)
-    shot, rectification = frame.shot, frame.shot.rectification
+    shot, rectification = stored.shot, stored.shot.rectification
     mask = None if shot.mask is None else rectification.checked(shot.mask, read_mask(shot.mask))
     content = all_of(rectification.stored_content, mask, shot.shown())
-    pose = np.asarray(shot.camera_to_world, np.float64)
+    pose = np.asarray(stored.camera_to_world, np.float64)
     return CoverageView(
         shot.name,
         pose,

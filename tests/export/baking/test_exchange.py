@@ -119,7 +119,7 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatc
     for index, frame in enumerate(frames):
         rgb = render_view(trained, frame, ("rgb", "alpha")).rgb
         image = (255.0 * rgb.detach()).round().to(torch.uint8)
-        frames[index] = Frame(name=frame.name, index=frame.index, camera=frame.camera, image=image)
+        frames[index] = Frame.of(name=frame.name, index=frame.index, camera=frame.camera, image=image)
     monkeypatch.setattr(distillation, "STEPS", 60)
     between, made = [], []
     for kind in (ExplicitGaussians, AttenuatedGaussians):

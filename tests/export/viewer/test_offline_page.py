@@ -37,7 +37,7 @@ def frame(index, turn=(0.0, 0.0, 0.0), center=(0.0, 0.0, -20.0)):
     pose[:3, 3] = torch.tensor(center)
     camera = Camera(120.0, 118.0, 66.0, 50.0, 128, 96, pose)
     image = torch.full((96, 128, 3), 40 * index, dtype=torch.uint8)
-    return Frame(name=f"f{index}", index=index, camera=camera, image=image)
+    return Frame.of(name=f"f{index}", index=index, camera=camera, image=image)
 
 
 FRAMES = [frame(0), frame(1, (0.3, -0.2, 0.1), (4.0, 2.0, -18.0)), frame(2, (-0.2, 0.4, 0.5), (-6.0, 1.0, -16.0))]

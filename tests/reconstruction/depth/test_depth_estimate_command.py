@@ -286,7 +286,7 @@ def noisy(frames, level, seed=0):
     def noise():
         return torch.from_numpy(np.clip(rng.normal(level, 1.5, size), 0, 255).astype(np.uint8))
 
-    return [dataclasses.replace(frame, image=noise()) for frame in frames]
+    return [frame.with_maps(image=noise()) for frame in frames]
 
 
 @pytest.mark.parametrize("level", [2, pytest.param(90, marks=pytest.mark.thorough)])

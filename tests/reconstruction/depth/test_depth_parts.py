@@ -73,7 +73,7 @@ def test_given_ranges_and_frames_without_features():
     with pytest.raises(InputError, match="0 < near < far"):
         given_range(0.0, 40.0, 2)
     flat = torch.full((80, 96, 3), 90, dtype=torch.uint8)
-    frames = [dataclasses.replace(frame, image=flat) for frame in wall_frames(sideways(4))]
+    frames = [frame.with_maps(image=flat) for frame in wall_frames(sideways(4))]
     with pytest.raises(InputError, match="the depth range is unknown: 0 points"):
         find_range(frames, FEATURES)
 
@@ -135,7 +135,7 @@ def lit_frame(law=2.0):
     depth = wall_depth(frame.camera)
     linear = 0.9 * (depth.min() / depth) ** law
     image = np.repeat(np.rint(255.0 * linear ** (1 / 2.2)).astype(np.uint8)[..., None], 3, axis=2)
-    return Frame("lit", 0, torch.from_numpy(image), frame.camera), depth
+    return Frame.of("lit", 0, torch.from_numpy(image), frame.camera), depth
 
 
 def test_a_robust_fit_ignores_a_third_of_outliers():

@@ -34,5 +34,5 @@ def wall_frames(poses: np.ndarray) -> list[Frame]:
         camera = Camera(*INTRINSICS, torch.from_numpy(pose))
         points = pose[:3, 3] + wall_depth(camera)[..., None] * camera.rays().numpy()
         image = np.rint(0.5 * texture(points / 2.0) + 40.0).astype(np.uint8)
-        frames.append(Frame(f"{index:04d}", index, torch.from_numpy(image), camera))
+        frames.append(Frame.of(f"{index:04d}", index, torch.from_numpy(image), camera))
     return frames

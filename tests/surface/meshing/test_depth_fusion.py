@@ -85,7 +85,7 @@ def test_what_is_masked_or_clipped_by_the_sensor_is_not_fused(what):
     scene = wall_scene(9, 160, 120)
     left = torch.arange(160).expand(120, 160) < 80
     value = ~left if what == "mask" else torch.where(left, 15.0, torch.nan)
-    spoilt = replace(scene, train=[replace(frame, **{what: value}) for frame in scene.train])
+    spoilt = replace(scene, train=[frame.with_maps(**{what: value}) for frame in scene.train])
     settings = MeshSettings(voxel_size=0.3)
     half, whole = (fuse_run(exact_run(scene=s), settings).mesh.areas.sum() for s in (spoilt, scene))
     assert 0.4 < half / whole < 0.65
@@ -167,7 +167,7 @@ def test_quality_of_views():
     confidence = torch.full((120, 160), 0.5)
     image = frame.image.clone()
     image[60, 80] = 255
-    run = exact_run(scene=replace(scene, train=[replace(frame, image=image, depth_confidence=confidence)] * 2))
+    run = exact_run(scene=replace(scene, train=[frame.with_maps(image=image, depth_confidence=confidence)] * 2))
     view = next(rendered_depth(run, MeshSettings()))
     rays = frame.camera.rays()
     pixel = view.depth.double() / (frame.camera.fx * frame.camera.fy) ** 0.5
@@ -322,5 +322,5 @@ def test_first_hits_are_what_the_views_see():
     inside = ((pixels > 4) & (pixels < torch.tensor([156, 116]))).all(dim=1).numpy()
     outside = ((pixels < -4) | (pixels > torch.tensor([164, 124]))).any(dim=1).numpy()
     assert seen[inside].all() and not seen[outside].any()
-    hidden = replace(frames[0], mask=torch.zeros(120, 160, dtype=torch.bool))
+    hidden = frames[0].with_maps(mask=torch.zeros(120, 160, dtype=torch.bool))
     assert not first_hits(mesh, [hidden]).any()
