@@ -8,12 +8,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_files import BENCHMARKS, is_path, method_folder
-from coliags_plugin.config.yaml_tree import dump_inline, errors_with_origins, read_tree
+from coliags_plugin.config.yaml_tree import at_origins, dump_inline, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.settings import Settings
@@ -40,10 +40,8 @@ def _read_file(name: str, folder: str, content: type[_Settings], noun: str) -> t
         raise InputError(f"no {noun} '{name}'", f"one of {', '.join(files)}, or a YAML file", did_you_mean(name, files))
     path = user_path(name) if is_path(name) else files[name]
     tree = read_tree(path)
-    try:
+    with at_origins(tree, noun):
         return path, content.model_validate(tree.plain())
-    except ValidationError as error:
-        raise InputError("\n".join(errors_with_origins(error, tree, noun))) from error
 
 
 def _known(name: str) -> str:

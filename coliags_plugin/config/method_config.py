@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config import registry
@@ -26,9 +26,9 @@ from coliags_plugin.config.components import (
 from coliags_plugin.config.method_files import is_path, method_files
 from coliags_plugin.config.yaml_tree import (
     Node,
+    at_origins,
     dump,
     dump_inline,
-    errors_with_origins,
     merge,
     override_all,
     read_tree,
@@ -148,10 +148,8 @@ def load_method(method: str, overrides: Iterable[str] = (), data_format: str | N
     tree = method_tree(method, overrides)
     if data_format is not None:
         tree = _with_data_format(tree, data_format)
-    try:
+    with at_origins(tree):
         config = MethodConfig.model_validate(tree.plain())
-    except ValidationError as error:
-        raise InputError("\n".join(errors_with_origins(error, tree))) from error
     return LoadedMethod(method_name(method), config, tree)
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.core.text_files import whole_text
 
 
@@ -207,19 +208,12 @@ def _dumped(plain: object, flow: bool | None, width: float) -> str:
     return text
 
 
-#: Errors of this package, with messages of their own.
-_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
+@contextmanager
+def at_origins(tree: Node, content: str = "config") -> Iterator[None]:
+    """Report what a validation of a tree refuses, line by line, each with where the value was written."""
 
+    def place(path: Sequence[object]) -> str:
+        return f"{tree.find([key for key in path if isinstance(key, str)]).origin}: "
 
-def errors_with_origins(error: ValidationError, tree: Node, what: str = "config") -> list[str]:
-    """One line per problem: where the value was written, its key (``what`` without one), and what is wrong with it."""
-    lines = []
-    for item in error.errors():
-        path = [key for key in item["loc"] if isinstance(key, str)]
-        message = item["msg"].removeprefix("Value error, ")
-        if item["type"] == "missing":
-            message = "is missing"
-        elif item["type"] not in _TELLING:
-            message = f"{message}, got {item['input']!r}"
-        lines.append(f"{tree.find(path).origin}: {'.'.join(path) or what}: {message.strip()}")
-    return lines
+    with invalid_reported(place, content=content):
+        yield

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,16 +60,43 @@ class Settings(BaseModel):
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
 
 
+#: Types of the errors whose messages are this package's own, and say all.
+_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
+
+
 @contextmanager
-def invalid_reported(place: str, expected: str = "", do: str = "") -> Iterator[None]:
-    """Report the first problem that a validation in the block finds as an InputError, ``place`` before its key."""
+def invalid_reported(
+    place: str | Callable[[Sequence[object]], str], expected: str = "", do: str = "", content: str = "content"
+) -> Iterator[None]:
+    """Report what a validation in the block refuses as an InputError.
+
+    Args:
+        place: Text before the key that is wrong, of which the first is reported; or a function from the path of a key
+            to that text, as for configs, of which all are.
+        expected: What would be valid.
+        do: What the user can do.
+        content: What the whole is called, where no key is to blame.
+    """
     try:
         yield
     except ValidationError as error:
-        first = error.errors()[0]
-        key, value = ".".join(map(str, first["loc"])), first["input"]
-        got = "" if isinstance(value, (dict, list, BaseModel)) else f" (got {value!r})"
-        raise InputError(f"{place}{key or 'content'}: {first['msg']}{got}", expected, do) from error
+        items = error.errors()
+        if isinstance(place, str):
+            lines = [f"{place}{_problem(items[0], content)}"]
+        else:
+            lines = [f"{place(item['loc'])}{_problem(item, content)}" for item in items]
+        raise InputError("\n".join(lines), expected, do) from error
+
+
+def _problem(item: Mapping[str, Any], content: str) -> str:
+    """A key and what is wrong with its value."""
+    key, value = ".".join(map(str, item["loc"])), item["input"]
+    message = item["msg"].removeprefix("Value error, ").strip()
+    if item["type"] == "missing":
+        message = "is missing"
+    elif item["type"] not in _TELLING and not isinstance(value, (dict, list, BaseModel)):
+        message = f"{message}, got {value!r}"
+    return f"{key or content}: {message}"
 
 
 def validated(kind: type[Model], values: Mapping[str, object], place: str, do: str = "") -> Model:

@@ -654,7 +654,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         ),
         (
             remove("params.npz"),
-            r"data has no params.npz.*params_file=FILE, or `datamanager.poses=ground-truth`",
+            r"data has no params.npz.*params_file=FILE`, or `datamanager.poses=ground-truth`",
         ),
         (remove("pose.txt"), "rotation has images, but it has no pose.txt|C3VD's release there"),
         (remove("rotation/pose.txt"), "rotation has images, but it has no pose.txt"),
@@ -700,7 +700,7 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
         (lambda folder: (folder / "depths").mkdir(), "holds depth/ and depths/"),
         (
             copy("groundtruth.txt", "slam_poses.txt"),
-            r"has the trajectories groundtruth\.txt, slam_poses\.txt.*--set datamanager\.trajectory=groundtruth\.txt",
+            r"has the trajectories groundtruth\.txt, slam_poses\.txt.*`datamanager\.trajectory=groundtruth\.txt`",
         ),
         (
             lambda folder: (folder / "rgb/1305031102.000000.png").rename(folder / "rgb/0.png"),

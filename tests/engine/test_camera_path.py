@@ -65,7 +65,7 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda path: path.pop("keyframes"), "keyframes: Field required"),
+        (lambda path: path.pop("keyframes"), "keyframes: is missing"),
         (lambda path: path["keyframes"].pop(), "at least 2 items"),
         (lambda path: path.update(seconds=0), "seconds: Input should be greater than 0"),
         (lambda path: path.update(fps=30), "unknown key 'fps'"),

@@ -128,7 +128,9 @@ def test_without_a_connection_all_that_is_missing_is_named(server, cache):
     del server.files["/v0.1/squeeze.pth"]
     with pytest.raises(InputError) as caught:
         install(NETS, None, None)
-    advice = re.search(r"On a machine with a connection download (.*), and pass --from FOLDER", str(caught.value))
+    advice = re.search(
+        r"On a machine with a connection download (.*), and pass `from_folder=FOLDER`", str(caught.value)
+    )
     left = [path for path in EVERYTHING if path != "v0.1/alex.pth"]  # which has come
     assert sorted(advice[1].split(", ")) == sorted(f"{server.url}/{path}" for path in left)
     assert files(cache) == ["v0.1/alex.pth"]

@@ -75,7 +75,7 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
     assert [cell.run is None for cell in study.runs] == [True, False]
     assert [(f.method, f.seed, f.reason) for f in study.missing] == [("2dgs", 0, "no memory"), ("3dgs", 1, None)]
     refuses([folder], "results of protocol paper only", protocol="authors-code")
-    damaged = {"{": "is not JSON", "[]": "valid dictionary", '{"cells": [{}]}': "cells.0.scene: Field required"}
+    damaged = {"{": "is not JSON", "[]": "valid dictionary", '{"cells": [{}]}': "cells.0.scene: is missing"}
     for content, match in damaged.items():
         (folder / "plan.json").write_text(content)
         refuses([folder], f"plan.json.*{match}")
