@@ -7,55 +7,43 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, Union
 
 import tyro
 
 from coliags_plugin._version import __version__
-from coliags_plugin.cli.arguments import Runnable
-from coliags_plugin.cli.comparing import AblateCommand, CompareCommand, ReportCommand, ResultsCommand
-from coliags_plugin.cli.flags import hint, in_flags, translate_for
-from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, DoctorCommand, ListCommand, WeightsCommand
-from coliags_plugin.cli.poses import PosesCommand
-from coliags_plugin.cli.reconstruct import ReconstructCommand
-from coliags_plugin.cli.runs import (
-    CoverageCommand,
-    EvaluateCommand,
-    ExportCommand,
-    ImportCommand,
-    MeshCommand,
-    RenderCommand,
-    TrainCommand,
-    ViewCommand,
-)
-from coliags_plugin.cli.scenes import DataCommand, DepthCommand, PhantomCommand
+from coliags_plugin.cli import comparing, methods, poses, reconstruct, runs, scenes
+from coliags_plugin.cli.arguments import Runnable, hint, in_flags, translate_for
 from coliags_plugin.core.errors import ReportedError
 from coliags_plugin.core.libraries import separate_stderr
 
-Command = (
-    Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
-    | Annotated[PhantomCommand, tyro.conf.subcommand("phantom")]
-    | Annotated[TrainCommand, tyro.conf.subcommand("train")]
-    | Annotated[EvaluateCommand, tyro.conf.subcommand("eval")]
-    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
-    | Annotated[CoverageCommand, tyro.conf.subcommand("coverage")]
-    | Annotated[MeshCommand, tyro.conf.subcommand("mesh")]
-    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
-    | Annotated[ImportCommand, tyro.conf.subcommand("import")]
-    | Annotated[ViewCommand, tyro.conf.subcommand("view")]
-    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
-    | Annotated[AblateCommand, tyro.conf.subcommand("ablate")]
-    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
-    | Annotated[ResultsCommand, tyro.conf.subcommand("results")]
-    | Annotated[PosesCommand, tyro.conf.subcommand("poses")]
-    | Annotated[ListCommand, tyro.conf.subcommand("list")]
-    | Annotated[ConfigCommand, tyro.conf.subcommand("config")]
-    | Annotated[DataCommand, tyro.conf.subcommand("data")]
-    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
-    | Annotated[CheckCommand, tyro.conf.subcommand("check")]
-    | Annotated[WeightsCommand, tyro.conf.subcommand("weights")]
-    | Annotated[DoctorCommand, tyro.conf.subcommand("doctor")]
-)
+#: Commands by their names, in the order of the help.
+COMMANDS: dict[str, type[Runnable]] = {
+    "reconstruct": reconstruct.ReconstructCommand,
+    "phantom": scenes.PhantomCommand,
+    "train": runs.TrainCommand,
+    "eval": runs.EvaluateCommand,
+    "render": runs.RenderCommand,
+    "coverage": runs.CoverageCommand,
+    "mesh": runs.MeshCommand,
+    "export": runs.ExportCommand,
+    "import": runs.ImportCommand,
+    "view": runs.ViewCommand,
+    "compare": comparing.CompareCommand,
+    "ablate": comparing.AblateCommand,
+    "report": comparing.ReportCommand,
+    "results": comparing.ResultsCommand,
+    "poses": poses.PosesCommand,
+    "list": methods.ListCommand,
+    "config": methods.ConfigCommand,
+    "data": scenes.DataCommand,
+    "depth": scenes.DepthCommand,
+    "check": methods.CheckCommand,
+    "weights": methods.WeightsCommand,
+    "doctor": methods.DoctorCommand,
+}
+#: Any of them, for tyro.
+Command: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items())]  # noqa: UP007
 
 #: A word, or the value after ``--option=``, that begins with ``~``. Settings are expanded where they are used.
 _HOME = re.compile(r"((?:--[\w-]+=)?)(~[^=]*)")
@@ -86,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             Command, prog="coliags", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
         )
     except SystemExit as refused:
-        if refused.code == _USAGE_ERROR and (meant := hint(words, Command)):
+        if refused.code == _USAGE_ERROR and (meant := hint(words, COMMANDS)):
             print(f"coliags: {meant}", file=sys.stderr)
         raise
     except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does

@@ -67,7 +67,7 @@ class CompareCommand(ComparisonCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AblateCommand(ComparisonCommand):
+class AblateCommand(ComparisonCommand, options.AblateOptions):
     """Train and evaluate the variants that a file names on scenes; otherwise as compare."""
 
     file: tyro.conf.Positional[str]

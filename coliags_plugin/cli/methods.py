@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.flags import in_flags
+from coliags_plugin.cli.arguments import in_flags
 from coliags_plugin.cli.summaries import print_summary
 from coliags_plugin.config import options
 

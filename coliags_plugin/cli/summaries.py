@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.cli.flags import in_flags
+from coliags_plugin.cli.arguments import in_flags
 
 #: The method for scenes with estimated depth, as `coliags reconstruct` trains it.
 ESTIMATED_DEPTH_METHOD = "coliags-in-vivo"

@@ -91,6 +91,7 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
 
         shown = [*parameters.values()]
         shown[before : before + 1] = signature(kind).parameters.values()
+        vars(call)["__options__"] = kind
         vars(call)["__signature__"] = signature(function).replace(parameters=shown)
         call.__doc__ = f"{getdoc(function)}\n\n{getdoc(kind)}"
         return call

@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from functools import partial
 from inspect import signature
 from pathlib import Path
 
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.cli import runs
-from coliags_plugin.cli.comparing import CompareCommand, ReportCommand
-from coliags_plugin.cli.reconstruct import ReconstructCommand
-from coliags_plugin.config.options import Options, TrainOptions, takes
+from coliags_plugin.cli import COMMANDS
+from coliags_plugin.cli.comparing import CompareCommand
+from coliags_plugin.config.options import TrainOptions, takes
+
+#: Functions of the Python API by the class of their options.
+FUNCTIONS = {
+    function.__options__: function
+    for function in (*map(partial(getattr, cp), cp.__all__), *vars(cp.Run).values())
+    if hasattr(function, "__options__")
+}
 
 
-@pytest.mark.parametrize(
-    ("command", "function", "own"),
-    [
-        (runs.TrainCommand, cp.train, "view port json"),
-        (runs.ImportCommand, cp.import_splats, "json"),
-        (runs.EvaluateCommand, cp.Run.evaluate, "path data device json"),
-        (runs.RenderCommand, cp.Run.write_renders, "path data device json light flatten"),
-        (runs.CoverageCommand, cp.Run.coverage, "path data device json"),
-        (runs.MeshCommand, cp.Run.mesh, "path data device json"),
-        (runs.ViewCommand, cp.Run.save_view, "path data device json host port open"),
-        (CompareCommand, cp.compare, "dry_run json"),
-        (ReportCommand, cp.report, "paths json"),
-        (
-            ReconstructCommand,
-            cp.reconstruct,
-            "camera params diameter start end every frames_per_second size method steps json",
-        ),
-    ],
-    ids=lambda value: getattr(value, "__name__", None),
-)
-def test_a_command_has_the_options_of_its_function_whose_help_tells_them(command, function, own):
+@pytest.mark.parametrize(("options", "function"), FUNCTIONS.items(), ids=lambda value: value.__name__)
+def test_a_command_and_a_function_have_the_same_options_and_the_help_tells_them(options, function):
+    assert any(issubclass(command, options) for command in COMMANDS.values())
     shown = signature(function).parameters
-    (kind,) = [base for base in command.__mro__ if Options in base.__bases__]
-    assert {field.name for field in fields(command)} - {*shown} == set(own.split())
-    for name in {field.name for field in fields(kind)} - {"data", "data_format", "device", "overwrite"}:
-        assert name in shown and f"\n    {name}: " in function.__doc__
+    for name in {field.name for field in fields(options)} - {"data", "data_format", "device", "overwrite"}:
+        assert name in shown
+        assert f"\n    {name}: " in function.__doc__ or "options: See :func:`compare`." in function.__doc__
 
 
 def test_options_are_given_as_an_object_or_by_name_with_texts_and_mappings():

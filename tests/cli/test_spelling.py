@@ -12,8 +12,8 @@ import pytest
 import tyro
 
 from coliags_plugin._version import __version__
-from coliags_plugin.cli import Command, hint
-from coliags_plugin.cli.flags import in_flags, translate_for
+from coliags_plugin.cli import COMMANDS
+from coliags_plugin.cli.arguments import hint, in_flags, subcommands, translate_for
 from coliags_plugin.cli.summaries import print_summary
 from tests.commands import run
 
@@ -24,17 +24,10 @@ NAMES = dict.fromkeys(("layout", "estimate_format", "reference_format", "from_fo
 NAMES |= {"settings": "set", "formats": "format"}
 
 
-def commands(union=Command) -> dict[str, type]:
-    """Every command by its name."""
-    found = {}
-    for annotated in typing.get_args(union):
-        kind, *_ = typing.get_args(annotated)
-        inner = typing.get_type_hints(kind, include_extras=True).get("subcommand")
-        if inner is None:
-            found[kind.__name__] = kind
-        else:
-            found |= commands(typing.get_args(inner)[0])
-    return found
+def commands() -> dict[str, type]:
+    """Every command by the name of its class."""
+    kinds = [inner for kind in COMMANDS.values() for inner in subcommands(kind).values() or [kind]]
+    return {kind.__name__: kind for kind in kinds}
 
 
 @pytest.mark.parametrize("kind", commands().values(), ids=commands())
@@ -79,7 +72,7 @@ def test_the_nearest_command_or_option_is_named(argv, meant, capsys):
 
 def test_nothing_is_suggested_where_nothing_is_near():
     for argv in ("", "xylophone", "train coliags", "train coliags --zzzzzz", "poses"):
-        assert hint(argv.split(), Command) == ""
+        assert hint(argv.split(), COMMANDS) == ""
 
 
 @pytest.mark.parametrize(
