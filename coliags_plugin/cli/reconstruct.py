@@ -70,14 +70,16 @@ class ReconstructCommand(options.ReconstructOptions):
         settings = {key: value for key, value in given.items() if value is not None}
         record = reconstruct(replace(self, settings=(*assignments(settings), *self.settings)))
         contents = read_contents(self.output, record, scene=self.video)
-        is_long = contents.whole is None
-        export = coliags("poses", "export", self.output, "--output", f"{self.output}-atlas")
-        values = {"stages": {name: asdict(stage) for name, stage in record.stages.items()}}
+        done = [submap for submap in contents.submaps if "report" in submap.stages and not submap.failure]
+        largest = max(done, key=lambda submap: len(submap.names))
         print_summary(
-            "\n".join(_segments(contents) if is_long else _stages(contents)),
-            values,
+            "\n".join(_lines(contents)),
+            {"stages": {name: asdict(stage) for name, stage in record.stages.items()}},
             written=[self.output / PAGE_FILE],
-            then=[export if is_long else view_command(self.output / "run")],
+            then=[
+                view_command(self.output / largest.folder / "run"),
+                coliags("poses", "export", self.output, "--output", f"{self.output}-atlas"),
+            ],
             as_json=self.json,
         )
 
@@ -98,33 +100,25 @@ class ReconstructCommand(options.ReconstructOptions):
         return {**frames, "frames.every": every, "frames.per_second": self.frames_per_second if by_time else None}
 
 
-def _stages(contents: Contents) -> Iterator[str]:
-    """Lines of what a video of one segment came to."""
+def _lines(contents: Contents) -> Iterator[str]:
+    """Lines of what a video came to: stages and files, segments and joins of a long one, sub-maps, and remarks."""
     from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table
     from coliags_plugin.reporting.text_formats import terminal_text
 
-    (segment,), folder = contents.segments, contents.folder
-    told = {name: stage for name, stage in segment.stages.items() if "/" not in name}
-    yield from (f"{name}: {stage.summary}" for name, stage in told.items())
-    yield from (f"{folder / path}: {content}" for stage in told.values() for path, content in stage.files.items())
-    submaps = [submap for submap in segment.submaps if submap.stages]
-    if len(submaps) > 1:
-        yield from (f"{folder / f'submap-{one.number}'}: {one.name}, likewise" for one in submaps[1:])
-        yield from ("", terminal_text([submap_table(submaps)]), "", f"held-out PSNR: {held_out_text(submaps)}")
-    yield from remarks(segment)
-
-
-def _segments(contents: Contents) -> Iterator[str]:
-    """A line for each segment of a long video, for what was left out, and for each join."""
-    from coliags_plugin.pipeline.page import held_out_text
-
-    for segment in contents.segments:
-        span, stages = segment.span, segment.stages
-        told = [stages["poses"].summary.partition("\n")[0]] if "poses" in stages else ["not begun"]
-        told += [f"held-out PSNR: {held_out_text(segment.submaps)}"] if "evaluate" in stages else []
-        yield f"{span.name}, frames {span.first} to {span.last}: {'; '.join(told)}"
-    for each in contents.video.skipped:
-        yield f"frames {each.first} to {each.last} left out: {each.why}"
+    folder, submaps = contents.folder, [submap for submap in contents.submaps if submap.stages]
+    stages = {name: stage for name, stage in contents.stages.items() if "/" not in name}
+    yield from (f"{name}: {stage.summary}" for name, stage in stages.items())
+    yield from (f"{folder / path}: {content}" for stage in stages.values() for path, content in stage.files.items())
+    for segment in contents.segments if len(contents.segments) > 1 else ():
+        span, poses = segment.span, segment.stages.get("poses")
+        told = "not begun" if poses is None else poses.summary.partition("\n")[0]
+        yield f"{span.name}, frames {span.first} to {span.last}: {told}"
+    for skipped in contents.video.skipped:
+        yield f"frames {skipped.first} to {skipped.last} left out: {skipped.why}"
     for join in contents.joins:
-        named = [f"{name}/{Path(model).name}" if model else name for name, model in join.keys]
-        yield f"{' and '.join(named)}: {'joined' if join.joined else f'not joined: {join.reason}'}"
+        models = [f"{name}/{Path(model).name}" if model else name for name, model in join.keys]
+        yield f"{' and '.join(models)}: {'joined' if join.joined else f'not joined: {join.reason}'}"
+    if len(submaps) > 1:
+        yield from (f"{folder / submap.folder}: {submap.name}" for submap in submaps)
+        yield from ("", terminal_text([submap_table(contents)]), "", f"held-out PSNR: {held_out_text(submaps)}")
+    yield from remarks(contents)

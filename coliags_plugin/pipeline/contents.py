@@ -1,11 +1,11 @@
-"""What lies in the folder of a reconstruction or of a segment: video, sub-maps, why frames have no pose, problems."""
+"""What lies in the folder of a reconstruction: video, segments, sub-maps, why frames have no pose, problems."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,7 +25,7 @@ from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
 _FRAME_NAME = re.compile(r"frame_(\d+)")
 #: Stages that are of no sub-map.
-_OF_ALL = ("survey", "joins", "frames", "poses")
+_SHARED_STAGES = ("survey", "joins", "frames", "poses")
 #: Figures that are words.
 _TEXTS = ("unit", "depth_scale")
 
@@ -35,9 +35,9 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 @dataclass(frozen=True)
 class SubmapContents:
-    """A model of a segment: its frames, and what was made of it."""
+    """A model of a segment: its frames, and the stages that were run on it."""
 
-    segment: str  # folder of the segment; empty: of the whole video
+    segment: str  # folder of the segment; empty: the only one, which lies in the reconstruction's folder
     model: str  # folder, relative to the segment's scene; of one without an atlas as if it had one
     stages: Mapping[str, StageRecord]  # by their names without its folder; none: too few frames to be reconstructed
     names: Mapping[int, str] = field(default_factory=dict)  # of its images, by their number in the video, ascending
@@ -55,8 +55,13 @@ class SubmapContents:
 
     @property
     def name(self) -> str:
-        """What pages and folders call it: segment and number."""
-        return f"{self.segment}/{self.number}" if self.segment else Submap(self.number).title
+        """Name on pages and in folders: segment and number."""
+        return f"{self.segment}/{self.number}" if self.segment else f"sub-map {self.number}"
+
+    @property
+    def folder(self) -> str:
+        """Folder of its results, relative to the reconstruction's."""
+        return "/".join(filter(None, (self.segment, Submap(self.number).folder)))
 
     @property
     def first(self) -> int:
@@ -68,25 +73,22 @@ class SubmapContents:
         """Last frame."""
         return max(self.names, default=0)
 
-    def place(self, path: str) -> str:
-        """Path of one of its files or of its segment's, relative to the folder that the segment lies in."""
-        return f"{self.segment}/{path}" if self.segment else path
-
-    @property
+    @cached_property
     def figures(self) -> dict[str, Any]:
         """The numbers of all its stages; of a damaged record, those that are numbers."""
-        found: dict[str, Any] = {
+        figures: dict[str, Any] = {
             name: value
             for stage in self.stages.values()
             for name, value in stage.figures.items()
             if isinstance(value, str) == (name in _TEXTS) and isinstance(value, int | float | str)
         }
-        gap = {"gap": found["psnr_training"] - found["psnr"]} if {"psnr", "psnr_training"} <= found.keys() else {}
-        return found | gap
+        if {"psnr", "psnr_training"} <= figures.keys():
+            figures["gap"] = figures["psnr_training"] - figures["psnr"]
+        return figures
 
     @property
     def failure(self) -> str:
-        """Which stage failed, and why; empty where none did."""
+        """The stage that failed, and why; empty where none did."""
         failed = (f"{name} failed: {stage.summary}" for name, stage in self.stages.items() if stage.state == "failed")
         return next(failed, "")
 
@@ -100,41 +102,9 @@ class SegmentContents:
     submaps: Sequence[SubmapContents]  # the largest first
     places: Mapping[int, AtlasJoin]  # between two stretches of frames, by the last frame before
     images: Path  # folder of the frames of use
-    kept: Mapping[int, str]  # their names, by their number in the video
-    why: Mapping[int, str]  # why frames have no pose, by their numbers
+    used: Mapping[int, str]  # names of the frames of use, by their number in the video
+    lost: Mapping[int, str]  # why frames have no pose, by their numbers
     problem: str = ""  # what of it cannot be read, and why
-
-    @property
-    def failure(self) -> str:
-        """Which stage failed, and why, or that it is not finished; empty where its largest sub-map is done."""
-        own = {name: stage for name, stage in self.stages.items() if "/" not in name}
-        for name, stage in own.items():
-            if stage.state == "failed":
-                of = "" if name in ("frames", "poses") else " of its largest sub-map"
-                return f"{name}{of} failed: {stage.summary}"
-        if self.problem:
-            return self.problem
-        if not self.stages:
-            return "it was not begun"
-        return "" if "report" in own and own["report"].state == "done" else "it is not finished"
-
-
-@dataclass(frozen=True)
-class Contents:
-    """The folder of a reconstruction, or of one of its segments."""
-
-    folder: Path
-    video: Video  # of a scene with poses without a list of its frames, of one frame
-    segments: Sequence[SegmentContents]
-    submaps: Sequence[SubmapContents]  # of all segments, by their first frames
-    joins: Sequence[SegmentJoin] = ()
-    survey: Survey | None = None
-    problems: Sequence[str] = ()  # what cannot be read, and why
-
-    @property
-    def whole(self) -> SegmentContents | None:
-        """The only segment, if this is its folder."""
-        return self.segments[0] if self.segments and not self.segments[0].span.name else None
 
     @property
     def posed(self) -> set[int]:
@@ -142,9 +112,50 @@ class Contents:
         return {number for submap in self.submaps for number in submap.names}
 
     @property
-    def kept(self) -> set[int]:
+    def failure(self) -> str:
+        """The stage that failed, and why, or that it is not finished; empty where its largest sub-map is done."""
+        largest = {name: stage for name, stage in self.stages.items() if "/" not in name}
+        for name, stage in largest.items():
+            if stage.state == "failed":
+                return f"{name}{'' if name in _SHARED_STAGES else ' of its largest sub-map'} failed: {stage.summary}"
+        if self.problem:
+            return self.problem
+        if not self.stages:
+            return "it was not begun"
+        return "" if "report" in largest and largest["report"].state == "done" else "it is not finished"
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The folder of a reconstruction."""
+
+    folder: Path
+    video: Video  # of a scene with poses without a list of its frames, of one frame
+    stages: Mapping[str, StageRecord]
+    segments: Sequence[SegmentContents]
+    joins: Sequence[SegmentJoin] = ()
+    survey: Survey | None = None
+    problems: Sequence[str] = ()  # what cannot be read, and why
+
+    @cached_property
+    def submaps(self) -> list[SubmapContents]:
+        """Sub-maps of all segments, by their first frames."""
+        return sorted((one for segment in self.segments for one in segment.submaps), key=lambda submap: submap.first)
+
+    @property
+    def posed(self) -> set[int]:
+        """Frames with a pose."""
+        return set().union(*(segment.posed for segment in self.segments))
+
+    @property
+    def used(self) -> set[int]:
         """Frames of use."""
-        return {number for segment in self.segments for number in segment.kept}
+        return set().union(*(segment.used for segment in self.segments))
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether the frames are known one by one: not of a scene with poses without a list of them."""
+        return self.video.size is not None or bool(self.used)
 
     def seconds(self, frames: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
         """Times of frames by their numbers, s; the numbers where neither times nor a rate are known."""
@@ -153,20 +164,13 @@ class Contents:
             return np.asarray(np.interp(frames, np.arange(first, first + len(times)), times))
         return np.asarray(frames) / (self.video.rate or 1.0)
 
-    def frames_at(self, seconds: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
-        """Numbers of the frames at times: the inverse of :meth:`seconds`."""
-        times, first = None if self.survey is None else self.survey.times, self.video.first
-        if times is not None:
-            return np.asarray(np.interp(seconds, times, np.arange(first, first + len(times))))
-        return np.asarray(seconds) * (self.video.rate or 1.0)
-
 
 class _Joins(BaseModel):
     joins: list[SegmentJoin] = []
 
 
-def read_contents(out: Path, record: Record | None = None, segment: str = "", scene: Path | None = None) -> Contents:
-    """Read the folder of a reconstruction, or of one segment; of damaged parts it is kept what is wrong with them.
+def read_contents(out: Path, record: Record | None = None, scene: Path | None = None) -> Contents:
+    """Read the folder of a reconstruction; of damaged parts, what is wrong with them becomes a problem.
 
     ``scene`` is where poses are, if they were given.
 
@@ -174,46 +178,36 @@ def read_contents(out: Path, record: Record | None = None, segment: str = "", sc
         InputError: Its record is damaged, or there is none.
     """
     record = record or Record.of(out)
-    stages, folder, problems = record.within(segment), out / segment, list[str]()
+    stages, problems = record.stages, list[str]()
     if not stages:
         raise InputError(f"no stage in {out / RECORD_FILE}", "the folder of a reconstruction, which has begun")
-    joins = figures_as(stages, "joins", _Joins, folder).joins if "joins" in stages else []
-    whole = record.stages.get("survey")
-    given = scene if whole is None else None
-    if whole is not None and whole.state == "done":
-        video = figures_as(record.stages, "survey", Video, out)
-        for span in video.segments if segment else ():
-            if span.name == segment:
-                own = (Segment(span.first, span.last, ""),)
-                part = {"first": span.first, "frames": span.count, "segments": own, "skipped": ()}
-                video = video.model_copy(update=part)
+    posed = None if "survey" in stages else scene
+    if record.is_done("survey"):
+        video = figures_as(stages, "survey", Video, out)
     else:
-        atlas = None if given is None else _attempt(partial(read_atlas, given), folder, problems)
+        atlas = None if posed is None else _attempt(partial(read_atlas, posed), out, problems)
         count = len(atlas.frames) if atlas else 0
-        name = (scene or folder).resolve().name
-        video = Video(source=name, frames=max(1, count), segments=(Segment(0, max(0, count - 1), ""),))
-    segments = [
-        _read_segment(folder / span.name, span, record.within(segment or span.name), video, given)
-        for span in video.segments
-    ]
-    problems += [": ".join(filter(None, (one.span.name, one.problem))) for one in segments if one.problem]
+        segments = (Segment(0, max(0, count - 1), ""),)
+        video = Video(source=(scene or out).resolve().name, frames=max(1, count), segments=segments)
+    contents = [_read_segment(out / span.name, span, record.within(span.name), video, posed) for span in video.segments]
+    problems += [": ".join(filter(None, (one.span.name, one.problem))) for one in contents if one.problem]
     survey = _attempt(partial(_read_survey, out, video), out, problems)
-    submaps = sorted((submap for one in segments for submap in one.submaps), key=lambda submap: submap.first)
-    return Contents(folder, video, segments, submaps, joins, survey, problems)
+    joins = figures_as(stages, "joins", _Joins, out).joins if "joins" in stages else []
+    return Contents(out, video, stages, contents, joins, survey, problems)
 
 
 def figures_as(stages: Mapping[str, StageRecord], name: str, kind: type[ModelT], folder: Path) -> ModelT:
-    """What a stage has found.
+    """Read the figures that a stage has recorded.
 
     Raises:
-        InputError: What was recorded of it is damaged.
+        InputError: They are damaged.
     """
     with invalid_reported(f"cannot read {folder / RECORD_FILE}: {name}: ", MADE):
         return kind.model_validate(stages[name].figures)
 
 
 def _read_survey(out: Path, video: Video) -> Survey | None:
-    """The survey of a video's frames; None without one."""
+    """Read the survey of a video's frames; None without one."""
     if not (out / SURVEY_FILE).is_file():
         return None
     survey = Survey.read(out)
@@ -223,7 +217,7 @@ def _read_survey(out: Path, video: Video) -> Survey | None:
 
 
 def _attempt(read: Callable[[], T], folder: Path, problems: list[str]) -> T | None:
-    """What is read; None of what is damaged, which is said without the place of the folder, as that may be moved."""
+    """Read a file; None if it is damaged, which is noted without the place of the folder, as that may be moved."""
     try:
         return read()
     except InputError as error:
@@ -232,67 +226,62 @@ def _attempt(read: Callable[[], T], folder: Path, problems: list[str]) -> T | No
 
 
 def _read_segment(
-    folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video, given: Path | None
+    folder: Path, span: Segment, stages: Mapping[str, StageRecord], video: Video, posed: Path | None
 ) -> SegmentContents:
-    """Read a segment; of a scene with poses, which is ``given``, its frames are those of its atlas."""
-    problems, scene, places = list[str](), given or folder / "poses", dict[int, AtlasJoin]()
-    atlas = _attempt(partial(read_atlas, scene), folder, problems)
-    if given is not None:
-        frames, kept, images = None, dict(enumerate(atlas.frames if atlas else ())), given / IMAGES
+    """Read a segment; ``posed`` is a scene whose poses were given: its frames are those of its atlas."""
+    problems, places, lost = list[str](), dict[int, AtlasJoin](), dict[int, str]()
+    atlas = _attempt(partial(read_atlas, posed or folder / "poses"), folder, problems)
+    if posed is not None:
+        images, used = posed / IMAGES, dict(enumerate(atlas.frames if atlas else ()))
     else:
-        frames, images = (
-            _attempt(lambda: FramesRecord.read(folder / "frames"), folder, problems),
-            folder / "frames" / IMAGES,
-        )
-        kept = {
-            one.frame: f"{one.name}.png"
-            for one in (frames.kept if frames else ())
-            if span.first <= one.frame <= span.last
-        }
-    why = {one.frame: one.why for one in (frames.dropped if frames else ())}
-    made: dict[int, dict[str, StageRecord]] = {}
+        images, used = folder / "frames" / IMAGES, {}
+        if frames := _attempt(partial(FramesRecord.read, folder / "frames"), folder, problems):
+            lost = {frame.frame: frame.why for frame in frames.dropped}
+            used = {one.frame: f"{one.name}.png" for one in frames.kept if span.first <= one.frame <= span.last}
+    by_submap: dict[int, dict[str, StageRecord]] = {}
     for name, stage in stages.items():
         place, _, step = name.rpartition("/")
-        if step not in _OF_ALL:
-            made.setdefault(int(place.removeprefix("submap-") or 0), {})[step] = stage
-    submaps = {number: SubmapContents(span.name, f"sparse/{number}", known) for number, known in made.items()}
+        if step not in _SHARED_STAGES:
+            by_submap.setdefault(int(place.removeprefix("submap-") or 0), {})[step] = stage
+    submaps = {number: SubmapContents(span.name, f"sparse/{number}", steps) for number, steps in by_submap.items()}
     if atlas is not None:
         try:
-            numbers = _numbers(atlas, {Path(name).stem: number for number, name in kept.items()}, video)
-            why |= {numbers[lost.frame]: lost.reason for lost in atlas.lost}
+            numbers = _frame_numbers(atlas, {Path(name).stem: number for number, name in used.items()}, video)
+            lost |= {numbers[frame.frame]: frame.reason for frame in atlas.lost}
             places = {numbers[place.after]: place for place in atlas.joins}
             names: dict[str, dict[int, str]] = {}
             for stretch in atlas.submaps:
-                own = {numbers[index]: atlas.frames[index] for index in stretch.frames}
-                names[stretch.model] = names.get(stretch.model, {}) | own
+                in_stretch = {numbers[frame]: atlas.frames[frame] for frame in stretch.frames}
+                names.setdefault(stretch.model, {}).update(in_stretch)
             units = {stretch.model: stretch.unit for stretch in atlas.submaps}
-            for model, own in names.items():
-                known = made.get(number := int(Path(model).name), {})
-                submaps[number] = SubmapContents(span.name, model, known, dict(sorted(own.items())), units[model])
+            for model, images_of in names.items():
+                number = int(Path(model).name)
+                ordered = dict(sorted(images_of.items()))
+                submaps[number] = SubmapContents(span.name, model, by_submap.get(number, {}), ordered, units[model])
         except (LookupError, ValueError) as error:
-            told = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
-            problems.append(f"poses/atlas.json does not fit the frames: {told}")
-    ordered = [submaps[number] for number in sorted(submaps)]
-    return SegmentContents(span, stages, ordered, places, images, kept, why, "; ".join(problems))
+            text = f"{error}".encode(errors="backslashreplace").decode()  # a name may be any text
+            problems.append(f"poses/atlas.json does not fit the frames: {text}")
+    largest_first = [submaps[number] for number in sorted(submaps)]
+    return SegmentContents(span, stages, largest_first, places, images, used, lost, "; ".join(problems))
 
 
-def _numbers(atlas: AtlasRecord, known: Mapping[str, int], video: Video) -> list[int]:
-    """Numbers in the video of an atlas's frames: by their names."""
-    numbers = []
+def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video) -> list[int]:
+    """Numbers in the video of an atlas's frames: by their names, in ``numbers`` or of the form ``frame_000123``."""
+    found = []
     for file in atlas.frames:
         if Path(file).name != file:
             raise ValueError(f"the name '{file}'")
         name = Path(file).stem
-        named = _FRAME_NAME.fullmatch(name)
-        number = known.get(name, int(named.group(1)) if named else -1)
+        match = _FRAME_NAME.fullmatch(name)
+        number = numbers.get(name, int(match.group(1)) if match else -1)
         if not video.first <= number < video.stop:
             raise ValueError(f"{file} is none of the frames {video.first} to {video.stop - 1}")
-        numbers.append(number)
-    return numbers
+        found.append(number)
+    return found
 
 
 def common_frames(contents: Contents) -> dict[ModelKey, tuple[ModelKey, Float[np.ndarray, "4 4"]]]:
-    """For each sub-map with poses the first that it is joined to, and the similarity to that one's world. [4, 4]
+    """Place each sub-map with poses in the world of the first that it is joined to, by a similarity. [4, 4]
 
     A sub-map that is joined to no other is its own first. Of several ways from one to another the shortest counts.
     """

@@ -8,7 +8,6 @@ is a worker process for one; TASK is a :class:`PartTask` as JSON.
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +26,6 @@ from coliags_plugin.engine.task_queue import Job, JobQueue
 from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, TaskOutcome, attempt, run_worker
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.page import write_page
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import (
     LOCK_SECONDS,
@@ -74,7 +72,7 @@ class Reconstruction:
     ) -> None:
         self.record, self.workers, self._overwrite = record, workers, overwrite
         self.failures: dict[tuple[str, Part], ReportedError] = {}
-        self._left, self._open = list(segments), Counter[str]()  # not begun; jobs by segments
+        self._left = list(segments)  # not begun
 
     def run(self) -> None:
         """Do all jobs.
@@ -117,9 +115,6 @@ class Reconstruction:
         waiting = list(dict.fromkeys(stage.part for stage in stages if not self.record.is_done(stage.name)))
         if None in waiting:
             waiting = [None]
-        self._open[context.segment] = len(waiting)
-        if not waiting:
-            self._write_page(context)
         frames = {inside.submap.number: inside.submap.frames or 1 for inside in context.submaps()}
         shares = {part: _PLAN_SHARE if part is None else frames[part] / sum(frames.values()) for part in waiting}
         own = [PartJob(self, context, part, stages, round(shares[part] * size)) for part in waiting]
@@ -128,18 +123,11 @@ class Reconstruction:
     def end(self, job: PartJob, error: ReportedError | None = None) -> list[PartJob]:
         """Take that a job has ended, or why it failed; returns what is to be done after it."""
         context = job.context
-        self._open[context.segment] -= 1
         if error is not None:
             self.failures[context.segment, job.part] = error
         elif job.part is None:
             return self._begin(context, round(job.size / _PLAN_SHARE) - job.size)
-        if not self._open[context.segment]:
-            self._write_page(context)
         return self._next(context) if job.part is None else []
-
-    def _write_page(self, context: StageContext) -> None:
-        self.record.refresh()
-        write_page(context.root, self.record, context.segment, context.source)
 
 
 def _camera_of(scene: Path) -> CameraSettings | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -69,21 +70,16 @@ def reconstruct(
         seen = f"{mask} is a folder" if mask.is_dir() else f"no file {mask}"
         raise InputError(seen, "an image, black where pixels are ignored", "Check `mask`")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
-    frames, is_long = settings.frames, False
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
-        video = frame_source(source, Span(frames.first, frames.last))
-        log.info("%s", forecast(video, settings))
-        is_long = video.expected > frames.segment * frames.every
+        log.info("%s", forecast(frame_source(source, Span(settings.frames.first, settings.frames.last)), settings))
     else:
         _refuse_unused(source, settings, mask)
     context = StageContext(out, source, settings, mask, data_format, device, progress)
     stages_of(context)  # finds out wrong settings before anything is written
     Record.of(out)  # refuses another folder
-    if is_long and execution is None:
-        execution = ExecutionOptions(jobs=1, device=str(device))
-    workers = None if execution is None else Workers(make_executor(execution), execution)
+    workers = None if execution is None else _workers(execution)
     if workers is not None:
         workers.executor.check(out, [path for path in (source, mask) if path is not None])
     with locked(out / LOCK_FILE, out):
@@ -91,33 +87,51 @@ def reconstruct(
         record = Record.of(out)
         record.places = context.places
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
-        parts = [(context, _UNITS)] if data_format is not None else _segments(context, record, overwrite, is_long)
-        work = Reconstruction(record, parts, overwrite, workers)
+        segments = [(context, _UNITS)] if data_format is not None else _segments(context, record, overwrite)
+        if len(segments) > 1 and workers is None:
+            workers = _workers(ExecutionOptions(jobs=1, device=str(device)))
+        work = Reconstruction(record, segments, overwrite, workers)
         work.run()
-        if is_long:
-            _join(context, record)
-    for part in (None, 0):
-        if ("", part) in work.failures:
-            raise work.failures["", part]
+        if len(segments) != 1:
+            _join(out, record)
+        write_page(out, record, source)
+    if not segments:
+        raise InputError(
+            f"no stretch of {source} of {settings.least_submap} frames in which points can be followed",
+            "a video of a camera that moves along tissue it sees",
+            f"{out / PAGE_FILE} shows why",
+        )
+    if not any(record.is_done(f"{segment.prefix}report") for segment, _ in segments):
+        failure = next(error for (_, part), error in work.failures.items() if not part)
+        if len(segments) == 1:
+            raise failure
+        seen = f"none of {len(segments)} segments of {source} could be reconstructed: {str(failure).rstrip('.')}"
+        raise InputError(seen, do=f"{out / PAGE_FILE} shows why")
     return record
 
 
-def _segments(context: StageContext, record: Record, overwrite: bool, is_long: bool) -> list[tuple[StageContext, int]]:
+def _workers(execution: ExecutionOptions) -> Workers:
+    return Workers(make_executor(execution), execution)
+
+
+def _segments(context: StageContext, record: Record, overwrite: bool) -> list[tuple[StageContext, int]]:
     """Survey the video and cut it, or read what was found before; where nothing was found, options may change.
 
     Returns contexts of the segments and their frames, first the one in which most is followed.
     """
-    out, settings, chosen, least = context.out, context.settings, context.settings.frames, context.settings.least_submap
+    out, settings, chosen = context.out, context.settings, context.settings.frames
     cutting = chosen.model_dump(include={"first", "last", "every", "segment", "deinterlace"})
-    options = {"source": identity_of(context.source), "frames": cutting} | ({"least_submap": least} if is_long else {})
+    options: dict[str, Any] = {"source": identity_of(context.source), "frames": cutting}
+    if frame_source(context.source, Span(chosen.first, chosen.last)).expected > chosen.segment * chosen.every:
+        options["least_submap"] = settings.least_submap
 
     def run() -> StageOutcome:
         source = chosen_frames(context.source, chosen)
-        survey, video = survey_and_cut(source, chosen, least if is_long else None, context.progress)
+        survey, video = survey_and_cut(source, chosen, settings.least_submap, context.progress)
         survey.write(out)
         summary = f"{counted(video.frames, 'frame')} in {counted(len(video.segments), 'segment')}"
-        made = {SURVEY_FILE: "sharpness and motion of every frame"}
-        return StageOutcome(summary, made, figures=video.model_dump(mode="json"))
+        files = {SURVEY_FILE: "sharpness and motion of every frame"}
+        return StageOutcome(summary, files, figures=video.model_dump(mode="json"))
 
     others = [name for name in record.stages if name not in ("survey", "joins")]
     outputs = [SURVEY_FILE, *{name.partition("/")[0] for name in others if name.startswith("segment-")}]
@@ -133,34 +147,20 @@ def _segments(context: StageContext, record: Record, overwrite: bool, is_long: b
         record.forget(["survey"], [])
     run_stages([stage], record)
     video, survey = figures_as(record.stages, "survey", Video, out), Survey.read(out)
-    found = []
-    for segment in sorted(video.segments, key=lambda own: -survey.part(own.first, own.last).followed.sum()):
+    segments = []
+    for segment in sorted(video.segments, key=lambda span: -survey.part(span.first, span.last).followed.sum()):
         span = {"first": segment.first, "last": segment.last, "deinterlace": video.deinterlace}
         own = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
-        found.append((replace(context, out=out / segment.name, segment=segment.name, settings=own), segment.count))
-    return found
+        segments.append((replace(context, out=out / segment.name, segment=segment.name, settings=own), segment.count))
+    return segments
 
 
-def _join(context: StageContext, record: Record) -> None:
-    """Join the segments, and write the page over them.
-
-    Raises:
-        InputError: None has poses; the page shows why.
-    """
-    out, video = context.out, figures_as(record.stages, "survey", Video, context.out)
-    joins = find_joins(out, video.segments)
+def _join(out: Path, record: Record) -> None:
+    """Join the segments."""
+    joins = find_joins(out, figures_as(record.stages, "survey", Video, out).segments)
     summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
     figures = {"joins": [join.model_dump(mode="json") for join in joins]}
     record.put("joins", StageRecord({}, "done", summary, figures=figures))
-    write_page(out, record)
-    if any(record.is_done(f"{segment.name}/poses") for segment in video.segments):
-        return
-    why = next((stage.summary for stage in record.stages.values() if stage.state == "failed"), "no stage was begun")
-    seen = f"none of {len(video.segments)} segments of {context.source} has poses: {why}"
-    if not video.segments:
-        least = context.settings.least_submap
-        seen = f"no stretch of {context.source} of {least} frames in which points can be followed"
-    raise InputError(seen, "a video of a camera that moves along tissue it sees", f"{out / PAGE_FILE} shows why")
 
 
 def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:

@@ -224,14 +224,11 @@ class Video(BaseModel):
 
 
 def survey_and_cut(
-    source: FrameSource, settings: FrameSettings, least: int | None, progress: Progress | None
+    source: FrameSource, settings: FrameSettings, least: int, progress: Progress | None
 ) -> tuple[Survey, Video]:
-    """Look at all frames of a video and cut it into segments of ``least`` frames or more; None: leave it whole."""
+    """Look at all frames of a video and cut it into segments of ``least`` frames or more."""
     survey, span = survey_video(source, progress), source.span
-    segments, skipped = [Segment(span.first, span.first + len(survey) - 1, "")], list[Skipped]()
-    if least is not None:
-        segments, skipped = cut(survey, settings, least)
-        log.info("%d frames in %d segments, %d stretches left out", len(survey), len(segments), len(skipped))
+    segments, skipped = cut(survey, settings, least)
     height, width = survey.size
     video = Video(
         source=source.path.name,
@@ -249,8 +246,12 @@ def survey_and_cut(
 def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segment], list[Skipped]]:
     """Segments in order, and what is left out: where nothing is followed for long, and what is shorter than ``least``.
 
-    Segments that follow each other without a gap share at most ``OVERLAP`` frames, times ``settings.every``.
+    A video that is not longer than a segment is one, whatever it shows. Segments that follow each other without a gap
+    share at most ``OVERLAP`` frames, times ``settings.every``.
     """
+    began = survey.first
+    if len(survey) <= settings.segment * settings.every:
+        return [Segment(began, began + len(survey) - 1, "")], []
     flat = survey.sharpness <= _FLAT * np.median(survey.sharpness)
     lost = flat | (survey.followed < _NOTHING)
     lost[0] = flat[0]
@@ -264,7 +265,7 @@ def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segme
             skipped.append((start, stop - 1, f"fewer than {least} frames of use between such stretches"))
         elif stop > start:
             kept += _split(survey, start, stop, settings)
-    began = survey.first
+    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(kept), len(skipped))
     return (
         [Segment(began + one, began + last, f"segment-{number:03d}") for number, (one, last) in enumerate(kept)],
         [Skipped(began + one, began + last, why) for one, last, why in sorted(skipped)],

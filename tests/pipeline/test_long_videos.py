@@ -70,7 +70,7 @@ def test_a_video_is_cut_where_nothing_is_seen_for_long_and_where_least_is_follow
 def test_the_noise_of_a_flat_wall_at_the_lens_may_be_followed_and_is_left_out():
     sharpness = np.full(400, 0.02)
     sharpness[200:260] = 0.002
-    segments, skipped = cut(surveyed(np.full(400, 0.5), sharpness), FrameSettings(), 12)
+    segments, skipped = cut(surveyed(np.full(400, 0.5), sharpness), FrameSettings(segment=300), 12)
     assert [(each.first, each.last) for each in skipped] == [(200, 259)]
     assert [(each.first, each.last) for each in segments] == [(0, 199), (260, 399)]
 
@@ -176,7 +176,6 @@ def test_a_long_video_is_reconstructed_segment_by_segment_and_what_is_done_is_no
         kept = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
         assert [frame["frame"] for frame in kept] == list(range(segment.first, segment.last + 1))
         assert record.stages[f"{name}/submap-1/report"].state == "done"
-        assert "<h2>Stages" in (tmp_path / "out" / name / "index.html").read_text(encoding="utf-8")
     assert {each.segments for each in made.joins} == set(pairwise(names))
     assert any("show nothing that can be followed" in each.reason for each in made.joins)
     assert list(Record.of(tmp_path / "out").stages) == list(record.stages)
@@ -218,12 +217,13 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     failing[:] = [f"segment-{number:03d}" for number in range(9)]
     workers()
     with pytest.raises(
-        InputError, match=r"none of 3 segments of .* has poses: 2 of 50 frames.*none/index.html shows why"
+        InputError,
+        match=r"none of 3 segments .* could be reconstructed: .*2 of 50 frames.*none/index.html shows why",
     ):
         cp.reconstruct(long_video, tmp_path / "none", settings=OPTIONS)
     assert len(list((tmp_path / "none").glob("segment-*/frames/frames.json"))) == 3, "the next one is tried"
     page = (tmp_path / "none" / "index.html").read_text(encoding="utf-8")
-    assert "No frame of this video has a pose: poses failed: 2 of 50 frames have poses" in page
+    assert "no frame of this video has a pose: poses failed: 2 of 50 frames have poses" in page
     assert Record.of(tmp_path / "none").is_done("survey") and Survey.read(tmp_path / "none")
 
 
@@ -254,7 +254,7 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
         message = commands.refused(capsys, *argv)
         assert "no stretch of " in message and f"{out / 'index.html'} shows why" in message
         page = (out / "index.html").read_text(encoding="utf-8")
-        assert "No frame of this video has a pose: nothing of the frame before is seen" in page
+        assert "no frame of this video has a pose: nothing of the frame before is seen" in page
         assert "No stretch of this video is long enough" in page and 'class="pictures"' not in page
         assert segments_of(Record.of(out)) == [] and len(Survey.read(out)) == 60
         (out / "index.html").unlink()
@@ -307,5 +307,5 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
 
     workers().check = refuse
     with pytest.raises(InputError, match=r"does not see long\.mp4"):
-        cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+        cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS, jobs=2)
     assert not any((tmp_path / "out").glob("[!.]*"))
