@@ -20,12 +20,10 @@ from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
-from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, Record, StageRecord
+from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
 _FRAME_NAME = re.compile(r"frame_(\d+)")
-#: Stages that are of no sub-map.
-_SHARED_STAGES = ("survey", "joins", "frames", "poses")
 #: Figures that are words.
 _TEXTS = ("unit", "depth_scale")
 
@@ -117,7 +115,7 @@ class SegmentContents:
         largest = {name: stage for name, stage in self.stages.items() if "/" not in name}
         for name, stage in largest.items():
             if stage.state == "failed":
-                return f"{name}{'' if name in _SHARED_STAGES else ' of its largest sub-map'} failed: {stage.summary}"
+                return f"{name}{'' if name in SHARED else ' of its largest sub-map'} failed: {stage.summary}"
         if self.problem:
             return self.problem
         if not self.stages:
@@ -241,7 +239,7 @@ def _read_segment(
     by_submap: dict[int, dict[str, StageRecord]] = {}
     for name, stage in stages.items():
         place, _, step = name.rpartition("/")
-        if step not in _SHARED_STAGES:
+        if step not in SHARED:
             by_submap.setdefault(int(place.removeprefix("submap-") or 0), {})[step] = stage
     submaps = {number: SubmapContents(span.name, f"sparse/{number}", steps) for number, steps in by_submap.items()}
     if atlas is not None:

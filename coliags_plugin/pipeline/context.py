@@ -1,4 +1,4 @@
-"""Sub-maps of a reconstruction, folders of both, and what their stages share."""
+"""Sub-maps of a reconstruction, and the context in which stages run: source, settings and folders."""
 
 from __future__ import annotations
 
@@ -29,23 +29,15 @@ class Submap:
 
     @property
     def folder(self) -> str:
-        """Folder of its results, relative to the reconstruction's; empty for the first."""
+        """Folder of its results, relative to its segment's; empty for the first."""
         return f"submap-{self.number}" if self.number else ""
-
-    @property
-    def title(self) -> str:
-        """What messages call it."""
-        return f"sub-map {self.number}"
-
-
-LARGEST = Submap()
 
 
 def find_submaps(scene: Path, least: int) -> list[Submap]:
     """The first model of a scene in COLMAP's layout, and the others that have ``least`` frames or more."""
     models = [folder for folder in find_models(scene) if folder.name.isdecimal()]
     if len(models) < 2:
-        return [LARGEST]
+        return [Submap()]
     counts = [len(colmap.read(folder).camera_to_world) for folder in models]
     return [
         Submap(number, folder.relative_to(scene).as_posix(), count)
@@ -56,43 +48,43 @@ def find_submaps(scene: Path, least: int) -> list[Submap]:
 
 @dataclass(frozen=True)
 class StageContext:
-    """What every stage is given."""
+    """Input of a stage: source, settings, and which segment and sub-map it is of."""
 
-    out: Path  # folder of the segment: the reconstruction's, or of a long video one within it
+    root: Path  # the reconstruction's folder
     source: Path  # the video, folder of images or scene
     settings: ReconstructionSettings
     mask: Path | None  # image that is black where pixels are ignored; None: found from the frames
     data_format: str | None  # of a source that is a scene; None: it is none
     device: torch.device
     progress: Progress | None = None
-    segment: str = ""  # name of the segment's folder; empty: of the whole video
-    submap: Submap = LARGEST  # which model of the posed scene is reconstructed
-
-    @property
-    def root(self) -> Path:
-        """The reconstruction's folder."""
-        return self.out.parent if self.segment else self.out
+    segment: str = ""  # name of the segment's folder; empty: the only one, which lies in the root
+    submap: Submap | None = None  # which model of the posed scene is reconstructed; None: what all of them need
 
     @property
     def prefix(self) -> str:
-        """What stages and files of the sub-map are called by in the reconstruction's folder: the way to its folder."""
-        return "".join(f"{name}/" for name in (self.segment, self.submap.folder) if name)
+        """The way from the root to the folder, which names of stages and of files begin with."""
+        return "".join(f"{name}/" for name in (self.segment, self.submap and self.submap.folder) if name)
 
     @property
-    def places(self) -> tuple[Path, ...]:
-        """Files and folders that are given."""
-        return tuple(path for path in (self.root, self.source, self.mask) if path is not None)
+    def places(self) -> list[Path]:
+        """Files and folders that were given."""
+        return [path for path in (self.source, self.mask) if path is not None]
 
     def submaps(self) -> list[StageContext]:
-        """One for every model that is reconstructed, the largest first, as far as poses are there."""
-        if self.data_format not in (None, "colmap") or not self.posed.is_dir():
-            return [self]
-        return [replace(self, submap=submap) for submap in find_submaps(self.posed, self.settings.least_submap)]
+        """Contexts of the models that are reconstructed, the largest first, as far as poses are there."""
+        is_atlas = self.data_format in (None, "colmap") and self.posed.is_dir()
+        found = find_submaps(self.posed, self.settings.least_submap) if is_atlas else [Submap()]
+        return [replace(self, submap=submap) for submap in found]
+
+    @property
+    def out(self) -> Path:
+        """Folder of the segment."""
+        return self.root / self.segment
 
     @property
     def folder(self) -> Path:
         """Folder of the sub-map's results."""
-        return self.out / self.submap.folder
+        return self.root / self.prefix
 
     @property
     def frames(self) -> Path:
@@ -128,7 +120,7 @@ class StageContext:
     @property
     def model_options(self) -> list[str]:
         """Options of the posed scene's data manager: which model is read."""
-        return [] if self.submap.model is None else [f"model={self.submap.model}"]
+        return [f"model={self.submap.model}"] if self.submap and self.submap.model else []
 
     @property
     def scene(self) -> Path:
@@ -137,12 +129,12 @@ class StageContext:
 
     @cached_property
     def estimates_depth(self) -> bool:
-        """Whether depth has to be estimated: the source is no scene, or one without dense depth."""
+        """True if depth has to be estimated, as the source is no scene, or one without dense depth."""
         return self.data_format is None or self._first_frame.depth is None
 
     @cached_property
     def has_estimates(self) -> bool:
-        """Whether the source is a scene with estimated depth."""
+        """True if the source is a scene with estimated depth."""
         return not self.estimates_depth and self._first_frame.depth_confidence is not None
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Parts of a reconstruction as jobs: of each segment what all its sub-maps need, then each sub-map by itself.
+"""Stages of a reconstruction as jobs: of each segment those that all its sub-maps need, then those of each sub-map.
 
     python -m coliags_plugin.pipeline.jobs TASK
 
-is a worker process for one; TASK is a :class:`PartTask` as JSON.
+is a worker process for one; TASK is a :class:`StageTask` as JSON.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from coliags_plugin.core.errors import (
     InputError,
@@ -29,9 +29,7 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import (
     LOCK_SECONDS,
-    Part,
     Record,
-    Stage,
     StageRecord,
     check_options,
     run_stages,
@@ -46,22 +44,21 @@ log = logging.getLogger(__name__)
 #: Folder of the workers' messages.
 LOGS = "logs"
 #: Share of the work that comes before the sub-maps.
-_PLAN_SHARE = 0.2
+_SHARED_WORK = 0.2
 
 
-@dataclass(frozen=True)
-class Workers:
+class Workers(NamedTuple):
     """Processes that do jobs, and how."""
 
     executor: Executor
     options: ExecutionOptions
 
 
-class Reconstruction:
+class StageJobs:
     """Jobs of segments, first those of one that tells the camera of the others if it is not known.
 
     Args:
-        record: Of the reconstruction.
+        record: Record of the reconstruction.
         segments: Contexts and sizes; if the first gets no poses, the next one is tried.
         overwrite: Whether stages that were made with other options are removed.
         workers: Processes that do the jobs; None: this one.
@@ -71,8 +68,8 @@ class Reconstruction:
         self, record: Record, segments: Sequence[tuple[StageContext, int]], overwrite: bool, workers: Workers | None
     ) -> None:
         self.record, self.workers, self._overwrite = record, workers, overwrite
-        self.failures: dict[tuple[str, Part], ReportedError] = {}
-        self._left = list(segments)  # not begun
+        self.failures: list[tuple[StageContext, ReportedError]] = []
+        self._segments = list(segments)  # that are not begun
 
     def run(self) -> None:
         """Do all jobs.
@@ -82,7 +79,7 @@ class Reconstruction:
             InterruptedRunError: Ctrl-C; what is done is kept.
             NotWritableError: The disk is full, or cannot be written; likewise.
         """
-        total, waiting = sum(size for _, size in self._left), self._next()
+        total, waiting = sum(size for _, size in self._segments), self._begin_segments()
         if self.workers is None:
             while waiting:
                 waiting[:0] = waiting.pop(0).run_here()
@@ -93,41 +90,40 @@ class Reconstruction:
         except KeyboardInterrupt as error:
             raise InterruptedRunError("stopped; the same command goes on where it stopped") from error
 
-    def _next(self, before: StageContext | None = None) -> list[PartJob]:
-        """Jobs of all segments that are left, by the camera that is known or ``before`` has found, or else of one."""
-        if not self._left:
+    def _begin_segments(self, posed: Path | None = None) -> list[StageJob]:
+        """Jobs of all segments that are left, if the camera is known or found from the scene ``posed``; else of one."""
+        if not self._segments:
             return []
-        camera = self._left[0][0].settings.sfm.camera
-        if before is not None and not has_known_camera(camera):
-            camera = _camera_of(before.posed) or camera
-        count = len(self._left) if has_known_camera(camera) else 1
-        chosen, self._left = self._left[:count], self._left[count:]
-        found = list[PartJob]()
-        for context, size in sorted(chosen, key=lambda one: one[0].segment):
-            sfm = context.settings.sfm.model_copy(update={"camera": camera})
-            found += self._begin(replace(context, settings=context.settings.model_copy(update={"sfm": sfm})), size)
-        return found
+        camera = self._segments[0][0].settings.sfm.camera
+        if posed is not None and not has_known_camera(camera):
+            camera = _camera_of(posed) or camera
+        count = len(self._segments) if has_known_camera(camera) else 1
+        chosen, self._segments = self._segments[:count], self._segments[count:]
+        jobs = list[StageJob]()
+        for segment, size in sorted(chosen, key=lambda pair: pair[0].segment):
+            sfm = segment.settings.sfm.model_copy(update={"camera": camera})
+            context = replace(segment, settings=segment.settings.model_copy(update={"sfm": sfm}))
+            check_options(stages_of(context), self.record, self._overwrite, self.record.of_submaps(context.prefix))
+            shared = StageJob(self, context, round(_SHARED_WORK * size))
+            jobs += self._begin_submaps(shared) if shared.is_done else [shared]
+        return jobs
 
-    def _begin(self, context: StageContext, size: int) -> list[PartJob]:
-        """Jobs of a segment: the stages that all its sub-maps need, or where these are done each sub-map."""
-        stages = stages_of(context)
-        check_options(stages, self.record, self._overwrite)
-        waiting = list(dict.fromkeys(stage.part for stage in stages if not self.record.is_done(stage.name)))
-        if None in waiting:
-            waiting = [None]
-        frames = {inside.submap.number: inside.submap.frames or 1 for inside in context.submaps()}
-        shares = {part: _PLAN_SHARE if part is None else frames[part] / sum(frames.values()) for part in waiting}
-        own = [PartJob(self, context, part, stages, round(shares[part] * size)) for part in waiting]
-        return own if None in waiting else [*own, *self._next(context)]
+    def _begin_submaps(self, shared: StageJob) -> list[StageJob]:
+        """Jobs of the sub-maps of a segment that has poses, and of the segments that have waited for them."""
+        contexts, left = shared.context.submaps(), shared.size / _SHARED_WORK - shared.size
+        frames = [context.submap.frames or 1 for context in contexts if context.submap]
+        jobs = list[StageJob]()
+        for context, count in zip(contexts, frames, strict=True):
+            check_options(stages_of(context), self.record, self._overwrite)
+            jobs.append(StageJob(self, context, round(left * count / sum(frames))))
+        return [*(job for job in jobs if not job.is_done), *self._begin_segments(shared.context.posed)]
 
-    def end(self, job: PartJob, error: ReportedError | None = None) -> list[PartJob]:
+    def end(self, job: StageJob, error: ReportedError | None = None) -> list[StageJob]:
         """Take that a job has ended, or why it failed; returns what is to be done after it."""
-        context = job.context
         if error is not None:
-            self.failures[context.segment, job.part] = error
-        elif job.part is None:
-            return self._begin(context, round(job.size / _PLAN_SHARE) - job.size)
-        return self._next(context) if job.part is None else []
+            self.failures.append((job.context, error))
+            return self._begin_segments(job.context.posed) if job.context.submap is None else []
+        return self._begin_submaps(job) if job.context.submap is None else []
 
 
 def _camera_of(scene: Path) -> CameraSettings | None:
@@ -141,44 +137,50 @@ def _camera_of(scene: Path) -> CameraSettings | None:
     return CameraSettings(model=camera.model, params=tuple(map(float, camera.params)), refine=False)
 
 
-class PartJob(Job):
-    """One part of a segment."""
+class StageJob(Job):
+    """The stages of one context."""
 
-    def __init__(
-        self, work: Reconstruction, context: StageContext, part: Part, stages: Sequence[Stage], size: int
-    ) -> None:
-        self._work, self.context, self.part, self.stages, self.size = work, context, part, stages, size
-        out, workers = context.out.resolve(), work.workers
-        self.task = PartTask(
-            title=f"{out.name}, {'poses' if part is None else f'sub-map {part}'}",
-            key=f"{out} {worker_name(context, part)}",
+    def __init__(self, jobs: StageJobs, context: StageContext, size: int) -> None:
+        self._jobs, self.context, self.size = jobs, context, size
+        self.stages = stages_of(context)
+        out, workers = context.root.resolve(), jobs.workers
+        submap = None if context.submap is None else context.submap.number
+        name = worker_name(context)
+        self.task = StageTask(
+            title=f"{context.out.resolve().name}, {'poses' if submap is None else f'sub-map {submap}'}",
+            key=f"{out} {name}",
             device=str(context.device) if workers is None else workers.options.device,
-            log=str(out / LOGS / f"{_part_name(part)}.log"),
+            log=str(out / LOGS / f"{name}.log"),
             threads=1 if workers is None else workers.executor.threads,
             source=str(context.source.resolve()),
-            out=str(out),
+            root=str(out),
             segment=context.segment,
+            submap=submap,
             settings=context.settings.model_dump_json(),
             mask=None if context.mask is None else str(context.mask.resolve()),
             data_format=context.data_format,
-            part=part,
         )
 
-    def run_here(self) -> list[PartJob]:
+    @property
+    def is_done(self) -> bool:
+        """Whether all stages are done."""
+        return all(self._jobs.record.is_done(stage.name) for stage in self.stages)
+
+    def run_here(self) -> list[StageJob]:
         """Do it in this process; returns what is to be done after it.
 
         Raises:
             NotWritableError: The disk is full, or cannot be written.
         """
         try:
-            run_stages(self.stages, self._work.record, self.part)
+            run_stages(self.stages, self._jobs.record)
         except NotWritableError:
             raise
         except (InputError, NotFiniteError, NothingDrawnError) as error:
-            if any(stage.part not in (None, self.part) for stage in self.stages):
+            if len(self.context.submaps()) > 1:
                 log.warning("%s; the others go on", str(error).rstrip("."))
-            return self._work.end(self, error)
-        return self._work.end(self)
+            return self._jobs.end(self, error)
+        return self._jobs.end(self)
 
     def progress(self) -> int:
         """Share of the stages that are done; the rest is over when the process has ended."""
@@ -187,16 +189,15 @@ class PartJob(Job):
 
     @property
     def doing(self) -> str:
-        """Title of the part, with the stage that its worker is at."""
+        """Title of the job, with the stage that its worker is at."""
         begun = [name for name, stage in self._states().items() if stage.state == "begun"]
         return " ".join([self.task.title, *(name.rpartition("/")[2] for name in begun)])
 
     def _states(self) -> dict[str, StageRecord]:
         """Its stages, as far as they are recorded; else failed ones without a word."""
-        record = self._work.record
+        record = self._jobs.record
         record.refresh()
-        names = [stage.name for stage in self.stages if stage.part == self.part]
-        return {name: record.stages.get(name, StageRecord({}, "failed")) for name in names}
+        return {stage.name: record.stages.get(stage.name, StageRecord(state="failed")) for stage in self.stages}
 
     def finish(self) -> Sequence[Job]:
         """Take up what the worker has written, and return the jobs after it."""
@@ -209,50 +210,46 @@ class PartJob(Job):
         return self._end(InputError(reason or "it failed"))
 
     def _end(self, error: InputError | None = None) -> Sequence[Job]:
-        """Tell what the worker has written; a stage at which its process died has failed."""
+        """Log what the worker has written; a stage at which its process died has failed."""
         for name, stage in self._states().items() if error is not None else ():
             if stage.state == "begun":
-                self._work.record.put(name, replace(stage, state="failed", summary=str(error)))
+                self._jobs.record.put(name, replace(stage, state="failed", summary=str(error)))
         for name, stage in self._states().items():
             if stage.summary:
-                what = stage.state if stage.state != "done" else f"took {duration(stage.seconds)}"
-                log.info("%s: %s; %s", name, stage.summary, what)
-        return self._work.end(self, error)
+                end = stage.state if stage.state != "done" else f"took {duration(stage.seconds)}"
+                log.info("%s: %s; %s", name, stage.summary, end)
+        return self._jobs.end(self, error)
 
 
-def worker_name(context: StageContext, part: Part) -> str:
-    """The worker of a part, for keys and files."""
-    return "-".join(filter(None, (context.segment, _part_name(part))))
-
-
-def _part_name(part: Part) -> str:
-    return "plan" if part is None else str(part)
+def worker_name(context: StageContext) -> str:
+    """The worker of a context, for keys and files."""
+    return "-".join(filter(None, (context.segment, "plan" if context.submap is None else str(context.submap.number))))
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartTask(Task):
-    """The stages of one part of a segment."""
+class StageTask(Task):
+    """The stages of one context, for a worker process."""
 
     worker: ClassVar[str] = "coliags_plugin.pipeline.jobs"
     source: str
-    out: str
+    root: str
     segment: str
+    submap: int | None  # number; None: the stages that all need
     settings: str  # JSON
     mask: str | None
     data_format: str | None
-    part: Part
 
 
-def work(task: PartTask) -> TaskOutcome:
+def work(task: StageTask) -> TaskOutcome:
     """Run the stages that are not done."""
-    return attempt(task.title, task.out, lambda: complete(task))
+    return attempt(task.title, task.root, lambda: complete(task))
 
 
-def complete(task: PartTask) -> None:
+def complete(task: StageTask) -> None:
     """Run the stages that are not done.
 
     Raises:
-        InputError: One cannot be done; what it says is in the record, too.
+        InputError: One cannot be done; the message is in the record, too.
     """
     import torch
 
@@ -260,17 +257,15 @@ def complete(task: PartTask) -> None:
 
     torch.set_num_threads(task.threads)
     settings = ReconstructionSettings.model_validate_json(task.settings, strict=False)  # of lists
-    mask = None if task.mask is None else Path(task.mask)
-    device = choose_device(task.device)
+    mask, device = None if task.mask is None else Path(task.mask), choose_device(task.device)
     context = StageContext(
-        Path(task.out), Path(task.source), settings, mask, task.data_format, device, segment=task.segment
+        Path(task.root), Path(task.source), settings, mask, task.data_format, device, segment=task.segment
     )
-    name = worker_name(context, task.part)
-    with locked(worker_lock(context.root, name), context.root, LOCK_SECONDS):
-        record = Record.of(context.root)
-        record.places = context.places
-        run_stages(stages_of(context), record, task.part)
+    if task.submap is not None:
+        context = next(one for one in context.submaps() if one.submap and one.submap.number == task.submap)
+    with locked(worker_lock(context.root, worker_name(context)), context.root, LOCK_SECONDS):
+        run_stages(stages_of(context), Record.of(context.root, context.places))
 
 
 if __name__ == "__main__":
-    run_worker(lambda text: work(PartTask.from_json(text)))
+    run_worker(lambda text: work(StageTask.from_json(text)))

@@ -6,7 +6,7 @@ A long video is cut into segments, which are reconstructed each by itself and jo
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.pipeline.contents import figures_as
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, chosen_frames, frame_source, opened_recording
-from coliags_plugin.pipeline.jobs import Reconstruction, Workers
+from coliags_plugin.pipeline.jobs import StageJobs, Workers
 from coliags_plugin.pipeline.joins import find_joins
 from coliags_plugin.pipeline.page import write_page
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
@@ -30,7 +30,6 @@ from coliags_plugin.pipeline.stages import (
     PAGE_FILE,
     Record,
     Stage,
-    StageOutcome,
     StageRecord,
     check_options,
     run_stages,
@@ -73,25 +72,32 @@ def reconstruct(
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
         settings = settings.model_copy(update={"sfm": sfm})
-        log.info("%s", forecast(frame_source(source, Span(settings.frames.first, settings.frames.last)), settings))
+        video = frame_source(source, Span(settings.frames.first, settings.frames.last))
+        frames, seconds, size = forecast(video, settings)
+        log.info(
+            "%d frames of use: about %s of a CPU core and %s of disk, by a patient's clip",
+            frames,
+            duration(seconds),
+            file_size(size),
+        )
     else:
         _refuse_unused(source, settings, mask)
     context = StageContext(out, source, settings, mask, data_format, device, progress)
-    stages_of(context)  # finds out wrong settings before anything is written
+    for part in (context, *context.submaps()):
+        stages_of(part)  # finds out wrong settings before anything is written
     Record.of(out)  # refuses another folder
     workers = None if execution is None else _workers(execution)
     if workers is not None:
-        workers.executor.check(out, [path for path in (source, mask) if path is not None])
+        workers.executor.check(out, context.places)
     with locked(out / LOCK_FILE, out):
         wait_for_workers(out)
-        record = Record.of(out)
-        record.places = context.places
+        record = Record.of(out, context.places)
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
         segments = [(context, _UNITS)] if data_format is not None else _segments(context, record, overwrite)
         if len(segments) > 1 and workers is None:
             workers = _workers(ExecutionOptions(jobs=1, device=str(device)))
-        work = Reconstruction(record, segments, overwrite, workers)
-        work.run()
+        jobs = StageJobs(record, segments, overwrite, workers)
+        jobs.run()
         if len(segments) != 1:
             _join(out, record)
         write_page(out, record, source)
@@ -102,7 +108,7 @@ def reconstruct(
             f"{out / PAGE_FILE} shows why",
         )
     if not any(record.is_done(f"{segment.prefix}report") for segment, _ in segments):
-        failure = next(error for (_, part), error in work.failures.items() if not part)
+        failure = next(error for context, error in jobs.failures if context.folder == context.out)
         if len(segments) == 1:
             raise failure
         seen = f"none of {len(segments)} segments of {source} could be reconstructed: {str(failure).rstrip('.')}"
@@ -119,48 +125,39 @@ def _segments(context: StageContext, record: Record, overwrite: bool) -> list[tu
 
     Returns contexts of the segments and their frames, first the one in which most is followed.
     """
-    out, settings, chosen = context.out, context.settings, context.settings.frames
+    out, settings, chosen = context.root, context.settings, context.settings.frames
     cutting = chosen.model_dump(include={"first", "last", "every", "segment", "deinterlace"})
     options: dict[str, Any] = {"source": identity_of(context.source), "frames": cutting}
     if frame_source(context.source, Span(chosen.first, chosen.last)).expected > chosen.segment * chosen.every:
         options["least_submap"] = settings.least_submap
 
-    def run() -> StageOutcome:
+    def work() -> StageRecord:
         source = chosen_frames(context.source, chosen)
         survey, video = survey_and_cut(source, chosen, settings.least_submap, context.progress)
         survey.write(out)
         summary = f"{counted(video.frames, 'frame')} in {counted(len(video.segments), 'segment')}"
         files = {SURVEY_FILE: "sharpness and motion of every frame"}
-        return StageOutcome(summary, files, figures=video.model_dump(mode="json"))
+        return StageRecord(summary, files, figures=video.model_dump(mode="json"))
 
-    others = [name for name in record.stages if name not in ("survey", "joins")]
-    outputs = [SURVEY_FILE, *{name.partition("/")[0] for name in others if name.startswith("segment-")}]
-    outputs += [path for stage in stages_of(context) for path in stage.outputs]
-    stage = Stage("survey", options, run, outputs)
-    if not others:
-        record.forget(["survey"], [])
-    was_done = record.is_done("survey")
-    check_options([stage], record, overwrite)
-    if was_done and not record.is_done("survey"):  # removed along with all that was made by it
-        record.forget(list(record.stages), [])
-    if not (out / SURVEY_FILE).is_file():
-        record.forget(["survey"], [])
-    run_stages([stage], record)
+    if not (out / SURVEY_FILE).is_file() or not record.stages.keys() - {"survey", "joins"}:
+        record.forget(["survey"])
+    stages = [Stage("survey", work, options)]
+    check_options(stages, record, overwrite, list(record.stages))
+    run_stages(stages, record)
     video, survey = figures_as(record.stages, "survey", Video, out), Survey.read(out)
     segments = []
     for segment in sorted(video.segments, key=lambda span: -survey.part(span.first, span.last).followed.sum()):
         span = {"first": segment.first, "last": segment.last, "deinterlace": video.deinterlace}
-        own = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
-        segments.append((replace(context, out=out / segment.name, segment=segment.name, settings=own), segment.count))
+        of_segment = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
+        segments.append((replace(context, segment=segment.name, settings=of_segment), segment.count))
     return segments
 
 
 def _join(out: Path, record: Record) -> None:
-    """Join the segments."""
+    """Record how the segments are joined."""
     joins = find_joins(out, figures_as(record.stages, "survey", Video, out).segments)
     summary = f"{sum(join.joined for join in joins)} of {counted(len(joins), 'join')}"
-    figures = {"joins": [join.model_dump(mode="json") for join in joins]}
-    record.put("joins", StageRecord({}, "done", summary, figures=figures))
+    record.put("joins", StageRecord(summary, figures={"joins": [join.model_dump(mode="json") for join in joins]}))
 
 
 def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:
@@ -190,27 +187,12 @@ _POSED, _SUBMAP_FRAMES, _STEPS = 0.92, 45, 23
 _PIXEL, _DEPTH, _SUBMAP_BYTES = 1.0, 0.45e6, 75e6
 
 
-@dataclass(frozen=True)
-class Forecast:
-    """Time and disk that a reconstruction takes, right within a factor of two."""
-
-    frames: int  # of use, at most
-    seconds: float  # of one CPU core
-    size: float  # of the results, bytes
-
-    def __str__(self) -> str:
-        return (
-            f"{self.frames} frames of use: about {duration(self.seconds)} of a CPU core and {file_size(self.size)} of "
-            "disk, by a patient's clip"
-        )
-
-
-def forecast(source: FrameSource, settings: ReconstructionSettings) -> Forecast:
-    """The forecast of a video by the number and size of its frames."""
+def forecast(source: FrameSource, settings: ReconstructionSettings) -> tuple[int, float, float]:
+    """Frames of use, seconds of one CPU core and bytes that a video takes at most, right within a factor of two."""
     frames, steps = -(-source.expected // settings.frames.every), settings.steps
     height, width = next(iter(source))[1].shape[:2]
     pixels = int(height * width)
     posed, submaps = _POSED * frames, max(1.0, frames / _SUBMAP_FRAMES)
     share = min(pixels, _MOST_PIXELS) / _TRAINED_PIXELS
     seconds = _POSES * frames + share * posed * (_FRAME + _STEP * _STEPS * steps / 2000) + _SUBMAP * submaps
-    return Forecast(frames, seconds, frames * (_PIXEL * pixels + _DEPTH) + submaps * _SUBMAP_BYTES)
+    return frames, seconds, frames * (_PIXEL * pixels + _DEPTH) + submaps * _SUBMAP_BYTES

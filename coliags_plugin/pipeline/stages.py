@@ -32,26 +32,52 @@ MADE = "what `coliags reconstruct` wrote"
 PAGE_FILE = "index.html"
 #: Lock that a process holds while it works in the folder.
 LOCK_FILE = ".lock"
-#: For a worker that was asked to end, seconds.
+#: Longest wait for a worker that was asked to end, seconds.
 LOCK_SECONDS = 120.0
-#: A part of a segment's stages that one process works on: those that all others need (None), or those of one sub-map.
-Part = int | None
+#: Files and folders that each stage writes, in the folder of its segment or sub-map.
+OUTPUTS: dict[str, tuple[str, ...]] = {
+    "survey": ("survey.npz",),
+    "frames": ("frames",),
+    "poses": ("poses",),
+    "check": ("check.html", "check.json"),
+    "depth": ("depth", ".depth.work"),
+    "train": ("run",),
+    "evaluate": ("run/eval",),
+    "mesh": ("run/mesh",),
+    "coverage": ("run/coverage",),
+    "scene": ("run/scene.html", "run/pictures"),
+    "report": ("report.html",),
+}
+#: Stages that are of no sub-map.
+SHARED = ("survey", "frames", "poses", "joins")
 
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage that was begun."""
+    """What a stage has made, and how far it is."""
 
-    options: Mapping[str, Any]  # what it depends on, as JSON
-    state: Literal["begun", "failed", "done"] = "begun"  # failed: for its input
     summary: str = ""  # what came out, or why it failed, in one line
-    seconds: float = 0.0  # of the attempt that ended, wall-clock
-    files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to the folder, and what each is
+    files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to its folder, and what each is
     warnings: Sequence[str] = ()  # what limits the result, and what to do
     figures: Mapping[str, Any] = field(default_factory=dict)  # numbers of the summary, by name
+    state: Literal["begun", "failed", "done"] = "done"  # failed: for its input
+    options: Mapping[str, Any] = field(default_factory=dict)  # what it depends on, as JSON
+    seconds: float = 0.0  # of the attempt that ended, wall-clock
 
 
-#: Of a long video, behind the folder of the segment; of other sub-maps than the largest, behind theirs.
+@dataclass(frozen=True)
+class Stage:
+    """A step of a reconstruction. It reads what earlier stages wrote, and can be repeated after a kill.
+
+    ``work`` replaces what an attempt that was killed has left, or goes on with that.
+    """
+
+    name: str  # as the record and messages call it: behind the way to the folder of its sub-map
+    work: Callable[[], StageRecord]
+    options: Mapping[str, Any] = field(default_factory=dict)  # all that it depends on apart from the stages before it
+
+
+#: Name of a stage: of a long video behind the folder of the segment, of other sub-maps than the largest behind theirs.
 _StageName = Annotated[str, Field(pattern=r"^(segment-[0-9]{1,6}/)?(submap-[0-9]{1,6}/)?[a-z]+$")]
 _RECORDED = TypeAdapter(dict[_StageName, StageRecord])
 
@@ -59,7 +85,7 @@ _RECORDED = TypeAdapter(dict[_StageName, StageRecord])
 class Record:
     """The record in a folder, written after every change: its stages by their names.
 
-    Several processes, each of which works on a part, change one file: what others have written is read before.
+    Several processes, each of which works on other stages, change one file: what others have written is read before.
     """
 
     def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
@@ -68,9 +94,10 @@ class Record:
         self._file, self._read = folder / RECORD_FILE, (0, 0)
 
     @classmethod
-    def of(cls, folder: Path) -> Record:
+    def of(cls, folder: Path, places: Sequence[Path] = ()) -> Record:
         """The record of a folder; empty for one that is new or empty, and refused for one of something else."""
         record = cls(folder)
+        record.places = (folder, *places)
         if not record.refresh() and folder.exists():
             if not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir()):
                 raise InputError(
@@ -88,17 +115,17 @@ class Record:
         """
         if not self._file.is_file():
             return False
-        if (known := self._status()) != self._read:
-            self.stages, self._read = _read(self._file), known
+        if (status := self._status()) != self._read:
+            self.stages, self._read = _read(self._file), status
         return True
 
     def _status(self) -> tuple[int, int]:
-        """What differs after every writing."""
+        """Inode and time of the file, which differ after every writing."""
         status = self._file.stat()
         return status.st_ino, status.st_mtime_ns
 
     def within(self, segment: str) -> dict[str, StageRecord]:
-        """The stages of a segment, named and with files as in its folder; of a short video's, '', all."""
+        """The stages of a segment, named and with files as in its folder; of the only one, '', all."""
         prefix = f"{segment}/" if segment else ""
         return {
             name.removeprefix(prefix): replace(
@@ -108,8 +135,12 @@ class Record:
             if name.startswith(prefix)
         }
 
+    def of_submaps(self, prefix: str) -> list[str]:
+        """Names of the stages of sub-maps of the segment that a prefix is of."""
+        return [name for name in self.stages if name.startswith(prefix) and name.rpartition("/")[2] not in SHARED]
+
     def is_done(self, name: str) -> bool:
-        """Whether a stage is."""
+        """Whether a stage is done."""
         return name in self.stages and self.stages[name].state == "done"
 
     def put(self, name: str, stage: StageRecord) -> None:
@@ -117,24 +148,27 @@ class Record:
         summary, *warnings = (without_places(text, self.places) for text in (stage.summary, *stage.warnings))
         self.write({name: replace(stage, summary=summary, warnings=tuple(warnings))})
 
-    def forget(self, names: Sequence[str], outputs: Sequence[str]) -> None:
-        """Forget stages and remove what they made, files and folders relative to the folder."""
+    def forget(self, names: Sequence[str]) -> None:
+        """Forget stages, and remove what they made, with folders that are empty then."""
         self.write(without=names)
-        for output in outputs:
-            path = self.folder / output
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-            if path.parent != self.folder and path.parent.is_dir() and not any(path.parent.iterdir()):
-                path.parent.rmdir()
+        for name in names:
+            parent, _, step = name.rpartition("/")
+            for path in (self.folder / parent / output for output in OUTPUTS.get(step, ())):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+                for folder in path.relative_to(self.folder).parents:
+                    place = self.folder / folder
+                    if place != self.folder and place.is_dir() and not any(place.iterdir()):
+                        place.rmdir()
 
     def write(self, stages: Mapping[str, StageRecord] | None = None, without: Sequence[str] = ()) -> None:
         """Write the file atomically, with these stages and without some, in the order of segments and sub-maps."""
         with locked(self.folder / f".{RECORD_FILE}.lock", self._file, LOCK_SECONDS):
             self.refresh()
             changed = {name: stage for name, stage in self.stages.items() if name not in without} | dict(stages or {})
-            self.stages = dict(sorted(changed.items(), key=lambda item: _place(item[0])))
+            self.stages = dict(sorted(changed.items(), key=lambda item: list(map(int, re.findall(r"\d+", item[0])))))
             plain = {name: asdict(stage) for name, stage in self.stages.items()}
             write_json(self._file, {"format": FORMAT, "version": __version__, "stages": plain})
             self._read = self._status()
@@ -154,11 +188,6 @@ def wait_for_workers(folder: Path) -> None:
     for lock in sorted(folder.glob(worker_lock(folder, "*").name)):
         with locked(lock, folder, LOCK_SECONDS):
             pass
-
-
-def _place(name: str) -> list[int]:
-    """Numbers of segment and sub-map of a stage."""
-    return [int(number) for number in re.findall(r"\d+", name)]
 
 
 def _read(file: Path) -> dict[str, StageRecord]:
@@ -182,88 +211,67 @@ def _is_ours(path: Path) -> bool:
     return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")
 
 
-@dataclass(frozen=True)
-class StageOutcome:
-    """What a stage has made."""
-
-    summary: str
-    files: Mapping[str, str] = field(default_factory=dict)  # paths relative to the folder, and what each is
-    warnings: Sequence[str] = ()  # logged, and kept
-    figures: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A step of a reconstruction. It reads what earlier stages wrote, and can be repeated after a kill.
-
-    ``run`` replaces what an attempt that was killed has left, or goes on with that.
-    """
-
-    name: str  # as the record and messages call it
-    options: Mapping[str, Any]  # all that it depends on apart from the stages before it, as JSON
-    run: Callable[[], StageOutcome]
-    outputs: Sequence[str] = ()  # files and folders that it writes, relative to the reconstruction's folder
-    part: Part = None  # which of several parts, independent of each other, it is of; None: all need it
-
-
-def run_stages(stages: Sequence[Stage], record: Record, part: Part = None) -> None:
-    """Run the stages of a part that are not done, in order.
+def run_stages(stages: Sequence[Stage], record: Record) -> None:
+    """Run the stages that are not done, in order.
 
     Raises:
-        InputError: One cannot be done; which, and what stands, is told.
+        InputError: One cannot be done; the message names it, and those before it that stand.
     """
-    for number, stage in enumerate(stages, start=1):
-        if stage.part != part:
-            continue
+    for number, stage in enumerate(stages):
         try:
-            _run_stage(stage, f"[{number}/{len(stages)}] {stage.name}", record)
+            _run_stage(stage, f"[{number + 1}/{len(stages)}] {stage.name}", record)
         except InputError as error:
-            before = [other.name for other in stages[: number - 1] if other.part in (None, part)]
-            raise _failed(error, stage, before) from error
+            before = ", ".join(earlier.name for earlier in stages[:number])
+            stands = f"{before} {'stand' if number > 1 else 'stands'}: the same command goes on from there"
+            advice = ". ".join(part.rstrip(".") for part in (error.do, stands if before else "") if part)
+            raise type(error)(f"stage {stage.name}: {error.seen}", error.expected, advice) from error
 
 
 def _run_stage(stage: Stage, title: str, record: Record) -> None:
     """Run a stage that is not done."""
-    known = record.stages.get(stage.name)
-    if known is not None and known.state == "done":
-        log.info("%s: done before: %s", title, known.summary)
+    recorded = record.stages.get(stage.name)
+    if recorded is not None and recorded.state == "done":
+        log.info("%s: done before: %s", title, recorded.summary)
         return
-    log.info("%s%s", title, "" if known is None else ": begun before")
-    begun = StageRecord(_plain(stage.options))
+    log.info("%s%s", title, "" if recorded is None else ": begun before")
+    begun = StageRecord(state="begun", options=_plain(stage.options))
     record.put(stage.name, begun)
-    began = time.monotonic()
+    start = time.monotonic()
     try:
-        made = stage.run()
+        result = stage.work()
     except (InputError, NotFiniteError, NothingDrawnError) as error:
         record.put(stage.name, replace(begun, state="failed", summary=str(error)))
         raise
     except KeyboardInterrupt:
         log.info("%s: interrupted; the same command goes on from here", title)
         raise
-    seconds = time.monotonic() - began
-    for warning in made.warnings:
+    seconds = time.monotonic() - start
+    for warning in result.warnings:
         log.warning("%s: %s", stage.name, warning)
-    record.put(stage.name, replace(begun, state="done", seconds=round(seconds, 1), **vars(made)))
-    log.info("%s: %s; took %s", title, made.summary, duration(seconds))
+    prefix = stage.name[: stage.name.rfind("/") + 1]
+    files = {prefix + path: what for path, what in result.files.items()}
+    record.put(stage.name, replace(result, files=files, options=begun.options, seconds=round(seconds, 1)))
+    log.info("%s: %s; took %s", title, result.summary, duration(seconds))
 
 
-def check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
-    """Refuse what was made with other options, or with ``overwrite`` remove it along with what needs it.
+def check_options(stages: Sequence[Stage], record: Record, overwrite: bool, after: Sequence[str] = ()) -> None:
+    """Refuse what was made with other options, or with ``overwrite`` forget it along with what needs it.
 
-    The options of a stage that failed may change.
+    That are the stages behind it, and those whose names are in ``after``. The options of a stage that failed may
+    change.
     """
     for number, stage in enumerate(stages):
-        known = record.stages.get(stage.name)
-        if known is None or not (differences := _differences(known.options, stage.options)):
+        recorded = record.stages.get(stage.name)
+        if recorded is None or not (differences := _differences(recorded.options, stage.options)):
             continue
-        if not overwrite and known.state != "failed":
+        if not overwrite and recorded.state != "failed":
             raise InputError(
                 f"{record.folder}: stage {stage.name} was made with {differences}",
                 "the options that it was begun with",
                 f"Choose another `output`, or pass `overwrite=True` to repeat {stage.name} and what follows it",
             )
-        later = [other for other in stages[number:] if stage.part in (None, other.part)]
-        record.forget([other.name for other in later], [output for other in later for output in other.outputs])
+        record.forget([*(later.name for later in stages[number:]), *after])
+        return
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -282,10 +290,3 @@ def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as they are read back from JSON."""
     values: dict[str, Any] = json.loads(json.dumps(options, default=str))
     return values
-
-
-def _failed(error: InputError, stage: Stage, before: Sequence[str]) -> InputError:
-    """The error of a stage, with those before it that stand."""
-    stands = f"{', '.join(before)} {'stand' if len(before) > 1 else 'stands'}: the same command goes on from there"
-    advice = ". ".join(part.rstrip(".") for part in (error.do, stands if before else "") if part)
-    return type(error)(f"stage {stage.name}: {error.seen}", error.expected, advice)

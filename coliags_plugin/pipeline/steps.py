@@ -1,9 +1,9 @@
-"""The stages of a segment, what each does, and their order: those that all its sub-maps need, and those of each."""
+"""The stages of a segment, their order and what each does: those that all its sub-maps need, and those of each."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST
-from coliags_plugin.pipeline.stages import Part, Stage, StageOutcome
+from coliags_plugin.pipeline.stages import Stage, StageRecord
 from coliags_plugin.pipeline.survey import Survey
 from coliags_plugin.reporting.numbers import area_text
 
@@ -42,56 +42,44 @@ _TRAINING_VIEWS = 16
 _ALL_STEPS, _LEAST_SHARE, _MOST_SHARE = 100, 0.25, 2.0
 
 
-#: What is done, its name, options, and files and folders that it writes.
-_Row = tuple[Callable[[StageContext], StageOutcome], str, Mapping[str, Any], tuple[str, ...]]
-
-
 def stages_of(context: StageContext) -> list[Stage]:
-    """The stages for a source, or a segment of it, in order: of the sub-maps as far as they are known."""
-    settings, stages = context.settings, list[Stage]()
-    source: dict[str, Any] = {"source": identity_of(context.source)}
+    """The stages of a context, in order: those that all sub-maps of a segment need, or those of one sub-map."""
+    rows = _shared_stages(context) if context.submap is None else _submap_stages(context)
+    return [Stage(context.prefix + name, partial(work, context), options) for work, name, options in rows]
+
+
+#: What a stage does, its name, and its options.
+_Row = tuple[Callable[[StageContext], StageRecord], str, Mapping[str, Any]]
+
+
+def _shared_stages(context: StageContext) -> Iterator[_Row]:
+    """Stages before those of the sub-maps; none for a scene with poses."""
+    settings = context.settings
     if context.data_format is None:
-        mask, source = None if context.mask is None else identity_of(context.mask), {}
-        rows: list[_Row] = [
-            (make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}, ("frames",)),
-            (make_poses, "poses", {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}, ("poses",)),
-        ]
-        stages += _stages(context, None, rows)
-    for inside in context.submaps():
-        number = inside.submap.number
-        own = {"model": identity_of(context.posed / str(inside.submap.model))} if number else source
-        stages += _stages(inside, number, _submap_rows(inside, own))
-    return stages
+        mask = None if context.mask is None else identity_of(context.mask)
+        yield make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}
+        yield make_poses, "poses", {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
 
 
-def _stages(context: StageContext, part: Part, rows: Iterable[_Row]) -> list[Stage]:
-    """Stages that are named, and have their files, by the way to the folder of their sub-map."""
-    prefix = context.prefix
-
-    def run(work: Callable[[StageContext], StageOutcome]) -> StageOutcome:
-        made = work(context)
-        return replace(made, files={prefix + path: what for path, what in made.files.items()})
-
-    return [
-        Stage(prefix + name, options, partial(run, work), [prefix + path for path in outputs], part)
-        for work, name, options, outputs in rows
-    ]
-
-
-def _submap_rows(context: StageContext, source: Mapping[str, Any]) -> Iterator[_Row]:
-    """The stages of one sub-map; the first depends on ``source``, as no stage before it does."""
-    settings, size = context.settings, {"size": context.settings.size}
-    yield check_data, "check", {**size, **source}, ("check.html", "check.json")
+def _submap_stages(context: StageContext) -> Iterator[_Row]:
+    """Stages of one sub-map; the first depends on what no stage before it does: the scene, or the other model."""
+    settings, size, model = context.settings, {"size": context.settings.size}, context.submap and context.submap.model
+    source: dict[str, Any] = {}
+    if context.submap and context.submap.number:
+        source = {"model": identity_of(context.posed / str(model))}
+    elif context.data_format is not None:
+        source = {"source": identity_of(context.source)}
+    yield check_data, "check", {**size, **source}
     if context.estimates_depth:
-        yield estimate_depth, "depth", {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work")
+        yield estimate_depth, "depth", {**size, "depth": settings.depth.model_dump()}
     method = method_for(context)
     load_method(method)  # an unknown method is found out before the work starts
-    yield train, "train", {"method": method, "steps": steps_for(context), "seed": settings.seed}, ("run",)
-    yield evaluate, "evaluate", {}, ("run/eval",)
-    yield mesh, "mesh", {"mesh": settings.mesh.model_dump()}, ("run/mesh",)
-    yield coverage, "coverage", {"coverage": settings.coverage.model_dump()}, ("run/coverage",)
-    yield show, "scene", {}, ("run/scene.html", "run/pictures")
-    yield report, "report", {}, ("report.html",)
+    yield train, "train", {"method": method, "steps": steps_for(context), "seed": settings.seed}
+    yield evaluate, "evaluate", {}
+    yield mesh, "mesh", {"mesh": settings.mesh.model_dump()}
+    yield coverage, "coverage", {"coverage": settings.coverage.model_dump()}
+    yield show, "scene", {}
+    yield report, "report", {}
 
 
 def identity_of(path: Path) -> Mapping[str, Any]:
@@ -100,17 +88,17 @@ def identity_of(path: Path) -> Mapping[str, Any]:
     return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}
 
 
-def make_frames(context: StageContext) -> StageOutcome:
+def make_frames(context: StageContext) -> StageRecord:
     """Write the frames of use, and their mask, by the survey of the video."""
     settings = context.settings.frames
     span = Span(settings.first, settings.last, settings.deinterlace)
     source, survey = frame_source(context.source, span), Survey.read(context.root).part(span.first, span.last)
     summary = write_frames(source, survey, context.frames, settings, context.mask, context.progress)
     made = {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}
-    return StageOutcome(summary, made)
+    return StageRecord(summary, made)
 
 
-def make_poses(context: StageContext) -> StageOutcome:
+def make_poses(context: StageContext) -> StageRecord:
     """Estimate poses and points by structure from motion, and write them as a scene."""
     from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
     from coliags_plugin.reconstruction.structure.colmap_scene import RIBBON_FILE, write_sfm_scene
@@ -147,10 +135,10 @@ def make_poses(context: StageContext) -> StageOutcome:
         else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
     )
     made = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
-    return StageOutcome(f"{atlas.summary()}; {unit}", made, warnings)
+    return StageRecord(f"{atlas.summary()}; {unit}", made, warnings)
 
 
-def check_data(context: StageContext) -> StageOutcome:
+def check_data(context: StageContext) -> StageRecord:
     """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
     from coliags_plugin.checks.data.check import check_scene
     from coliags_plugin.checks.data.page import check_page, verdict
@@ -164,10 +152,10 @@ def check_data(context: StageContext) -> StageOutcome:
     write_json(context.folder / "check.json", check.as_json())
     made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
     warnings = [str(finding) for finding in check.findings]
-    return StageOutcome(verdict(check), made, warnings, {"frames": len(scene.video)})
+    return StageRecord(verdict(check), made, warnings, {"frames": len(scene.video)})
 
 
-def estimate_depth(context: StageContext) -> StageOutcome:
+def estimate_depth(context: StageContext) -> StageRecord:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
     from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
 
@@ -176,7 +164,7 @@ def estimate_depth(context: StageContext) -> StageOutcome:
         context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
     )
     made = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
-    return StageOutcome(estimated.summary, made, estimated.warnings)
+    return StageRecord(estimated.summary, made, estimated.warnings)
 
 
 def method_for(context: StageContext) -> str:
@@ -188,13 +176,13 @@ def method_for(context: StageContext) -> str:
 def steps_for(context: StageContext) -> int:
     """Training steps: in proportion to the sub-map's frames, for the largest not below those of the settings."""
     steps, submap = context.settings.steps, context.submap
-    if submap.frames is None:
+    if submap is None or submap.frames is None:
         return steps
     least = 1.0 if submap.number == 0 else _LEAST_SHARE
     return max(1, round(steps * min(_MOST_SHARE, max(least, submap.frames / _ALL_STEPS))))
 
 
-def train(context: StageContext) -> StageOutcome:
+def train(context: StageContext) -> StageRecord:
     """Train, or go on from the newest checkpoint."""
     from coliags_plugin.engine.run_folder import RunFolder
     from coliags_plugin.engine.training import TrainingRequest, open_training
@@ -218,10 +206,10 @@ def train(context: StageContext) -> StageOutcome:
     rows = folder.log_rows()
     last = f", {rows[-1]['psnr']:.2f} dB in the last view" if rows else ""
     summary = f"{method_name(request.method)}, {trainer.steps} steps{last}"
-    return StageOutcome(summary, {"run": "the trained run"}, figures={"steps": trainer.steps})
+    return StageRecord(summary, {"run": "the trained run"}, figures={"steps": trainer.steps})
 
 
-def evaluate(context: StageContext) -> StageOutcome:
+def evaluate(context: StageContext) -> StageRecord:
     """Evaluate the held-out frames."""
     from coliags_plugin.engine import evaluator
     from coliags_plugin.engine.trained import load_trained
@@ -236,7 +224,7 @@ def evaluate(context: StageContext) -> StageOutcome:
     made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
     warnings = [f"held-out frames: {part.transparency_warning}" for part in result.sets.values() if part.blank]
-    return StageOutcome(f"held-out frames: {shown}", made, warnings, figures=figures | _training_psnr(trained))
+    return StageRecord(f"held-out frames: {shown}", made, warnings, figures=figures | _training_psnr(trained))
 
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:
@@ -252,7 +240,7 @@ def _training_psnr(trained: TrainedRun) -> dict[str, float]:
     return {"psnr_training": sum(values) / len(values)} if values else {}
 
 
-def mesh(context: StageContext) -> StageOutcome:
+def mesh(context: StageContext) -> StageRecord:
     """Fuse the rendered depth into a mesh."""
     from coliags_plugin.engine.trained import load_trained
     from coliags_plugin.surface.meshing.fusion import mesh_run
@@ -263,10 +251,10 @@ def mesh(context: StageContext) -> StageOutcome:
     shown = area_text(area, trained.scene.is_metric)
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
     figures = {"triangles": len(made.mesh), "area": float(area), "unit": trained.scene.length_unit}
-    return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
+    return StageRecord(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
 
 
-def coverage(context: StageContext) -> StageOutcome:
+def coverage(context: StageContext) -> StageRecord:
     """Measure the share of the wall seen in the video; left out where it cannot be measured."""
     from coliags_plugin.geometry.meshes.files import read_mesh
     from coliags_plugin.surface.coverage.writing import measure_scene
@@ -277,17 +265,17 @@ def coverage(context: StageContext) -> StageOutcome:
     except NotWritableError:
         raise
     except InputError as error:
-        return StageOutcome(f"left out: {error}", warnings=[f"no coverage: {error}"])
+        return StageRecord(f"left out: {error}", warnings=[f"no coverage: {error}"])
     what = "what was seen and missed, for research use only"
     values = made.values
-    return StageOutcome(
+    return StageRecord(
         "; ".join(" ".join(line.split()).rstrip(";") for line in made.summary),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
         figures={name: values[name] for name in ("seen", "seen_area") if values[name] is not None},
     )
 
 
-def show(context: StageContext) -> StageOutcome:
+def show(context: StageContext) -> StageRecord:
     """Write the page of Gaussians and meshes along the path of the video, and pictures of some of its frames."""
     from coliags_plugin.config.options import PageOptions
     from coliags_plugin.engine.trained import load_trained
@@ -295,10 +283,10 @@ def show(context: StageContext) -> StageOutcome:
 
     trained = load_trained(context.run, context.device, context.scene)
     depth_scale = _write_pictures(trained, context.run / "pictures")
-    size, steps = _PAGES[context.submap.number == 0], min(trained.step, _MOST_FIT_STEPS)
+    size, steps = _PAGES[context.folder == context.out], min(trained.step, _MOST_FIT_STEPS)
     page = save_page(trained, PageOptions(size=size, seconds=math.inf), steps)
     files = {"run/scene.html": SCENE, "run/pictures": PICTURES}
-    return StageOutcome(page.text, files, figures={"depth_scale": depth_scale})
+    return StageRecord(page.text, files, figures={"depth_scale": depth_scale})
 
 
 def _write_pictures(trained: TrainedRun, folder: Path) -> str:
@@ -327,7 +315,7 @@ def _write_pictures(trained: TrainedRun, folder: Path) -> str:
     return scale
 
 
-def report(context: StageContext) -> StageOutcome:
+def report(context: StageContext) -> StageRecord:
     """Write the report of the run."""
     from coliags_plugin.comparison.report.report import write_report
     from coliags_plugin.config.options import ReportOptions
@@ -337,4 +325,4 @@ def report(context: StageContext) -> StageOutcome:
     title = f"Reconstruction of {context.source.name}"
     options = ReportOptions(context.folder / "report.html", title=title, protocol=protocol)
     write_report([context.run], options)
-    return StageOutcome("report.html", {"report.html": "views, metrics, training, provenance"})
+    return StageRecord("report.html", {"report.html": "views, metrics, training, provenance"})

@@ -14,8 +14,8 @@ from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
-from coliags_plugin.pipeline.jobs import PartTask, work
-from coliags_plugin.pipeline.stages import StageOutcome
+from coliags_plugin.pipeline.jobs import StageTask, work
+from coliags_plugin.pipeline.stages import StageRecord
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film
 from tests.reconstruction.seen_points import frame_model
@@ -41,8 +41,8 @@ def done(monkeypatch):
 
     def faked(name):
         def work(context):
-            names.append("/".join(filter(None, (context.submap.folder, name))))
-            return StageOutcome(f"{name} done", {name: "a file"})
+            names.append("/".join(filter(None, (context.submap and context.submap.folder, name))))
+            return StageRecord(f"{name} done", {name: "a file"})
 
         return work
 
@@ -118,7 +118,7 @@ class Workers(TaskList):
         self.endings = list(endings)
 
     def outcome(self, task):
-        assert PartTask.from_json(task.to_json()) == task
+        assert StageTask.from_json(task.to_json()) == task
         ending = self.endings.pop(0) if self.endings else None
         if isinstance(ending, BaseException):
             raise ending

@@ -39,7 +39,7 @@ SCENE_FILE, FOLDER = "run/scene.html", "run/pictures"
 
 
 def done(files=(), warnings=(), **figures):
-    return StageRecord({}, "done", "well", 60.0, dict(files), warnings, figures)
+    return StageRecord("well", dict(files), warnings, figures, seconds=60.0)
 
 
 def similarity(seed: int) -> np.ndarray:
@@ -101,7 +101,7 @@ def three_submaps() -> dict[str, StageRecord]:
         "submap-1/scene": done({f"submap-1/{SCENE_FILE}": SCENE}),
         "submap-1/coverage": done(seen_area=800.0),
         "submap-2/check": done(frames=5),
-        "submap-2/depth": StageRecord({}, "failed", "no surface that 5 frames agree on. Check the poses."),
+        "submap-2/depth": failed("no surface that 5 frames agree on. Check the poses."),
     }
 
 
@@ -175,4 +175,4 @@ def write_short(out: Path) -> Path:
 
 
 def failed(why: str) -> StageRecord:
-    return StageRecord({}, "failed", why)
+    return StageRecord(why, state="failed")

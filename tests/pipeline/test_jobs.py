@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,10 +15,10 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
-from coliags_plugin.pipeline.context import StageContext
-from coliags_plugin.pipeline.jobs import PartJob, Reconstruction
+from coliags_plugin.pipeline.context import StageContext, Submap
+from coliags_plugin.pipeline.jobs import StageJob, StageJobs
 from coliags_plugin.pipeline.settings import ReconstructionSettings
-from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageOutcome, StageRecord
+from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
 from tests.comparison.small import lock_holder, until
 from tests.pipeline.conftest import TRAINING, write_atlas
 
@@ -32,7 +31,7 @@ def told(folder):
 
 
 def parts(executor):
-    return [task.part for task in executor.tasks]
+    return [task.submap for task in executor.tasks]
 
 
 @pytest.fixture
@@ -42,7 +41,7 @@ def posed(done, monkeypatch):
     def poses(context):
         done.append("make_poses")
         write_atlas(context.posed)
-        return StageOutcome("posed")
+        return StageRecord("posed")
 
     monkeypatch.setattr(steps, "make_poses", poses)
 
@@ -82,14 +81,15 @@ def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, a
 
 
 def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
-    stages = [SimpleNamespace(name=f"submap-3/{name}", part=3) for name in ("depth", "train", "mesh")]
-    context = StageContext(tmp_path, tmp_path, ReconstructionSettings(), None, None, torch.device("cpu"))
-    job = PartJob(Reconstruction(Record(tmp_path), [], False, None), context, 3, stages, 10)
+    submap, device = Submap(3), torch.device("cpu")
+    context = StageContext(tmp_path, tmp_path, ReconstructionSettings(), None, None, device, submap=submap)
+    job = StageJob(StageJobs(Record(tmp_path), [], False, None), context, 27)
     assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3", 0)
     worker = Record.of(tmp_path)
-    worker.put("submap-3/depth", StageRecord({}, "done"))
-    worker.put("submap-3/train", StageRecord({}))
-    assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3 train", 2)
+    for name in ("check", "depth"):
+        worker.put(f"submap-3/{name}", StageRecord())
+    worker.put("submap-3/train", StageRecord(state="begun"))
+    assert (job.doing, job.progress()) == (f"{tmp_path.name}, sub-map 3 train", 6)
 
 
 @pytest.mark.thorough

@@ -21,7 +21,7 @@ from coliags_plugin.pipeline.contents import read_contents
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
-from coliags_plugin.pipeline.stages import Record, StageOutcome
+from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.pipeline.survey import OVERLAP, Survey, cut, survey_video
 from coliags_plugin.reporting.video import write_video
 from tests import commands
@@ -144,7 +144,7 @@ def long_video(done, tmp_path, monkeypatch):
     def poses(context):
         done.append(f"{context.out.name}/make_poses")
         write_atlas(context.posed)
-        return StageOutcome("31 of 50 images posed")
+        return StageRecord("31 of 50 images posed")
 
     monkeypatch.setattr(steps, "make_poses", poses)
     return tmp_path / "long.mp4"
@@ -166,8 +166,8 @@ def test_a_long_video_is_reconstructed_segment_by_segment_and_what_is_done_is_no
     record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     made = read_contents(tmp_path / "out", record)
     names = [segment.span.name for segment in made.segments]
-    plans = [task for task in executor.tasks if task.part is None]
-    assert len(plans) == len(names) >= 3 and executor.tasks[0].part is None
+    plans = [task for task in executor.tasks if task.submap is None]
+    assert len(plans) == len(names) >= 3 and executor.tasks[0].submap is None
     cameras = [json.loads(task.settings)["sfm"]["camera"] for task in plans]
     assert cameras[0]["params"] is None and all(camera["params"] is not None for camera in cameras[1:])
     (skipped,) = made.video.skipped
@@ -242,7 +242,7 @@ def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path
     made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
     states = {name: made.stages[f"{name}/poses"].state for name in segments_of(made)}
     assert states == {name: "failed" if name == tried[0] else "done" for name in states}
-    plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.part is None]
+    plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.submap is None]
     assert [params is None for params in plans] == [True, True, False]
 
 

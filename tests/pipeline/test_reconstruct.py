@@ -190,6 +190,5 @@ class Frames:
 
 def test_the_clip_that_it_was_measured_on():
     """247 frames: 2,400 s of processor time and 487 MB."""
-    expected = forecast(Frames(247), ReconstructionSettings())
-    assert expected.seconds == pytest.approx(2400.0, rel=0.2) and expected.size == pytest.approx(487e6, rel=0.3)
-    assert "247 frames of use: about" in str(expected)
+    frames, seconds, size = forecast(Frames(247), ReconstructionSettings())
+    assert frames == 247 and seconds == pytest.approx(2400.0, rel=0.2) and size == pytest.approx(487e6, rel=0.3)

@@ -8,17 +8,23 @@ from dataclasses import replace
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.pipeline import stages
 from coliags_plugin.pipeline.stages import (
     LOCK_FILE,
     RECORD_FILE,
     Record,
     Stage,
-    StageOutcome,
     StageRecord,
     check_options,
     run_stages,
 )
 from tests.pipeline.conftest import Killed
+
+
+@pytest.fixture(autouse=True)
+def outputs(monkeypatch):
+    for name in ("first", "second", "third"):
+        monkeypatch.setitem(stages.OUTPUTS, name, (f"{name}.txt",))
 
 
 class Workshop:
@@ -29,7 +35,7 @@ class Workshop:
 
     def stages(self, **options):
         return [
-            Stage(name, {"value": options.get(name, 0)}, lambda name=name: self.work(name), (f"{name}.txt",))
+            Stage(name, lambda name=name: self.work(name), {"value": options.get(name, 0)})
             for name in ("first", "second", "third")
         ]
 
@@ -40,7 +46,7 @@ class Workshop:
         if name == self.kill:
             raise Killed
         self.done.append(name)
-        return StageOutcome(f"{name} is there", {f"{name}.txt": "a file"})
+        return StageRecord(f"{name} is there", {f"{name}.txt": "a file"})
 
     def run(self, overwrite=False, **options):
         self.done = []
@@ -119,14 +125,14 @@ def test_records_of_other_versions_are_refused(tmp_path):
 
 
 def test_several_processes_change_one_record_which_is_in_order(tmp_path):
-    record = Record(tmp_path, {"survey": StageRecord({}, "done")})
+    record = Record(tmp_path, {"survey": StageRecord()})
     record.write()
     names = ["segment-001/frames", "segment-000/submap-1/train", "segment-000/train"]
     workers = {name: Record.of(tmp_path) for name in names}
     for name, worker in workers.items():
-        worker.put(name, StageRecord({}, "done", files={name: "a file"}))
+        worker.put(name, StageRecord(files={name: "a file"}))
     assert record.refresh() and list(record.stages) == ["survey", *names[:0:-1], names[0]]
-    workers[names[0]].forget(names[1:2], [])
+    workers[names[0]].forget(names[1:2])
     assert list(Record.of(tmp_path).stages) == ["survey", names[2], names[0]]
     assert [path.name for path in tmp_path.iterdir()] == [RECORD_FILE]
     own = record.within("segment-000")

@@ -21,7 +21,7 @@ from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.context import StageContext, Submap, find_submaps
 from coliags_plugin.pipeline.settings import ReconstructionSettings
-from coliags_plugin.pipeline.stages import Record, StageOutcome
+from coliags_plugin.pipeline.stages import Record, StageRecord
 from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
 from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas
@@ -168,7 +168,7 @@ def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypa
 
 
 def test_warnings_and_figures_are_kept(done, atlas, tmp_path, monkeypatch, caplog):
-    outcome = StageOutcome("1 suspect finding", {}, ["suspect: the camera jumps. Check it"], {"frames": 14})
+    outcome = StageRecord("1 suspect finding", {}, ["suspect: the camera jumps. Check it"], {"frames": 14})
     monkeypatch.setattr(steps, "check_data", lambda context: outcome)
     cp.reconstruct(atlas, tmp_path / "out")
     assert "submap-1/check: suspect: the camera jumps. Check it" in caplog.text
