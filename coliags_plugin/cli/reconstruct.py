@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,6 +17,9 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.pipeline.contents import Contents
+    from coliags_plugin.pipeline.frame_sources import FrameSource
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,19 +89,52 @@ class ReconstructCommand(options.ReconstructOptions):
 
     def _frames(self) -> dict[str, Any]:
         """Settings of which frames are used, None where nothing is given."""
-        from coliags_plugin.pipeline.frame_sources import every_of, frame_at, frame_source
+        from coliags_plugin.pipeline.frame_sources import frame_source
 
         if self.every is not None and self.frames_per_second is not None:
             raise InputError("--every and --frames-per-second", "one of them")
         if self.start is None and self.end is None and self.frames_per_second is None:
             return {"frames.every": self.every}
         source = frame_source(self.video)
-        first, last = (None if time is None else frame_at(source, time) for time in (self.start, self.end))
+        first, last = (None if time is None else source.frame_at(seconds_of(time)) for time in (self.start, self.end))
         frames = {"frames.first": first, "frames.last": last, "frames.every": self.every}
         if self.frames_per_second is None:
             return frames
         every, by_time = every_of(source, self.frames_per_second), source.is_variable
         return {**frames, "frames.every": every, "frames.per_second": self.frames_per_second if by_time else None}
+
+
+def seconds_of(time: str) -> float:
+    """Seconds of a time such as ``200``, ``3:20`` or ``1:02:03.5`` (seconds, minutes, hours)."""
+    try:
+        parts = [float(part) for part in time.split(":")]
+        if len(parts) > 3 or min(parts) < 0.0:
+            raise ValueError
+    except ValueError:
+        expected = "seconds, or hours, minutes and seconds such as 3:20 or 1:02:03.5"
+        raise InputError(f"the time '{time}'", expected) from None
+    return sum(part * 60.0**power for power, part in enumerate(reversed(parts)))
+
+
+def every_of(source: FrameSource, rate: float) -> int:
+    """The n for which one of every n frames gives about ``rate`` frames a second.
+
+    Raises:
+        InputError: ``rate`` is no positive number, or the source does not tell how many frames a second it has.
+    """
+    from coliags_plugin.pipeline.video_files import FASTEST
+
+    if not 0.0 < rate < FASTEST:
+        raise InputError(f"--frames-per-second {rate:g}", f"a number between 0 and {FASTEST:g}")
+    recorded = source.known_rate
+    every = max(1, round(recorded / rate))
+    if source.is_variable:
+        what = "%s has a variable rate, of %.4g frames a second in the mean: the sharpest of every 1/%.4g s is used"
+        log.info(what, source.path, recorded, rate)
+    else:
+        what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
+        log.info(what, source.path, recorded, every, recorded / every)
+    return every
 
 
 def _lines(contents: Contents) -> Iterator[str]:

@@ -23,7 +23,7 @@ from coliags_plugin.datamanagers.recognition import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
 from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field
 from coliags_plugin.pipeline.settings import FrameSettings
-from coliags_plugin.pipeline.video_files import AS_IMAGES, FASTEST, VideoFile
+from coliags_plugin.pipeline.video_files import AS_IMAGES, VideoFile, video_file
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, read_image
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, camera_of_lens
 
@@ -60,19 +60,24 @@ class FrameSource:
 
     path: Path
     span: Span = Span()  # which of them
-    videos: tuple[Path, ...] = ()  # files; none: a folder of images
+    videos: tuple[VideoFile, ...] = ()  # none: a folder of images
 
     @property
     def expected(self) -> int:
         """Number of frames, at least 1: for progress, of one file about so many."""
-        if len(self.videos) == 1:
-            return self.span.count(VideoFile(self.videos[0]).expected)
-        return self.span.count(sum(self._counts.values()) or len(list_images(self.path)))
+        if not self.videos:
+            return self.span.count(len(self._images))
+        return self.span.count(self.videos[0].expected if len(self.videos) == 1 else self._count)
+
+    @property
+    def _count(self) -> int:
+        """Number of frames of all files."""
+        return sum(video.count for video in self.videos)
 
     @property
     def rate(self) -> float | None:
         """Frames a second of the first file, or of all if they differ in theirs; None where it does not say."""
-        if not self.videos or (rate := VideoFile(self.videos[0]).rate) is None:
+        if not self.videos or (rate := self.videos[0].rate) is None:
             return None
         times = self.times if len(self.videos) > 1 else None
         return rate if times is None or not _is_variable(times, rate) else float((len(times) - 1) / times[-1])
@@ -80,26 +85,38 @@ class FrameSource:
     @cached_property
     def times(self) -> Float64[np.ndarray, "N"] | None:
         """Presentation times of all frames after the first one, s, of one file after the other; None where unknown."""
-        found, start = list[Float64[np.ndarray, "N"]](), 0.0
-        for path in self.videos:
-            file = VideoFile(path)
-            if (rate := file.rate) is None or (file.index is None and len(self.videos) == 1):
+        parts, start = list[Float64[np.ndarray, "N"]](), 0.0
+        for video in self.videos:
+            if (rate := video.rate) is None or (video.index is None and len(self.videos) == 1):
                 return None
-            times = np.zeros(1) if file.times is None else file.times
-            lacking = np.arange(1, self._counts[path] - len(times) + 1) / rate
-            found.append(start + np.append(times, times[-1] + lacking))
-            start = found[-1][-1] + 1.0 / rate
-        return np.concatenate(found) if found else None
+            times = np.zeros(1) if video.times is None else video.times
+            missing = np.arange(1, video.count - len(times) + 1) / rate
+            parts.append(start + np.append(times, times[-1] + missing))
+            start = parts[-1][-1] + 1.0 / rate
+        return np.concatenate(parts) if parts else None
 
     @property
     def is_variable(self) -> bool:
-        """Return True if the frame rate varies: a frame is half a frame or more from its time at a constant rate."""
+        """True if the frame rate varies: a frame is half a frame or more from its time at a constant rate."""
         return self.times is not None and self.rate is not None and _is_variable(self.times, self.rate)
 
-    @cached_property
-    def _counts(self) -> dict[Path, int]:
-        """Number of frames of each file."""
-        return {path: VideoFile(path).count for path in self.videos}
+    def frame_at(self, seconds: float) -> int:
+        """Number of the frame that is shown at a time; InputError where the rate is unknown."""
+        rate, times = self.known_rate, self.times
+        if times is None:
+            return round(seconds * rate)
+        # The frame that is shown then, or comes within half a frame, as times are rounded.
+        place = int(np.searchsorted(times, seconds + 0.5 * np.diff(times).min(initial=1.0 / rate), side="right")) - 1
+        return place if place < len(times) - 1 else place + round((seconds - times[-1]) * rate)
+
+    @property
+    def known_rate(self) -> float:
+        """Frames a second; InputError where the source does not tell."""
+        if self.rate is None:
+            seen = f"{self.path} does not tell how many frames a second it has"
+            numbers = "`every=N`, `frames.first=100`, `frames.last=400`"
+            raise InputError(seen, "a video whose header does", f"Give numbers of frames: {numbers}")
+        return self.rate
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Names, which sort in frame order, and RGB images, all of one size.
@@ -140,13 +157,13 @@ class FrameSource:
     def _of_videos(self) -> Iterator[tuple[Path, str, UInt8[np.ndarray, "H W 3"], bool]]:
         """Files, names, frames and flags. Where a file ends too early, and another one follows, black ones."""
         start, end = 0, sys.maxsize if self.span.last is None else self.span.last + 1
-        for path in self.videos:
-            is_last, first = path == self.videos[-1], max(0, self.span.first - start)
-            count = sys.maxsize if is_last else self._counts[path]
+        for video in self.videos:
+            is_last, first = video is self.videos[-1], max(0, self.span.first - start)
+            count = sys.maxsize if is_last else video.count
             if first < (stop := min(end - start, count)):
-                frames = VideoFile(path).frames(first, stop, not is_last, self.span.shown)
+                frames = video.frames(first, stop, not is_last, self.span.shown)
                 for number, (image, is_interlaced) in enumerate(frames, start + first):
-                    yield path, f"frame_{number:06d}", image, is_interlaced
+                    yield video.path, f"frame_{number:06d}", image, is_interlaced
             start += count
 
 
@@ -158,17 +175,14 @@ def frame_source(path: Path, span: Span = Span()) -> FrameSource:
     """The frames of a file or folder, all or some."""
     if path.is_dir():
         if videos := videos_in(path):
-            for video in videos:
-                VideoFile(video).check()
-            return FrameSource(path, span, tuple(videos))
+            return FrameSource(path, span, tuple(map(video_file, videos)))
         list_images(path)
         return FrameSource(path, span)
     if not path.exists():
         raise InputError(f"no {path}", "a video file, or a folder of images", "Check the path")
     if path.suffix.lower() in FRAME_SUFFIXES:
         raise InputError(f"{path} is a single image", "a video file, or a folder of images", "Give its folder")
-    VideoFile(path).check()
-    return FrameSource(path, span, (path,))
+    return FrameSource(path, span, (video_file(path),))
 
 
 def chosen_frames(path: Path, settings: FrameSettings) -> FrameSource:
@@ -202,60 +216,6 @@ def watched(
         yield frame
         if progress is not None:
             progress(what, done, max(done, expected))
-
-
-def every_of(source: FrameSource, rate: float) -> int:
-    """Of how many frames one is used for about so many a second.
-
-    Raises:
-        InputError: ``rate`` is no positive number, or the source does not tell how many frames a second it has.
-    """
-    if not 0.0 < rate < FASTEST:
-        raise InputError(f"`frames_per_second={rate:g}`", f"a number between 0 and {FASTEST:g}")
-    own = source.rate
-    if own is None:
-        raise InputError(
-            f"`frames_per_second={rate:g}`, and {source.path} does not tell how many frames a second it has",
-            "a video whose header does",
-            "Use one of every n frames: `every=N`",
-        )
-    every = max(1, round(own / rate))
-    if source.is_variable:
-        what = "%s has a variable rate, of %.4g frames a second in the mean: the sharpest of every 1/%.4g s is used"
-        log.info(what, source.path, own, rate)
-    else:
-        what = "%s has %.4g frames a second: the sharpest of every %d is used, %.3g a second"
-        log.info(what, source.path, own, every, own / every)
-    return every
-
-
-def frame_at(source: FrameSource, time: str) -> int:
-    """Number of the frame at a time such as ``200``, ``3:20`` or ``1:02:03.5`` (seconds, minutes, hours).
-
-    Raises:
-        InputError: This is no time, or the source does not tell how many frames a second has.
-    """
-    try:
-        parts = [float(part) for part in time.split(":")]
-        if len(parts) > 3 or min(parts) < 0.0:
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"the time '{time}'", "seconds, or hours, minutes and seconds such as 3:20 or 1:02:03.5"
-        ) from None
-    rate = source.rate
-    if rate is None:
-        raise InputError(
-            f"the time {time}, and {source.path} does not tell how many frames a second it has",
-            "a video whose header does",
-            "Give numbers of frames: `frames.first=100` and `frames.last=400`",
-        )
-    seconds, times = sum(part * 60.0**power for power, part in enumerate(reversed(parts))), source.times
-    if times is None:
-        return round(seconds * rate)
-    # The frame that is shown then, or comes within half a frame, as times are rounded.
-    place = int(np.searchsorted(times, seconds + 0.5 * np.diff(times).min(initial=1.0 / rate), side="right")) - 1
-    return place if place < len(times) - 1 else place + round((seconds - times[-1]) * rate)
 
 
 @contextmanager
@@ -311,7 +271,7 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
     if calibration is None:
         return source, settings
     height, width = next(iter(frames))[1].shape[:2]
-    lens, aspect = calibration.lens, VideoFile(source).aspect if frames.videos == (source,) else 1
+    lens, aspect = calibration.lens, frames.videos[0].aspect if len(frames.videos) == 1 else 1
     if round(lens.height * width / height) == round(lens.width * aspect):  # calibrated with pixels as they are stored
         lens = lens.resized(round(lens.width * aspect), lens.height)
     model, params = camera_of_lens(lens, str(calibration.path), width, height)

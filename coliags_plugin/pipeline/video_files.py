@@ -88,11 +88,23 @@ class VideoIndex:
         return Key(time, size, int(self.keys[place - 1, 1]))
 
 
-@dataclass(frozen=True)
 class VideoFile:
-    """A video file, decoded anew by every iteration; frame n is what follows n frames, in every container."""
+    """A video file, decoded anew by every iteration; frame n is what follows n frames, in every container.
 
-    path: Path
+    Raises:
+        InputError: The file cannot be opened, or has no video.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self.opened() as (container, stream):
+            width, height = stream.width, stream.height
+            if (count := len(_videos(container))) > 1:
+                what = "%s has %d video streams: number %d is used, of %d x %d"
+                log.warning(what, path, count, stream.index, width, height)
+        if (square := round(width * self.aspect)) != width:
+            what = "%s has pixels that are not square (%s) and is read as %d x %d: `params` and `mask` are of that size"
+            log.warning(what, path, self.aspect, square, height)
 
     @contextmanager
     def opened(self) -> Iterator[tuple[InputContainer, VideoStream]]:
@@ -117,10 +129,6 @@ class VideoFile:
                 raise InputError(f"FFmpeg does not know the codec of {self.path}", "another one", AS_IMAGES)
             yield container, max(known, key=lambda stream: stream.width * stream.height)
 
-    def check(self) -> None:
-        """Raise InputError if the file cannot be opened; warn, once, of several streams and of pixels not square."""
-        _check(*self._identity)
-
     @cached_property
     def aspect(self) -> Fraction:
         """Width of a pixel as stored over its height; 1 where the file does not say, in earnest."""
@@ -131,17 +139,19 @@ class VideoFile:
     @property
     def index(self) -> VideoIndex | None:
         """Times of the frames, for which the file is read once; None where packets do not tell them."""
-        return _packets_of(*self._identity)[0]
+        return self._packets[0]
 
     @property
     def expected(self) -> int:
         """Number of frames that the file should have, or of packets where these do not tell; at least 1."""
-        return max(1, _packets_of(*self._identity)[1] if self.index is None else self.index.stated)
+        return max(1, self._packets[1] if self.index is None else self.index.stated)
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Number of frames, those included that a file which is cut off lacks at its end; at least 1."""
-        return max(1, _decoded_frames(*self._identity) if self.index is None else self.index.stated)
+        if self.index is not None:
+            return max(1, self.index.stated)
+        return max(1, sum(frame is not None for frame in self.decoded()))
 
     @cached_property
     def rate(self) -> float | None:
@@ -161,11 +171,6 @@ class VideoFile:
         """Presentation times of the frames after that of the first, s; None where packets do not tell them."""
         index = self.index
         return None if index is None else (index.times - index.times[0]) * float(index.unit)
-
-    @property
-    def _identity(self) -> tuple[Path, int, int]:
-        status = self.path.stat()
-        return self.path.absolute(), status.st_size, status.st_mtime_ns
 
     def frames(
         self, first: int, stop: int, is_filled: bool, shown: Callable[[np.ndarray, bool], np.ndarray]
@@ -277,6 +282,51 @@ class VideoFile:
                 yield number, frame
             number += 1
 
+    @cached_property
+    def _packets(self) -> tuple[VideoIndex | None, int]:
+        """Index of the file, None where its packets lack times, and their number."""
+        shown, keys = list[int | None](), list[tuple[int, int, int]]()
+        begin, end = np.inf, -np.inf  # of all streams, s
+        with self.opened() as (container, stream):
+            codec = stream.codec_context.name
+            for packet in _filled(container):
+                time = packet.dts if packet.pts is None else packet.pts
+                if time is not None and packet.time_base is not None:
+                    begin = min(begin, float(time * packet.time_base))
+                    end = max(end, float((time + (packet.duration or 0)) * packet.time_base))
+                if packet.stream_index == stream.index:
+                    if packet.is_keyframe and packet.pts is not None:
+                        keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+                    # VP8 marks packets that show nothing; in MPEG-4 part 2 they are short, as real frames may be.
+                    is_shown = not packet.is_discard and (codec != "vp8" or bool(bytes(packet)[0] & 0x10))
+                    is_sure = codec != "mpeg4" or packet.size > _EMPTY
+                    shown += [packet.pts if is_sure else None] if is_shown else []
+            unit, seconds = stream.time_base or Fraction(1), (container.duration or 0) / 1e6
+            # The header of MP4 and MOV lists all frames; that of AVI may state nonsense, of which the length is then.
+            entries = stream.index_entries if "mp4" in container.format.name else ()
+            listed = sum(not entry.is_discard for entry in entries)
+            if not listed and stream.frames <= self.path.stat().st_size and 0.0 < end - begin < _COMPLETE * seconds:
+                listed = stream.frames or round(len(shown) * seconds / (end - begin))
+        packets = np.array([time for time in shown if time is not None], np.int64)
+        order = np.argsort(packets, kind="stable")
+        times, places = packets[order], np.arange(len(order))
+        is_even = len(times) == len(shown) and (np.diff(times) > 0).all()
+        is_even = is_even and (np.abs(order - places) <= _REORDERED).all()
+        if not keys or not is_even or (start := next(self.decoded(), None)) is None or start.pts is None:
+            return None, len(shown)
+        times = times[times >= start.pts]
+        index = VideoIndex(times, np.array(sorted(keys), np.int64), unit, max(len(times), listed))
+        looked_at = {index.key_before(number) for number in (0, len(times) // 2, len(times) - 1)} if len(times) else {}
+        return index if looked_at and all(self._is_right(index, key) for key in looked_at) else None, len(shown)
+
+    def _is_right(self, index: VideoIndex, key: Key | None) -> bool:
+        """Return True if frames decoded from a key frame on have the index's times, up to the first damaged one."""
+        whole = takewhile(lambda frame: frame is not None, self.decoded(key))
+        times = (frame.pts for frame in islice(whole, _COMPARED) if frame is not None)
+        decoded = [time for time in times if time is not None and (key is None or time >= key.time)]
+        place = np.searchsorted(index.times, decoded[0]) if decoded else 0
+        return index.times[place:][: len(decoded)].tolist() == decoded
+
     def decoded(self, key: Key | None = None, threads: int = 0) -> Iterator[VideoFrame | None]:
         """Decode all frames, or those from a key frame on; None stands for what is damaged up to the next key frame.
 
@@ -289,7 +339,7 @@ class VideoFile:
                 with suppress(av.FFmpegError):  # all is read then
                     container.seek(key.before, stream=stream)
             is_first = key is None
-            for packet in _packets(container, stream):
+            for packet in _filled(container, stream):
                 if key is not None and not key.is_in(packet):
                     continue
                 key, is_first, is_before = None, False, is_before or (is_first and not packet.is_keyframe)
@@ -318,7 +368,7 @@ def _videos(container: InputContainer) -> list[VideoStream]:
     return [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
 
 
-def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packet]:
+def _filled(container: InputContainer, *streams: VideoStream) -> Iterator[Packet]:
     """Packets that hold something, of some streams or of all, as far as the file can be read."""
     with suppress(av.FFmpegError, IndexError):  # at the end, of streams that begin within the file
         for packet in container.demux(*streams):
@@ -326,64 +376,12 @@ def _packets(container: InputContainer, *streams: VideoStream) -> Iterator[Packe
                 yield packet
 
 
-@lru_cache(maxsize=64)
-def _check(path: Path, size: int, modified: int) -> None:
-    """Open a file, which is known by its size and time, and say what is not as usual."""
-    with VideoFile(path).opened() as (container, stream):
-        aspect, width, height = VideoFile(path).aspect, stream.width, stream.height
-        if (count := len(_videos(container))) > 1:
-            what = "%s has %d video streams: number %d is used, of %d x %d"
-            log.warning(what, path, count, stream.index, width, height)
-        if (square := round(width * aspect)) != width:
-            what = "%s has pixels that are not square (%s) and is read as %d x %d: `params` and `mask` are of that size"
-            log.warning(what, path, aspect, square, height)
+def video_file(path: Path) -> VideoFile:
+    """A video file, which is read and warned of once while it is not changed."""
+    status = path.stat()
+    return _video_file(path, status.st_size, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=64)
-def _decoded_frames(path: Path, size: int, modified: int) -> int:
-    """Number of frames that can be decoded of a file, which is known by its size and time."""
-    return sum(frame is not None for frame in VideoFile(path).decoded())
-
-
-@lru_cache(maxsize=64)
-def _packets_of(path: Path, size: int, modified: int) -> tuple[VideoIndex | None, int]:
-    """Index of a file, which is known by its size and time, and number of packets; None where these lack times."""
-    file, shown, keys = VideoFile(path), list[int | None](), list[tuple[int, int, int]]()
-    begin, end = np.inf, -np.inf  # of all streams, s
-    with file.opened() as (container, stream):
-        codec = stream.codec_context.name
-        for packet in _packets(container):
-            time = packet.dts if packet.pts is None else packet.pts
-            if time is not None and packet.time_base is not None:
-                begin = min(begin, float(time * packet.time_base))
-                end = max(end, float((time + (packet.duration or 0)) * packet.time_base))
-            if packet.stream_index == stream.index:
-                if packet.is_keyframe and packet.pts is not None:
-                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
-                # VP8 marks packets that show nothing; in MPEG-4 part 2 they are of a few bytes, and may be real frames.
-                is_shown = not packet.is_discard and (codec != "vp8" or bool(bytes(packet)[0] & 0x10))
-                is_sure = codec != "mpeg4" or packet.size > _EMPTY
-                shown += [packet.pts if is_sure else None] if is_shown else []
-        unit, seconds = stream.time_base or Fraction(1), (container.duration or 0) / 1e6
-        # The header of MP4 and MOV lists all frames; that of AVI may state nonsense, of which the length is then.
-        listed = sum(not entry.is_discard for entry in stream.index_entries) if "mp4" in container.format.name else 0
-        if not listed and stream.frames <= size and 0.0 < end - begin < _COMPLETE * seconds:
-            listed = stream.frames or round(len(shown) * seconds / (end - begin))
-    packets = np.array([time for time in shown if time is not None], np.int64)
-    order = np.argsort(packets, kind="stable")
-    times, places = packets[order], np.arange(len(order))
-    is_even = len(times) == len(shown) and (np.diff(times) > 0).all() and (np.abs(order - places) <= _REORDERED).all()
-    if not keys or not is_even or (start := next(file.decoded(), None)) is None or start.pts is None:
-        return None, len(shown)
-    times = times[times >= start.pts]
-    index = VideoIndex(times, np.array(sorted(keys), np.int64), unit, max(len(times), listed))
-    looked_at = {index.key_before(number) for number in (0, len(times) // 2, len(times) - 1)} if len(times) else {}
-    return index if looked_at and all(_is_right(file, index, key) for key in looked_at) else None, len(shown)
-
-
-def _is_right(file: VideoFile, index: VideoIndex, key: Key | None) -> bool:
-    """Return True if frames decoded from a key frame on have the index's times, up to the first damaged one."""
-    whole = (frame.pts for frame in takewhile(lambda frame: frame is not None, file.decoded(key)) if frame is not None)
-    decoded = [time for time in islice(whole, _COMPARED) if time is not None and (key is None or time >= key.time)]
-    place = np.searchsorted(index.times, decoded[0]) if decoded else 0
-    return index.times[place:][: len(decoded)].tolist() == decoded
+def _video_file(path: Path, size: int, modified: int) -> VideoFile:
+    return VideoFile(path)

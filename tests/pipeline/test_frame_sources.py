@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from coliags_plugin.cli.reconstruct import every_of, seconds_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
-from coliags_plugin.pipeline.frame_sources import Span, every_of, frame_at, frame_source
+from coliags_plugin.pipeline.frame_sources import Span, frame_source
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film, write_film, write_images
 
@@ -73,12 +74,12 @@ def test_times_are_frames(tmp_path):
     source = frame_source(tmp_path / "film.mp4")
     assert source.rate == pytest.approx(15.0)
     for text, frame in (("0", 0), ("3:20", 3000), ("1:00:00.2", 54003), ("0.4", 6)):
-        assert frame_at(source, text) == frame
+        assert source.frame_at(seconds_of(text)) == frame
     for text in ("", "3:x", "-1", "1:2:3:4"):
         with pytest.raises(InputError, match="seconds, or hours, minutes and seconds"):
-            frame_at(source, text)
+            seconds_of(text)
     with pytest.raises(InputError, match=r"does not tell how many frames a second.*frames.first"):
-        frame_at(frame_source(write_images(tmp_path / "images", film([0, 5]))), "3:20")
+        frame_source(write_images(tmp_path / "images", film([0, 5]))).frame_at(200.0)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +87,7 @@ def test_times_are_frames(tmp_path):
 )
 def test_of_how_many_frames_one_is_used(rate, wanted, every, caplog):
     with caplog.at_level(logging.INFO):
-        assert every_of(SimpleNamespace(path="film.mp4", rate=rate, is_variable=False), wanted) == every
+        assert every_of(SimpleNamespace(path="film.mp4", known_rate=rate, is_variable=False), wanted) == every
     assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
 
 

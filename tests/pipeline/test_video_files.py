@@ -10,14 +10,13 @@ import av
 import numpy as np
 import pytest
 
+from coliags_plugin.cli.reconstruct import every_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.pipeline.frame_selection import one_field
 from coliags_plugin.pipeline.frame_sources import (
     Span,
     chosen_frames,
-    every_of,
-    frame_at,
     frame_source,
     opened_recording,
 )
@@ -133,7 +132,7 @@ def test_an_edit_list_says_which_frames_are_shown(tmp_path):
     (tmp_path / "a.mp4").write_bytes(data)
     source = frame_source(tmp_path / "a.mp4")
     assert [number_of(image) for _, image in source] == list(range(10, 35))
-    assert source.expected == 25 and frame_at(source, "0.4") == 10
+    assert source.expected == 25 and source.frame_at(0.4) == 10
     for first in (1, 6, 13, 24):
         assert number_of(next(iter(frame_source(source.path, Span(first))))[1]) == 10 + first
 
@@ -198,8 +197,8 @@ def test_times_are_those_of_the_frames(tmp_path, name, caplog):
     source = frame_source(write_film(FRAMES[:20], tmp_path / name, times=VARIABLE, **codec))
     np.testing.assert_allclose(source.times, np.array(VARIABLE) / 1000, atol=1e-9)
     assert source.is_variable and source.rate == pytest.approx(19 / 2.12) and numbers(source.path) == list(range(20))
-    for text, frame in (("0", 0), ("0.2", 5), ("0.359", 9), ("1.2", 9), ("1.4", 10), ("1.75", 14), ("0:02.12", 19)):
-        assert frame_at(source, text) == frame
+    for seconds, frame in ((0, 0), (0.2, 5), (0.359, 9), (1.2, 9), (1.4, 10), (1.75, 14), (2.12, 19)):
+        assert source.frame_at(seconds) == frame
     with caplog.at_level("INFO"):
         assert every_of(source, 3.0) == 3
     assert "variable rate" in caplog.text and "every 1/3 s" in caplog.text
@@ -213,7 +212,7 @@ def test_even_rates_are_not_variable(tmp_path, name):
     codec = {"codec": "mjpeg", "pix_fmt": "yuvj420p"} if name == "a.avi" else ORDERED
     source = frame_source(write_film(FRAMES, tmp_path / name, rate=Fraction(30000, 1001), **codec))
     assert source.rate == pytest.approx(30000 / 1001, rel=1e-4) and not source.is_variable
-    assert [frame_at(source, str(number * 1001 / 30000)) for number in range(40)] == list(range(40))
+    assert [source.frame_at(number * 1001 / 30000) for number in range(40)] == list(range(40))
     assert survey_video(source).times is None
 
 
@@ -222,7 +221,7 @@ def test_files_of_a_folder_may_have_other_rates(tmp_path):
         write_film(FRAMES[:20], tmp_path / f"{part}.mp4", rate=rate)
     source = frame_source(tmp_path)
     np.testing.assert_allclose(source.times, [*np.arange(20) / 10, *(2.0 + np.arange(20) / 20)], atol=1e-9)
-    assert source.is_variable and source.rate == pytest.approx(39 / 2.95) and frame_at(source, "2.5") == 30
+    assert source.is_variable and source.rate == pytest.approx(39 / 2.95) and source.frame_at(2.5) == 30
 
 
 QUADRANTS = np.zeros((48, 64, 3), np.uint8)
