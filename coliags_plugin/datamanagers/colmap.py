@@ -25,8 +25,7 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
 from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit
-from coliags_plugin.geometry.lenses.models import Array, PinholeLens
-from coliags_plugin.geometry.lenses.tabulated import MappedLens
+from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 
 if TYPE_CHECKING:

@@ -29,8 +29,7 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import FACTORS, POINTS_FILE, SceneSettings, Unit, printed_unit
-from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, PinholeLens
-from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 

@@ -17,7 +17,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.reading.images import resize_nearest, resize_rgb
-from coliags_plugin.geometry.lenses.models import Lens, PinholeLens, Undistortion
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
 
 _Key = TypeVar("_Key")
 

@@ -10,8 +10,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import subsampled
-from coliags_plugin.geometry.lenses.models import FisheyeLens
-from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, OpenCVLens
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 

@@ -19,8 +19,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
-from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, Undistortion
-from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, OpenCVLens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
 from tests.datamanagers.wall_scenes import PINHOLE, load_scene, look, manager, off_wall, poses, rays, seen_from

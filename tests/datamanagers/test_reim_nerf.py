@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.geometry.lenses.models import LENSES, undistortion_map
+from coliags_plugin.geometry.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.undistortion import undistortion_map
 from tests.datamanagers.kinds import change_frames, remove
 from tests.datamanagers.wall_scenes import FAR, load_scene, look, manager, names, poses, write_wall
 

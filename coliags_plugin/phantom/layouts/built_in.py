@@ -13,8 +13,7 @@ from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.datamanagers.scene_settings import write_unit
-from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
+from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model, write_reconstruction

@@ -63,7 +63,7 @@ def test_what_is_written_is_read(tmp_path):
     [
         ("</rig>", "", r"calibration\.xml is not XML: .*line \d+"),
         ("<rig>", "<!DOCTYPE rig [<!ENTITY a 'b'>]><rig>", "has a document type"),
-        ("_kb4", "_k1_k2", "camera model 'calibu_fu_fv_u0_v0_k1_k2'. Expected calibu_fu_fv_u0_v0_kb4.* --camera"),
+        ("_kb4", "_k1_k2", "camera model 'calibu_fu_fv_u0_v0_k1_k2'. Expected calibu_fu_fv_u0_v0_kb4.* `camera`"),
         ("; -4.07e-05", "", r"params '\[  717\.2;.*913 \]'. Expected 8 finite numbers"),
         ("717.5", "nan", r"params .*Expected 8 finite numbers"),
         ("717.5", "-717.5", r"focal lengths 717\.2, -717\.5 and .*above 0"),
