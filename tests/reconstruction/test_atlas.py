@@ -36,7 +36,7 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     CameraSettings,
     SfmSettings,
     TrackSettings,
-    tracked_starts,
+    candidate_cameras,
 )
 from coliags_plugin.reconstruction.structure.video import read_video
 from coliags_plugin.reporting.image_files import write_png
@@ -380,7 +380,7 @@ def halves(tmp_path_factory):
     images = images_of(folder, tube_frames(LONG, 1.0))
     with quiet_colmap(0):
         video = read_video(images, TRACKED)
-        (whole,) = video.mapped(TRACKED, tracked_starts(TRACKED.camera)[0][0], None)
+        (whole,) = video.mapped(TRACKED, candidate_cameras(TRACKED.camera, tracked=True)[0][0], None)
     parts = [part_of(whole, range(HALF)), part_of(whole, range(HALF, LONG))]
     parts[1].transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(TURN), MOVE))
     return video, whole, [Hypothesis.of(part, video.brightness) for part in parts]

@@ -12,7 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, choose, is_ambiguous, reversed_in_depth
+from coliags_plugin.reconstruction.structure.hypotheses import (
+    Hypothesis,
+    choose,
+    fitting_focal_lengths,
+    reversed_in_depth,
+)
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, brightness_correlation, depths_of
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     CALIBRATED,
@@ -20,11 +25,11 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
     Start,
     camera_of_lens,
+    candidate_cameras,
     distortion,
     field_of_view,
     is_refined,
     starting_cameras,
-    starts,
 )
 from tests.reconstruction.seen_points import seen_points
 from tests.textured_tube import HEIGHT, WIDTH
@@ -181,21 +186,18 @@ def test_a_fisheye_is_as_wide_as_its_own_law_says():
 
 
 @pytest.mark.parametrize(
-    ("focal", "error", "correlation", "lens", "told"),
+    ("focal", "error", "correlation", "lens", "fits"),
     [
         (260.0, 0.51, -0.5, "SIMPLE_RADIAL", True),
-        (210.0, 0.51, -0.5, "SIMPLE_RADIAL", False),
         (260.0, 0.7, -0.5, "SIMPLE_RADIAL", False),
         (260.0, 0.51, 0.5, "SIMPLE_RADIAL", False),
-        # Another camera model tells nothing else unless its focal length is another one.
-        (210.0, 0.51, -0.7, "SIMPLE_RADIAL_FISHEYE", False),
         (260.0, 0.51, -0.7, "SIMPLE_RADIAL_FISHEYE", True),
     ],
 )
-def test_other_focal_lengths_that_fit_as_well_are_told(focal, error, correlation, lens, told):
+def test_focal_lengths_that_fit_as_well(focal, error, correlation, lens, fits):
     chosen, other = Hypothesis(Model(), -0.7), Hypothesis(Model(focal=focal, error=error, lens=lens), correlation)
-    assert not is_ambiguous([chosen], chosen, RANGE)
-    assert is_ambiguous([chosen, other], chosen, RANGE) == told
+    assert set(fitting_focal_lengths([chosen], chosen, RANGE)) == {200.0}
+    assert set(fitting_focal_lengths([chosen, other], chosen, RANGE)) == {200.0, *([focal] if fits else [])}
 
 
 def test_correlation_of_exact_falloff_and_of_too_few_points():
@@ -254,10 +256,12 @@ def test_colmaps_camera_projects_as_the_lens(name, size):
 )
 def test_known_cameras_have_one_start_and_are_kept(options, refined, count):
     settings = CameraSettings(focal_factors=(0.6, 0.4), **options)
-    assert is_refined(settings) == refined and len(starts(settings)) == count
+    lenses, factors = candidate_cameras(settings, tracked=False)
+    assert is_refined(settings) == refined and len(lenses) + len(factors) - 1 == count
     if not options:
-        fisheye = "SIMPLE_RADIAL_FISHEYE"
-        assert starts(settings) == [Start(fisheye, 0.6), Start(fisheye, 0.4), Start("SIMPLE_RADIAL", 0.6)]
+        assert lenses == [Start("SIMPLE_RADIAL_FISHEYE", 0.6), Start("SIMPLE_RADIAL", 0.6)] and factors == [0.6, 0.4]
+        lenses, factors = candidate_cameras(settings, tracked=True)
+        assert [lens.radial for lens in lenses] == [0.333, 0.0, 0.167] and len(factors) == 6
 
 
 def test_crops_are_refused():

@@ -8,7 +8,7 @@ at the lens resolves it: nearer points are brighter.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -16,19 +16,18 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.jobs import Progress, with_progress
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.reconstruction.structure.adjustment import adjust, held_out_error
 from coliags_plugin.reconstruction.structure.atlas import Again, held_part, part_of
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     SfmSettings,
     Start,
+    candidate_cameras,
     distortion,
     field_of_view,
     is_refined,
     starting_cameras,
-    starts,
-    tracked_starts,
 )
 from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
@@ -156,13 +155,15 @@ def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
     return min(firsts.values(), key=lambda one: one.distortion)
 
 
-def is_ambiguous(hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]) -> bool:
-    """Whether another model of plausible focal length, lit from the camera, fits nearly as well with another one."""
-    rivals = _explaining([one for one in hypotheses if one.is_plausible(plausible)])
+def fitting_focal_lengths(
+    hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]
+) -> list[float]:
+    """Focal lengths, pixels, of the chosen model and of others, as plausible and lit, that fit nearly as well."""
+    rivals = _explaining([hypothesis for hypothesis in hypotheses if hypothesis.is_plausible(plausible)])
     if chosen.is_lit_from_the_camera:
-        rivals = [one for one in rivals if one.is_lit_from_the_camera]
-    factors = [one.focal_length / chosen.focal_length for one in rivals if one.error <= _SAME_ERROR * chosen.error]
-    return any(max(factor, 1.0 / factor) > _OTHER_FOCAL_LENGTH for factor in factors)
+        rivals = [rival for rival in rivals if rival.is_lit_from_the_camera]
+    fitting = [rival for rival in rivals if rival.error <= _SAME_ERROR * chosen.error]
+    return [hypothesis.focal_length for hypothesis in (chosen, *fitting)]
 
 
 def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -205,35 +206,6 @@ def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> py
     return made
 
 
-def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | None = None) -> Start:
-    """Camera model and focal length to map a video from, chosen on its middle if there are several candidates.
-
-    The part is mapped from each of :func:`starts`; the models, and their reversals in depth, are bundle-adjusted and
-    compared (:func:`choose`). Where no model is plausible, the first start.
-    """
-    tried = starts(settings.camera)
-    if len(tried) == 1:
-        return tried[0]
-    part, refined = video.search_part(settings.search_images), is_refined(settings.camera)
-    hypotheses = []
-    for start in with_progress(tried, "try cameras", progress):
-        for model in part.mapped(settings, start, None)[:1]:
-            hypotheses += both_signs(model, part, refined)
-    plausible = settings.camera.field_of_view
-    try:
-        chosen = choose(hypotheses, plausible)
-    except InputError:
-        return tried[0]
-    _compare(chosen, hypotheses, plausible)
-    if is_ambiguous(hypotheses, chosen, plausible):
-        log.warning(
-            "the images hardly determine the focal length, and a wrong one distorts path and surface: give the "
-            "camera's calibration (`camera`, `params`) if there is one"
-        )
-    camera = next(iter(chosen.model.cameras.values()))
-    return Start(chosen.camera_model, float(camera.mean_focal_length() / max(camera.width, camera.height)))
-
-
 def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: bool) -> list[Hypothesis]:
     """The model, bundle-adjusted in place if refined, and its reversal in depth unless it is lit from the camera."""
     if refined:
@@ -244,20 +216,66 @@ def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: boo
     return [hypothesis, Hypothesis.of(reversed_in_depth(model, refined), video.brightness, is_reversed=True)]
 
 
-def _compare(chosen: Hypothesis, hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> None:
-    """Log how far each other camera model's best is from the chosen one."""
-    for name in dict.fromkeys(one.camera_model for one in hypotheses):
-        rivals = [one for one in hypotheses if one.camera_model == name and one.is_plausible(plausible)]
-        if name == chosen.camera_model or not rivals:
-            continue
-        compared = ("error", "observations", "focal_length")
-        rival = best(rivals)
-        log.info(
-            "%s is taken; %s at best has %+.1f %% reprojection error, %+.1f %% observations, %+.1f %% focal length",
-            chosen.camera_model,
-            name,
-            *(100.0 * (getattr(rival, value) / getattr(chosen, value) - 1.0) for value in compared),
+#: Adds cameras to those that were tried; returns the best of all, and the focal lengths, pixels, that fit as well.
+_Trial = Callable[[Iterable[Start]], tuple[Start, Sequence[float]]]
+
+
+def find_camera(
+    video: MatchedVideo,
+    settings: SfmSettings,
+    models: Sequence[pycolmap.Reconstruction] = (),
+    progress: Progress | None = None,
+) -> Start:
+    """Camera model and focal length of a video: those to map its features with, or of its tracks' ``models``.
+
+    First lenses of one focal length are tried, then the other focal lengths with the best lens.
+    """
+    lenses, factors = candidate_cameras(settings.camera, bool(video.tracks))
+    starts = iter(range(1, count := len(lenses) + len(factors)))
+
+    def announced(cameras: Sequence[Start]) -> Iterator[Start]:
+        for camera in cameras:
+            if progress is not None:
+                progress("try cameras", next(starts), count - 1)
+            yield camera
+
+    if count == 2:
+        return lenses[0]
+    trial = _trial_on_tracks(models, video, settings) if video.tracks else _trial_on_features(video, settings)
+    best, _ = trial(announced(lenses))
+    best, lengths = trial(announced([replace(best, focal_factor=factor) for factor in factors[1:]]))
+    if max(lengths) > _OTHER_FOCAL_LENGTH * min(lengths):
+        log.warning(
+            "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
+            "and surface: give the camera's calibration (--camera, --params) if there is one",
+            *(min(lengths), max(lengths)),
         )
+    return best
+
+
+def _trial_on_features(video: MatchedVideo, settings: SfmSettings) -> _Trial:
+    """Trial of cameras by the models that the middle of a video has with them, bundle-adjusted (:func:`choose`).
+
+    Where no model is plausible, the first camera is the best.
+    """
+    part, is_camera_refined = video.search_part(settings.search_images), is_refined(settings.camera)
+    hypotheses: list[Hypothesis] = []
+    tried: list[Start] = []
+
+    def trial(cameras: Iterable[Start]) -> tuple[Start, Sequence[float]]:
+        for camera in cameras:
+            tried.append(camera)
+            for model in part.mapped(settings, camera, None)[:1]:
+                hypotheses.extend(both_signs(model, part, is_camera_refined))
+        try:
+            chosen = choose(hypotheses, settings.camera.field_of_view)
+        except InputError:
+            return tried[0], [1.0]
+        side = max(part.sizes[0])
+        lengths = fitting_focal_lengths(hypotheses, chosen, settings.camera.field_of_view)
+        return Start(chosen.camera_model, chosen.focal_length / side), lengths
+
+    return trial
 
 
 #: Models on which cameras are tried, and their fewest images; cameras whose errors differ by less than this factor are
@@ -268,47 +286,24 @@ _TRIED_MODELS, _FEWEST_TRIED, _SAME_TEST = 3, 12, 1.02
 _MOVED = 0.0015
 
 
-def find_tracked_camera(
-    models: Sequence[pycolmap.Reconstruction],
-    video: MatchedVideo,
-    settings: SfmSettings,
-    progress: Progress | None = None,
-) -> Start:
-    """The most likely lens and focal length of least error of held-out tracks, on parts of the largest models.
-
-    First lenses of one focal length are tried, then the other focal lengths with the best lens.
-    """
-    lenses, factors = tracked_starts(settings.camera)
-    count = len(lenses) + len(factors) - 1
-    if count == 1:
-        return lenses[0]
+def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings) -> _Trial:
+    """Trial of cameras by held-out tracks of the middle of the largest models; of equal ones the first is the best."""
     large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
     parts = [_middle_of(model, video, settings.search_images) for model in large]
     errors: dict[Start, float] = {}
 
-    def likely(tried: Sequence[Start]) -> list[Start]:
-        for start in tried:
-            if progress is not None:
-                progress("try cameras", len(errors) + 1, count)
-            errors[start] = _test_error(parts, video, settings, start)
-            shape = "" if start.radial is None else f", distortion {start.radial:g}"
+    def trial(cameras: Iterable[Start]) -> tuple[Start, Sequence[float]]:
+        for camera in cameras:
+            errors[camera] = _test_error(parts, video, settings, camera)
+            shape = "" if camera.radial is None else f", distortion {camera.radial:g}"
             log.info(
                 "%s, focal length %.2f of the larger side%s: error of held-out tracks %.3f px",
-                *(start.model, start.focal_factor, shape, errors[start]),
+                *(camera.model, camera.focal_factor, shape, errors[camera]),
             )
-        return [start for start, error in errors.items() if error <= _SAME_TEST * min(errors.values())]
+        fitting = [camera for camera, error in errors.items() if error <= _SAME_TEST * min(errors.values())]
+        return fitting[0], [camera.focal_factor * max(video.sizes[0]) for camera in fitting]
 
-    lens = likely(lenses)[0]
-    left = likely([replace(lens, focal_factor=factor) for factor in factors[1:]])
-    lengths = [max(video.sizes[0]) * start.focal_factor for start in left]
-    least, most = min(lengths), max(lengths)
-    if most > _OTHER_FOCAL_LENGTH * least:
-        log.warning(
-            "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
-            "and surface: give the camera's calibration (`camera`, `params`) if there is one",
-            *(least, most),
-        )
-    return left[0]
+    return trial
 
 
 def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) -> pycolmap.Reconstruction:

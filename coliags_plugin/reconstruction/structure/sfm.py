@@ -26,8 +26,7 @@ from coliags_plugin.reconstruction.structure.hypotheses import (
     best,
     both_signs,
     choose,
-    find_start,
-    find_tracked_camera,
+    find_camera,
     with_camera,
 )
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
@@ -35,10 +34,10 @@ from coliags_plugin.reconstruction.structure.joining import join_models, stretch
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     SfmSettings,
+    candidate_cameras,
     field_of_view,
     has_known_camera,
     is_refined,
-    tracked_starts,
 )
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, read_video
 
@@ -130,9 +129,8 @@ def reconstruct(
 ) -> Atlas:
     """Estimate poses and points by structure from motion.
 
-    With features, an unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`),
-    and refined on the largest model; the others are adjusted with its cameras, unless their images have other sizes.
-    With tracks, its lens and focal length are those that held-out tracks favour (:func:`find_tracked_camera`).
+    An unknown camera's model and focal length are chosen on a part of the video (:func:`find_camera`); with features
+    they are refined on the largest model, whose cameras the others get, unless their images have other sizes.
 
     Args:
         images: Files in video order. Images of the same size share a camera.
@@ -150,8 +148,7 @@ def reconstruct(
         raise InputError(f"{len(images) or 'no'} image", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         video = read_video(images, settings, masks, progress)
-        chosen = _tracked(video, settings, progress) if video.tracks else _matched(video, settings, progress)
-        atlas = _atlas(video, chosen, settings, masks, progress)
+        atlas = _atlas(video, _models(video, settings, progress), settings, masks, progress)
         if not atlas.models:
             counts = [len(keypoints) for keypoints in video.keypoints]
             matches = [len(pairs) for pairs in video.matches.values()] or [0]
@@ -166,37 +163,34 @@ def reconstruct(
         return atlas
 
 
-def _tracked(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
-    """Models of tracks with one camera, the best of those tried on the largest of them."""
-    models = video.mapped(settings, tracked_starts(settings.camera)[0][0], progress)
+def _models(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
+    """Models of a video with one camera per image size, adjusted, the largest first."""
+    start = candidate_cameras(settings.camera, tracked=True)[0][0]
+    if not video.tracks:
+        start = find_camera(video, settings, progress=progress)
+    models = video.mapped(settings, start, progress)
     if not models:
         return []
-    start = find_tracked_camera(models, video, settings, progress)
-    for model in models:
-        with_camera(model, video, settings, start)
-    if settings.camera.refine:
-        bundle_adjust(models[0], refine_camera=True)
-        for model in models[1:]:
-            _take_cameras(model, models[0])
-    return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
-
-
-def _matched(video: MatchedVideo, settings: SfmSettings, progress: Progress | None) -> list[Hypothesis]:
-    """Models of matched features, with the cameras of the largest where image sizes are the same."""
-    models = video.mapped(settings, find_start(video, settings, progress), progress)
-    if not models:
-        return []
+    if video.tracks:
+        start = find_camera(video, settings, models, progress)
+        for model in models:
+            with_camera(model, video, settings, start)
+        if settings.camera.refine:
+            bundle_adjust(models[0], refine_camera=True)
+            for model in models[1:]:
+                _take_cameras(model, models[0])
+        return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
     refined = is_refined(settings.camera)
     known = has_known_camera(settings.camera) and not refined
-    first = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
-    chosen = [first]
+    largest = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
+    hypotheses = [largest]
     for model in models[1:]:
-        has_its_cameras = set(model.cameras) <= set(first.model.cameras)
+        has_its_cameras = set(model.cameras) <= set(largest.model.cameras)
         if has_its_cameras:
-            _take_cameras(model, first.model)
+            _take_cameras(model, largest.model)
             bundle_adjust(model, refine_camera=False)
-        chosen.append(best(both_signs(model, video, refined and not has_its_cameras)))
-    return chosen
+        hypotheses.append(best(both_signs(model, video, refined and not has_its_cameras)))
+    return hypotheses
 
 
 def _take_cameras(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> None:

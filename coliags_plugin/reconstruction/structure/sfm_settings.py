@@ -178,32 +178,26 @@ class Picture:
                 point.xy = point.xy + np.array(self.corner, float)
 
 
-def starts(settings: CameraSettings) -> list[Start]:
-    """Cameras to try, the most likely first; one if it is known.
-
-    Where no model is given, the fisheye starts from every focal length, and the pinhole with distortion from the first:
-    undistorted images are rarely wider than 100 degrees.
-    """
-    likely = settings.focal_factors[0]
-    if settings.model is None:
-        return [*(Start(_FISHEYE, factor) for factor in settings.focal_factors), Start(_UNDISTORTED, likely)]
-    factors = (likely,) if has_known_camera(settings) else settings.focal_factors
-    return [Start(settings.model, factor) for factor in factors]
-
-
 #: Distortion of the fisheye lenses tried on tracks, the most likely first: nearly a pinhole's image, whose radius is
 #: tan(x) = x + x^3 / 3 + ..., equal angles at equal distances, and between; and focal lengths, relative to the side.
 _RADIALS, _TRACKED_FACTORS = (0.333, 0.0, 0.167), (0.57, 0.4, 0.48, 0.68, 0.82, 1.0)
 
 
-def tracked_starts(settings: CameraSettings) -> tuple[list[Start], list[float]]:
-    """Lenses to try on tracks, the most likely first, all of one focal length; and focal lengths, this one first."""
-    factors = list(settings.focal_factors if settings.refine is False else _TRACKED_FACTORS)
+def candidate_cameras(settings: CameraSettings, tracked: bool) -> tuple[list[Start], list[float]]:
+    """Lenses to try, all of one focal length, and the focal lengths relative to the larger side, this one first.
+
+    The most likely come first; a known camera is the only one. Features tell the distortion, so that a fisheye and a
+    pinhole are tried on them; on tracks it is fixed.
+    """
+    factors = list(_TRACKED_FACTORS if tracked and settings.refine is not False else settings.focal_factors)
     if has_known_camera(settings):
         factors = factors[:1]
-    if settings.model is not None or settings.refine is False:
-        return [Start(settings.model or _FISHEYE, factors[0])], factors
-    return [Start(_FISHEYE, factors[0], radial) for radial in _RADIALS], factors
+    if settings.model is not None:
+        return [Start(settings.model, factors[0])], factors
+    if not tracked:
+        return [Start(model, factors[0]) for model in (_FISHEYE, _UNDISTORTED)], factors
+    radials = (None,) if settings.refine is False else _RADIALS
+    return [Start(_FISHEYE, factors[0], radial) for radial in radials], factors
 
 
 def has_known_camera(settings: CameraSettings) -> bool:

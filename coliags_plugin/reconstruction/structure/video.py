@@ -28,9 +28,9 @@ from coliags_plugin.reconstruction.structure.sfm_settings import (
     Picture,
     SfmSettings,
     Start,
+    candidate_cameras,
     has_known_camera,
     starting_cameras,
-    starts,
 )
 from coliags_plugin.reconstruction.structure.texture import sharpness
 
@@ -125,7 +125,7 @@ def read_video(
     """
     # Before the minutes of matching: what cannot be read or repeats, and a camera that does not fit.
     images, sizes, picture = _looked_at(images, masks)
-    starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
+    starting_cameras(settings.camera, images, sizes, candidate_cameras(settings.camera, tracked=False)[0][0])
     if has_known_camera(settings.camera):
         picture = None
     extract = feature_extractor(settings.features)
