@@ -22,7 +22,6 @@ from scipy.spatial import cKDTree
 from typing_extensions import Self
 
 from coliags_plugin.core import bounds
-from coliags_plugin.core.arrays import eroded
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 
