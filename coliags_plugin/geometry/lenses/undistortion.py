@@ -7,8 +7,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
-from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.arrays import eroded
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import Lens
 
 #: Where :func:`undistortion_map` sends pixels that no source pixel shows: outside any image, whatever the border.
