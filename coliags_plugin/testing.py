@@ -14,7 +14,6 @@ A test module that checks a method of your own::
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections import Counter
@@ -45,6 +44,7 @@ from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.rendering import render_run
 from coliags_plugin.engine.trained import TrainedRun, load_trained
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.results.reading import means_summary
 
 __all__ = ["METHOD_CHECKS", "CheckContext", "CheckFailedError", "CheckSkippedError", "name_of_check"]
 
@@ -431,7 +431,7 @@ def _step_changes_rows(trainer: Trainer) -> bool:
 def check_evaluates(context: CheckContext) -> None:
     """The method's protocol yields finite metrics, or reasons for those that cannot be had."""
     trained = _few_frames(context)
-    summary = json.loads((evaluate(trained, trained.config.protocol) / "metrics.json").read_text(encoding="utf-8"))
+    summary = means_summary(evaluate(trained, trained.config.protocol))
     metrics, reasons = {name: summary[name] for name in summary["directions"] if name in summary}, summary["reasons"]
     unexplained = [
         name for name, value in metrics.items() if not (reasons.get(name) if value is None else math.isfinite(value))

@@ -61,7 +61,7 @@ class Run:
         self._loaded: TrainedRun | None = None
 
     def __repr__(self) -> str:
-        """What it is, in one line."""
+        """Method, scene, seed and steps in one line."""
         relit = ", relit" if self._loaded is not None and self._loaded.relit else ""
         steps = f"step {self.step} of {self._identity.steps}"
         return f"{self.method} on {self.scene_name}, seed {self.seed}, {steps}{relit}: {self.path}"
@@ -108,10 +108,10 @@ class Run:
         from coliags_plugin.engine.devices import choose_device
         from coliags_plugin.engine.trained import load_trained
 
-        kept, device = self._loaded, choose_device(self.device)
-        if kept is None or (kept.lamp is None and kept.step != self.step):
-            self._loaded = kept = load_trained(self.path, device, self.data)
-        return kept
+        loaded, device = self._loaded, choose_device(self.device)
+        if loaded is None or (loaded.lamp is None and loaded.step != self.step):
+            self._loaded = loaded = load_trained(self.path, device, self.data)
+        return loaded
 
     @takes(EvaluateOptions)
     def evaluate(self, options: EvaluateOptions) -> Result:
@@ -122,13 +122,11 @@ class Run:
                 is not of the same video and world.
         """
         from coliags_plugin.engine import evaluator
-        from coliags_plugin.results.reading import RESULT_FILE, read_result
 
         trained = self.load()
         other = None if options.truth is None else _scene_of_size(options.truth, trained.scene)
         protocol = options.protocol or trained.config.protocol
-        folder = evaluator.evaluate(trained, protocol, other, options.refine_poses)
-        return read_result(folder / RESULT_FILE)
+        return evaluator.evaluate(trained, protocol, other, options.refine_poses)
 
     def frame_names(self, frames: str = "test") -> list[str]:
         """Names of frames that can be rendered.
@@ -187,11 +185,11 @@ class Run:
         from coliags_plugin.surface.meshing.fusion import mesh_run
         from coliags_plugin.surface.meshing.views import MeshSettings
 
-        given: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
-        given |= parse_assignments(options.settings, "KEY=VALUE, for instance depth=median")
+        values: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
+        values |= parse_assignments(options.settings, "KEY=VALUE, for instance depth=median")
         if options.voxel is not None:
-            given["voxel_size"] = options.voxel
-        chosen, folder = validated(MeshSettings, given, "mesh option"), options.output or self.path / "mesh"
+            values["voxel_size"] = options.voxel
+        chosen, folder = validated(MeshSettings, values, "mesh option"), options.output or self.path / "mesh"
         return mesh_run(self.load(), folder, chosen, options.formats, options.truth, options.overwrite)
 
     def export(self, output: ExportOptions | str | Path | None = None, *formats: str, **options: Any) -> list[Exported]:
@@ -209,8 +207,8 @@ class Run:
         """
         from coliags_plugin.export.baking.exporting import export_run
 
-        given: Any = {"output": output, "formats": formats or ("ply",), **options}
-        chosen = output if isinstance(output, ExportOptions) else ExportOptions(**given)
+        values: Any = {"output": output, "formats": formats or ("ply",), **options}
+        chosen = output if isinstance(output, ExportOptions) else ExportOptions(**values)
         return export_run(self.load(), chosen)
 
     @takes(CoverageOptions)
@@ -280,8 +278,8 @@ class Run:
         from coliags_plugin.core.settings import validated
         from coliags_plugin.engine.held_light import relight
 
-        made = validated(Lamp, lamp, "lamp option")
-        return self._relit(relight(self.load(), made))
+        validated_lamp = validated(Lamp, lamp, "lamp option")
+        return self._relit(relight(self.load(), validated_lamp))
 
     def flatten(self) -> Run:
         """The run in the same light everywhere, without gain, for rendering; it shares the parameters.

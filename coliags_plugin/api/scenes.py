@@ -85,8 +85,8 @@ def coverage_settings(options: CoverageOptions) -> CoverageSettings:
     from coliags_plugin.core.settings import validated
     from coliags_plugin.surface.coverage.visibility import CoverageSettings
 
-    given = parse_assignments(options.settings, "KEY=VALUE, for instance region_diameter=10")
-    return validated(CoverageSettings, given, "coverage option")
+    values = parse_assignments(options.settings, "KEY=VALUE, for instance region_diameter=10")
+    return validated(CoverageSettings, values, "coverage option")
 
 
 @takes(ReconstructOptions)

@@ -64,8 +64,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if argv is None:
         separate_stderr()
     # The shell leaves a ~ that is quoted or comes after "=", as in --data=~/scene.
-    given = sys.argv[1:] if argv is None else argv
-    words = [f[1] + os.path.expanduser(f[2]) if (f := _HOME.fullmatch(word)) else word for word in given]
+    arguments = sys.argv[1:] if argv is None else argv
+    words = [f[1] + os.path.expanduser(f[2]) if (f := _HOME.fullmatch(word)) else word for word in arguments]
     if words == ["--version"]:
         print(f"coliags {__version__}")
         sys.exit(0)
@@ -74,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             Command, prog="coliags", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
         )
     except SystemExit as refused:
-        if refused.code == _USAGE_ERROR and (meant := hint(words, COMMANDS)):
-            print(f"coliags: {meant}", file=sys.stderr)
+        if refused.code == _USAGE_ERROR and (correction := hint(words, COMMANDS)):
+            print(f"coliags: {correction}", file=sys.stderr)
         raise
     except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does
         sys.stderr.close()

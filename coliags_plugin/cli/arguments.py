@@ -86,9 +86,9 @@ def hint(argv: Sequence[str], commands: Mapping[str, type[Runnable]]) -> str:
     kind = commands[argv[0]]
     if inner := subcommands(kind):
         return hint(argv[1:], inner)
-    known = {spelling for flag in flags_of(kind).values() for spelling in _spellings(flag)}
+    spellings = {spelling for flag in flags_of(kind).values() for spelling in _spellings(flag)}
     unknown = (word.partition("=")[0] for word in argv if word.startswith("--"))
-    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
+    return next((did_you_mean(word, spellings) for word in unknown if word not in spellings), "")
 
 
 def _spellings(flag: str) -> Iterator[str]:
@@ -116,8 +116,8 @@ def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tu
     """Settings from the ``--set`` assignments with a key prefix, and the others, which are the data manager's."""
     from coliags_plugin.config.assignments import settings_of
 
-    own = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
-    return settings_of(kind, own, prefix), [item for item in assignments if not item.startswith(prefix)]
+    chosen = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
+    return settings_of(kind, chosen, prefix), [item for item in assignments if not item.startswith(prefix)]
 
 
 def refuse_output(output: Path, source: Path, overwrite: bool) -> None:

@@ -60,7 +60,7 @@ class ConfigCommand:
     """Show a method config with everything inherited and every default filled in."""
 
     action: tyro.conf.Positional[Literal["show"]]
-    """What to do."""
+    """Action."""
     method: tyro.conf.Positional[str]
     """Name of a method or path of a YAML file."""
     origin: bool = False
@@ -110,7 +110,7 @@ class CheckCommand:
             sys.exit(1)
 
     def _print_results(self, folder: Path) -> bool:
-        """Whether a check failed."""
+        """Print each result; True if a check failed."""
         from coliags_plugin.checks.results import line, summary, tracebacks
         from coliags_plugin.testing import METHOD_CHECKS, CheckContext, name_of_check
 
@@ -164,7 +164,7 @@ class WeightsCommand:
     net: Literal["vgg", "alex", "squeeze", "all"] | None = None
     """Backbone: VGG's has 528 MiB, AlexNet's 233, SqueezeNet's 5; default: vgg and squeeze, for the protocol paper."""
     folder: options.OptionalPath = None
-    """Where to install them; default: torch's download cache, where LPIPS finds them."""
+    """Folder to install them in; default: torch's download cache, where LPIPS finds them."""
     from_folder: Annotated[options.OptionalPath, tyro.conf.arg(name="from")] = None
     """Copy the files from this folder instead of downloading them."""
 

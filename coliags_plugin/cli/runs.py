@@ -166,11 +166,11 @@ class ExportCommand(RunCommand, options.ExportOptions):
     def run(self) -> None:
         """Export, and print what was written."""
         exported = self.opened().export(self)
-        records = [one.record for one in exported]
+        records = [exported_file.record for exported_file in exported]
         print_summary(
-            "\n".join(one.text for one in exported),
+            "\n".join(exported_file.text for exported_file in exported),
             facts=records[0] if len(records) == 1 else {"files": records},
-            written=[path for one in exported for path in (one.file, one.record_file)],
+            written=[path for exported_file in exported for path in (exported_file.file, exported_file.record_file)],
             as_json=self.json,
         )
 

@@ -56,16 +56,16 @@ class PhantomCommand:
         from coliags_plugin.config.assignments import parse_assignments
 
         names = ("preset", "trajectory", "frames", "light", "gain", "polyps", "rotation_views")
-        given = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in names}
         options: dict[str, Any] = {"seed": self.seed, "layout": self.layout, "overwrite": self.overwrite}
-        options |= {name: value for name, value in given.items() if value is not None}
+        options |= {name: value for name, value in values.items() if value is not None}
         if self.size is not None:
             options["width"], options["height"] = arguments.parse_size(self.size)
         if self.light_offset is not None:
             options["light_offset"] = arguments.parse_vector("--light-offset", self.light_offset)
         options |= parse_assignments(self.set, expected="KEY=VALUE")
-        made = make_phantom(self.output, **options)
-        print_summary(facts={"settings": options}, written=[made], then=[train_command(made)], as_json=self.json)
+        folder = make_phantom(self.output, **options)
+        print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class DataCommand:
     """Describe a scene and check that images, poses, depth and calibration agree; exit status 1 if suspect."""
 
     action: tyro.conf.Positional[Literal["check"]]
-    """What to do."""
+    """Action."""
     scene: tyro.conf.Positional[options.SceneFolder]
     html: options.OptionalPath = None
     """Also write an HTML page with images and the trajectory."""
@@ -120,7 +120,7 @@ class DepthCommand:
     """Estimate the dense depth of a video with known poses, with its confidence; write it as a scene to train on."""
 
     action: tyro.conf.Positional[Literal["estimate"]]
-    """What to do."""
+    """Action."""
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder. Depth that it has is ignored."""
     output: options.Output

@@ -64,11 +64,11 @@ def complete(task: CellTask) -> None:
     run, device = RunFolder(Path(task.run)), choose_device(task.device)
     _train(task, run, device)
     file = run.evaluation(task.protocol) / RESULT_FILE
-    if not (file.is_file() and read_result(file).key == task.key):
+    result = read_result(file) if file.is_file() else None
+    if result is None or result.key != task.key:
         trained = load_trained(run.path, device, Path(task.data))
         trained = replace(trained, scene=replace(trained.scene, name=task.scene))
-        file = evaluator.evaluate(trained, task.protocol) / RESULT_FILE
-    result = read_result(file)
+        result = evaluator.evaluate(trained, task.protocol)
     if result.key != task.key:
         raise InputError(
             f"{file} has the key {result.key}", f"{task.key}", "Method or scene changed meanwhile: start again"

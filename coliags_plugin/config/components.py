@@ -39,8 +39,8 @@ def make_component(kind: str, node: object) -> Component:
     if isinstance(node, str):
         node = {"name": node}
     if not isinstance(node, dict) or not isinstance(node.get("name"), str):
-        known = ", ".join(REGISTRIES[kind].names())
-        raise PydanticCustomError("no_name", "a component needs 'name', one of {known}", {"known": known})
+        names = ", ".join(REGISTRIES[kind].names())
+        raise PydanticCustomError("no_name", "a component needs 'name', one of {known}", {"known": names})
     options = {key: value for key, value in node.items() if key != "name"}
     try:
         settings_class = getattr(REGISTRIES[kind].get(node["name"]), "Settings", None)
@@ -66,7 +66,7 @@ def named_component(kind: str, node: Mapping[str, object], asking: str) -> Compo
 
 
 def is_auto(kind: str, name: object) -> bool:
-    """Whether a name in a config stands for whichever component is resolved."""
+    """True if a name in a config stands for whichever component is resolved."""
     return isinstance(name, str) and name in REGISTRIES[kind] and isinstance(REGISTRIES[kind].get(name), Resolver)
 
 

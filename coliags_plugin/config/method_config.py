@@ -109,8 +109,8 @@ class MethodConfig(Settings):
     @classmethod
     def _known_protocol(cls, name: str) -> str:
         if name not in registry.protocols.names():
-            known = ", ".join(registry.protocols.names())
-            raise ValueError(f"no protocol '{name}'; known: {known}. {did_you_mean(name, registry.protocols.names())}")
+            names = ", ".join(registry.protocols.names())
+            raise ValueError(f"no protocol '{name}'; known: {names}. {did_you_mean(name, registry.protocols.names())}")
         return name
 
     @classmethod
@@ -187,9 +187,9 @@ def _find(method: str, folder: Path) -> Path:
     return files[method]
 
 
-def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
-    if path in seen:
-        chain = " -> ".join(p.name for p in (*seen, path))
+def _resolve(path: Path, descendants: tuple[Path, ...]) -> Node:
+    if path in descendants:
+        chain = " -> ".join(p.name for p in (*descendants, path))
         raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
     tree = read_tree(path)
     base = tree.value.get("base")
@@ -197,10 +197,10 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
         return tree
     if not isinstance(base.value, str):
         raise InputError(f"{base.origin}: base is {base.value!r}", "the name or path of a method config")
-    parent = _resolve(_find(base.value, path.parent), (*seen, path))
+    parent = _resolve(_find(base.value, path.parent), (*descendants, path))
     inherited = {key: node for key, node in parent.value.items() if key != "description"}
-    own = {key: node for key, node in tree.value.items() if key != "base"}
-    return merge(Node(inherited, parent.origin), Node(own, tree.origin))
+    overriding = {key: node for key, node in tree.value.items() if key != "base"}
+    return merge(Node(inherited, parent.origin), Node(overriding, tree.origin))
 
 
 def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:

@@ -45,14 +45,14 @@ def method_folder() -> Path:
 
 
 def is_path(name: str) -> bool:
-    """Whether this is the path of a YAML file, not a name."""
+    """True for the path of a YAML file, not a name."""
     return name.endswith((".yaml", ".yml"))
 
 
 def descriptions(files: Mapping[str, Path]) -> dict[str, str]:
     """The description, one line, of every file by name, sorted."""
-    found = {name: read_tree(path).value.get("description") for name, path in sorted(files.items())}
-    return {name: "" if text is None else str(text.value) for name, text in found.items()}
+    texts = {name: read_tree(path).value.get("description") for name, path in sorted(files.items())}
+    return {name: "" if text is None else str(text.value) for name, text in texts.items()}
 
 
 def _file_in(package: str, name: str) -> Path:

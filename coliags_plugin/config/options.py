@@ -83,11 +83,11 @@ def takes(kind: type) -> Callable[[Callable[..., R]], Callable[..., R]]:
         before = list(parameters).index("options")
 
         @wraps(function)
-        def call(*given: Any, **named: Any) -> R:
-            if len(given) > before and isinstance(given[before], kind):
-                return function(*given, **named)
+        def call(*positional: Any, **named: Any) -> R:
+            if len(positional) > before and isinstance(positional[before], kind):
+                return function(*positional, **named)
             others = {name: named.pop(name) for name in parameters if name in named}
-            return function(*given[:before], options=kind(*given[before:], **named), **others)
+            return function(*positional[:before], options=kind(*positional[before:], **named), **others)
 
         shown = [*parameters.values()]
         shown[before : before + 1] = signature(kind).parameters.values()
@@ -418,8 +418,8 @@ _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
 
 def bytes_of(text: str) -> int:
     """A size such as ``20MB`` in bytes; units are powers of 1000."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
-    unit = found and found[2].lower()
-    if found is None or unit not in _UNITS:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?B?)\s*", text, re.IGNORECASE)
+    unit = match and match[2].lower()
+    if match is None or unit not in _UNITS:
         raise InputError(f"`size={text}`", "a size in bytes, kB, MB or GB, for instance 20MB")
-    return int(float(found[1]) * _UNITS[unit])
+    return int(float(match[1]) * _UNITS[unit])

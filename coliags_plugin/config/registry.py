@@ -125,17 +125,17 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def _is_components(found: object) -> TypeGuard[dict[str, dict[str, object]]]:
+def _is_components(components: object) -> TypeGuard[dict[str, dict[str, object]]]:
     return (
-        isinstance(found, dict)
-        and set(found) <= set(REGISTRIES)
-        and all(isinstance(named, dict) for named in found.values())
+        isinstance(components, dict)
+        and set(components) <= set(REGISTRIES)
+        and all(isinstance(named, dict) for named in components.values())
     )
 
 
 @cache
 def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
-    found: dict[str, dict[str, dict[str, object]]] = {}
+    files: dict[str, dict[str, dict[str, object]]] = {}
     for path in map(os.path.expanduser, filter(None, path_list.split(os.pathsep))):
         if not Path(path).is_file():
             raise InputError(
@@ -149,8 +149,8 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
                 f"{path} defines COMPONENTS = {components!r}",
                 f"{{kind: {{name: class}}}}, the kinds being {', '.join(REGISTRIES)}",
             )
-        found[path] = components
-    return found
+        files[path] = components
+    return files
 
 
 #: Built-in components by kind and noun.

@@ -26,7 +26,7 @@ class Node:
 
     @property
     def is_mapping(self) -> bool:
-        """Whether this is a mapping of further nodes."""
+        """True for a mapping of further nodes."""
         return isinstance(self.value, dict)
 
     def plain(self) -> Any:

@@ -52,8 +52,8 @@ def read_arrays(
         if unpacked > max(_SMALL, _RATIO * packed):
             raise InputError(f"{path} has {packed:,} bytes and expands to {unpacked:,}", expected, "It is no such data")
         with _HEADERS, np.load(path, allow_pickle=False) as archive:
-            wanted = archive.files if optional is None else {*needed, *optional}
-            arrays = {name: archive[name] for name in archive.files if name in wanted}
+            names = archive.files if optional is None else {*needed, *optional}
+            arrays = {name: archive[name] for name in archive.files if name in names}
     except _DAMAGED as error:
         raise unreadable(path, f"cannot read {path}: {error}", expected) from error
     for name, array in arrays.items():

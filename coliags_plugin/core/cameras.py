@@ -96,7 +96,7 @@ class Camera(Intrinsics):
         return depth, self.is_inside(pixels, depth)
 
     def is_inside(self, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Which points, projected to columns and rows at z-depths, are in front of the camera and inside its image."""
+        """Mask of points, projected to columns and rows at z-depths, in front of the camera and inside its image."""
         inside = ((pixels >= 0) & (pixels < constant((self.width, self.height), pixels))).all(dim=-1)
         return inside & (depth > 0)
 

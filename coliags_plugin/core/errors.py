@@ -12,7 +12,7 @@ class ReportedError(Exception):
     exit_status = 1
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython shows instead of a traceback."""
+        """Text that IPython shows instead of a traceback."""
         return [f"{type(self).__name__}: {self}"]
 
 
@@ -49,7 +49,7 @@ class NotFiniteError(ReportedError):
 
 
 class NothingDrawnError(ReportedError):
-    """Nothing was drawn for many steps: the field is not where the cameras look."""
+    """No Gaussian was drawn for many steps: the field is not where the cameras look."""
 
 
 class DeviceMemoryError(ReportedError):

@@ -47,8 +47,8 @@ def user_path(path: str | Path) -> Path:
 
 def refuse_overlap(output: Path, source: Path) -> None:
     """Refuse an output folder that is, contains or is inside the input."""
-    made, read = output.resolve(), source.resolve()
-    if made == read or made in read.parents or read in made.parents:
+    target, origin = output.resolve(), source.resolve()
+    if target == origin or target in origin.parents or origin in target.parents:
         raise InputError(
             f"`output={output}`, and the input is {source}", "a folder apart from the input", "Choose another"
         )
@@ -128,8 +128,8 @@ def _scratch(target: Path) -> Iterator[Path]:
 def _sweep(target: Path) -> None:
     """Remove what killed processes have left beside ``target``; restore it if one was killed while replacing it."""
     for path in sorted(target.parent.glob(f"{escape(f'.{target.name}.')}*.partial")):
-        found = _SCRATCH.fullmatch(path.name)
-        if found is None or found[1] != target.name or path.name in _OWN or _is_running(int(found[2])):
+        scratch = _SCRATCH.fullmatch(path.name)
+        if scratch is None or scratch[1] != target.name or path.name in _OWN or _is_running(int(scratch[2])):
             continue
         if (path / _OLD).exists() and not os.path.lexists(target):
             log.warning("%s was being replaced when its process was killed; restored", target)
@@ -138,7 +138,7 @@ def _sweep(target: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Whether another process of this number is running; in containers, this one may have a killed one's number."""
+    """True if another process of this number is running; in containers, this one may have a killed one's number."""
     if process == os.getpid():
         return False
     try:
@@ -166,7 +166,7 @@ def _put_folder(path: Path, target: Path) -> None:
 
 
 def _is_in_scratch(path: Path) -> bool:
-    """Whether a path lies in a scratch folder, which becomes durable and gets its name as a whole."""
+    """True for a path in a scratch folder, which becomes durable and gets its name as a whole."""
     return any(_SCRATCH.fullmatch(part) for part in path.parts[:-1])
 
 
@@ -220,10 +220,10 @@ def make_folder(folder: Path) -> None:
 
 def not_writable(folder: Path, error: OSError) -> NotWritableError:
     """The error for a folder that cannot be written."""
-    seen = f"cannot write to {final_place(folder)}: {error.strerror or error}"
+    problem = f"cannot write to {final_place(folder)}: {error.strerror or error}"
     if error.errno in _FULL:
-        return NotWritableError(seen, "a disk with space left", "Free some, or choose another output")
-    return NotWritableError(seen, "a writable folder", "Choose another output")
+        return NotWritableError(problem, "a disk with space left", "Free some, or choose another output")
+    return NotWritableError(problem, "a writable folder", "Choose another output")
 
 
 def file_sha256(file: Path) -> str:

@@ -1,4 +1,4 @@
-"""What long jobs need: progress callbacks, and locks between processes, also of machines that share a file system."""
+"""Long jobs: progress callbacks, and locks between processes, also of machines that share a file system."""
 
 from __future__ import annotations
 

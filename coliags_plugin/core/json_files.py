@@ -26,9 +26,9 @@ def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> 
         return parse_json(text, finite)
     except json.JSONDecodeError as error:
         line = (*text.splitlines(), "")[error.lineno - 1].strip()
-        seen = f"{path} is not JSON: {error.msg} in line {error.lineno}, column {error.colno}: '{line[:60]}'"
+        problem = f"{path} is not JSON: {error.msg} in line {error.lineno}, column {error.colno}: '{line[:60]}'"
         hint = "JSON has neither comments nor a comma behind the last value" if error.pos else ""
-        raise InputError(seen, expected, do or hint) from error
+        raise InputError(problem, expected, do or hint) from error
     except ValueError as error:
         raise InputError(f"{path} is not JSON: {error}", expected, do) from error
 

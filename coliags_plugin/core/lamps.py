@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -40,7 +39,7 @@ class Lamp(Settings):
 
     @property
     def at_camera(self) -> bool:
-        """Whether it is at the optical centre."""
+        """True for a lamp at the optical centre."""
         return not any(self.offset)
 
     def position(self, camera: Camera) -> Float[Tensor, "3"]:
@@ -63,29 +62,8 @@ class Lamp(Settings):
         return torch.as_tensor(self.intensity * cosines.pow(self.power))
 
 
-class HeldLight(ABC):
-    """Light that stays as it is while the camera moves."""
-
-    @abstractmethod
-    def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """Distance of points to the lamp, scene units, and cosine of their angle to its axis, in [0, 1]."""
-
-    @property
-    @abstractmethod
-    def described(self) -> JsonObject:
-        """Plain values, for a record."""
-
-    @abstractmethod
-    def scaled(self, factor: float) -> HeldLight:
-        """The light in a world whose lengths are ``factor`` times as large."""
-
-    @abstractmethod
-    def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Unit vectors from points of a surface, world frame, with unit normals to the lamp."""
-
-
 @dataclass(frozen=True)
-class LightOfCamera(HeldLight):
+class LightOfCamera:
     """The lamp at the optical centre of a camera that stays where it is; it shines along the optical axis."""
 
     camera: Camera
@@ -96,23 +74,23 @@ class LightOfCamera(HeldLight):
         return {"camera_to_world": self.camera.camera_to_world.tolist()}
 
     def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """See :meth:`HeldLight.incidence`; the cosine is 0 behind the camera."""
+        """Distance of points to the lamp, scene units, and cosine of their angle to its axis; 0 behind the camera."""
         camera = self.camera.to(points.device, points.dtype)
         sight = points - camera.center
         distances = sight.norm(dim=1)
         return distances, (sight @ camera.optical_axis / distances.clamp_min(_MIN_DISTANCE)).clamp(0.0, 1.0)
 
     def scaled(self, factor: float) -> LightOfCamera:
-        """See :meth:`HeldLight.scaled`."""
+        """The light in a world whose lengths are ``factor`` times as large."""
         return LightOfCamera(self.camera.scaled(factor))
 
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """See :meth:`HeldLight.towards`."""
+        """Unit vectors from points of a surface, world frame, with unit normals, to the lamp."""
         return torch.nn.functional.normalize(self.camera.center.to(points) - points, dim=1)
 
 
 @dataclass(frozen=True)
-class FlattenedLight(HeldLight):
+class FlattenedLight:
     """Light that is alike everywhere, and falls on every surface along its normal."""
 
     distance: float  # to the lamp, scene units
@@ -124,13 +102,17 @@ class FlattenedLight(HeldLight):
         return {"distance": self.distance, "cosine": self.cosine}
 
     def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """See :meth:`HeldLight.incidence`."""
+        """Distance of points to the lamp, scene units, and cosine of their angle to its axis."""
         return points.new_full((len(points),), self.distance), points.new_full((len(points),), self.cosine)
 
     def scaled(self, factor: float) -> FlattenedLight:
-        """See :meth:`HeldLight.scaled`."""
+        """The light in a world whose lengths are ``factor`` times as large."""
         return FlattenedLight(factor * self.distance, self.cosine)
 
     def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """See :meth:`HeldLight.towards`."""
+        """Unit vectors from points of a surface, world frame, with unit normals, to the lamp."""
         return normals
+
+
+#: Light that stays as it is while the camera moves.
+HeldLight: TypeAlias = LightOfCamera | FlattenedLight

@@ -46,7 +46,7 @@ def separate_stderr() -> None:
 
 
 class _Kept:
-    """What is written to the descriptor while any thread decodes."""
+    """Text written to the descriptor while any thread decodes."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -76,10 +76,10 @@ class _Kept:
             os.close(self._place)
             self._place = None
             self._file.seek(0)
-            said = self._file.read().decode(errors="replace").strip()
+            message = self._file.read().decode(errors="replace").strip()
             self._file.seek(0)
             self._file.truncate()
-            return said.splitlines()[0] if said and not self._failed else ""
+            return message.splitlines()[0] if message and not self._failed else ""
 
 
 _KEPT = _Kept()
@@ -97,12 +97,12 @@ def decoder_messages() -> Iterator[None]:
         yield
         failed = False
     finally:
-        if said := _KEPT.end(failed):
-            log.warning("an image is read that may be damaged; its decoder says: %s", said)
+        if message := _KEPT.end(failed):
+            log.warning("an image is read that may be damaged; its decoder says: %s", message)
 
 
 def _is_separate() -> bool:
-    """Whether Python's standard error has another descriptor than the one that libraries in C write to."""
+    """True if Python's standard error has another descriptor than the one that libraries in C write to."""
     with suppress(OSError, AttributeError, UnsupportedOperation, ValueError):
         return sys.stderr.fileno() != _STDERR
     return False

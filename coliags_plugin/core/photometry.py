@@ -137,8 +137,8 @@ class _Observations:
         """
         exponents = parameters[3:5]
         distances, cosines = self.rays(parameters[:3])
-        known, angles = _falloff(distances, cosines)
-        direct = ((known + angles @ exponents) / _ENCODING).exp()
+        falloffs, angles = _falloff(distances, cosines)
+        direct = ((falloffs + angles @ exponents) / _ENCODING).exp()
         distances, cosines = distances[:: self.cavity.every], cosines[:: self.cavity.every]
         reached = self.lit[:: self.cavity.every] & (cosines > 0.0).all(-1)
         near = distances.clamp_min(_SMALLEST_DISTANCE * scale) ** _INVERSE_SQUARE
@@ -182,12 +182,12 @@ def _fit_scene(scene: Scene) -> LightFit | None:
     points = everything[:: max(1, len(everything) // _POINTS)]
     if min(len(scene.train), len(points)) < _FEWEST or any(frame.depth is None for frame in scene.train):
         return None
-    seen = _observe(scene, points, wall_normals(everything, points))
-    parameters, log_gains = _lamp(seen)
-    known, cosines = _falloff(*seen.rays(parameters[:3]))
-    rest = seen.logs - (known + log_gains)[..., None]
+    observations = _observe(scene, points, wall_normals(everything, points))
+    parameters, log_gains = _lamp(observations)
+    falloffs, cosines = _falloff(*observations.rays(parameters[:3]))
+    rest = observations.logs - (falloffs + log_gains)[..., None]
     slopes = torch.stack(
-        [_fit(rest[..., color], seen.usable[..., color], cosines, gains=False).slopes for color in range(3)]
+        [_fit(rest[..., color], observations.usable[..., color], cosines, gains=False).slopes for color in range(3)]
     ).float()
     return LightFit(log_gains.float(), parameters[:3].float(), slopes[:, 0], slopes[:, 1], float(parameters[5]))
 
@@ -225,11 +225,11 @@ def _seen(
     blurred = _mean_of_neighbours(zero_outside(frame.rgb.cpu(), valid))
     whole = _mean_of_neighbours(valid[..., None].float())[..., 0] > _ALL
     colors = blurred[row, column].double()
-    found = torch.where(valid, frame.depth.cpu(), math.nan)[row, column]
-    known = camera.is_inside(pixels, depths) & found.isfinite()
-    same = known & ((found - depths).abs() < _SAME_SURFACE * depths)
+    stored_depths = torch.where(valid, frame.depth.cpu(), math.nan)[row, column]
+    has_depth = camera.is_inside(pixels, depths) & stored_depths.isfinite()
+    same = has_depth & ((stored_depths - depths).abs() < _SAME_SURFACE * depths)
     usable = (same & whole[row, column])[:, None] & (colors > _DARKEST) & (colors < _BRIGHTEST)
-    return colors.clamp_min(1e-3).log(), usable, same, known & ~same
+    return colors.clamp_min(1e-3).log(), usable, same, has_depth & ~same
 
 
 def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
@@ -238,28 +238,28 @@ def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]
     return torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 0)
 
 
-def _lamp(seen: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:
+def _lamp(obs: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:
     """Fitted parameters (lamp offset, exponents, albedo) and log gains; the offset is 0 unless it lowers residuals."""
-    usable = seen.usable[..., _GREEN]
+    usable = obs.usable[..., _GREEN]
     if not usable.any():
-        return seen.logs.new_tensor([0.0, 0.0, 0.0, *_START]), seen.logs.new_zeros(seen.logs.shape[1])
-    scale = float(seen.sights.norm(dim=-1)[usable].median())
-    at_lens, fit = _descend(seen, scale, seen.logs.new_tensor([0.0, 0.0, 0.0, *_START]), range(3, 6))
-    beside, better = _descend(seen, scale, at_lens, range(6))
+        return obs.logs.new_tensor([0.0, 0.0, 0.0, *_START]), obs.logs.new_zeros(obs.logs.shape[1])
+    scale = float(obs.sights.norm(dim=-1)[usable].median())
+    at_lens, fit = _descend(obs, scale, obs.logs.new_tensor([0.0, 0.0, 0.0, *_START]), range(3, 6))
+    beside, better = _descend(obs, scale, at_lens, range(6))
     if better.deviation < _MAX_RESIDUAL_RATIO * fit.deviation:
         return beside, better.log_gains
     return at_lens, fit.log_gains
 
 
-def _descend(seen: _Observations, scale: float, at: Float[Tensor, "6"], free: range) -> tuple[Float[Tensor, "6"], _Fit]:
+def _descend(obs: _Observations, scale: float, at: Float[Tensor, "6"], free: range) -> tuple[Float[Tensor, "6"], _Fit]:
     """Gauss-Newton steps of some of offset, exponents and albedo on green, and the last fit."""
-    logs, usable = seen.logs[..., _GREEN], seen.usable[..., _GREEN]
+    logs, usable = obs.logs[..., _GREEN], obs.usable[..., _GREEN]
 
     def limits(of_offset: float, of_others: float) -> Float[Tensor, "6"]:
         return logs.new_tensor([of_offset * scale] * 3 + [of_others] * 3)
 
     def light(parameters: Float[Tensor, "6"]) -> Float[Tensor, "P F"]:
-        return torch.where(usable, seen.light(parameters, scale), 0.0)
+        return torch.where(usable, obs.light(parameters, scale), 0.0)
 
     differences, largest = limits(_DIFFERENCE, _SMALL_CHANGE), limits(_LARGEST_STEP, _LARGEST_CHANGE)
     enough = limits(_CONVERGED, _CHANGE_CONVERGED)
@@ -268,7 +268,7 @@ def _descend(seen: _Observations, scale: float, at: Float[Tensor, "6"], free: ra
     here = light(at)
     for _ in range(_ITERATIONS):
         moved = [at + torch.eye(6, dtype=at.dtype)[index] * differences[index] for index in free]
-        slopes = [(light(one) - here) / differences[index] for one, index in zip(moved, free, strict=True)]
+        slopes = [(light(shifted) - here) / differences[index] for shifted, index in zip(moved, free, strict=True)]
         step = torch.zeros_like(at)
         step[list(free)] = _fit(logs - here, usable, torch.stack(slopes, dim=-1)).slopes
         step = step.clamp(-largest, largest)

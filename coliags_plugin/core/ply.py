@@ -30,8 +30,8 @@ def read_triangles(path: Path) -> tuple[dict[str, np.ndarray], Int[np.ndarray, "
     """Vertex properties as of :func:`read_vertices`, and triangles; polygons are split into triangles."""
     from trimesh.geometry import triangulate_quads
 
-    found = _read(path)
-    columns, faces = _columns(path, found), found.get("faces")
+    elements = _read(path)
+    columns, faces = _columns(path, elements), elements.get("faces")
     if faces is None:
         raise InputError(f"{path} has no faces", "a mesh", "Check that it is no cloud of points")
     triangles = np.asarray(triangulate_quads(faces))
@@ -102,8 +102,8 @@ def point_properties(
     return properties
 
 
-def _columns(path: Path, found: dict[str, Any], needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
-    vertices = found["metadata"]["_ply_raw"].get("vertex", {"properties": {}, "length": 0})
+def _columns(path: Path, elements: dict[str, Any], needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
+    vertices = elements["metadata"]["_ply_raw"].get("vertex", {"properties": {}, "length": 0})
     names = list(vertices["properties"])
     if missing := [name for name in needed if name not in names]:
         raise InputError(
@@ -127,11 +127,11 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of text that is not numbers, which is refused below
-            found: dict[str, Any] = load_ply(file, fix_texture=False, skip_materials=True)
+            elements: dict[str, Any] = load_ply(file, fix_texture=False, skip_materials=True)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a PLY file") from error
     except Exception as error:  # trimesh raises whatever it meets
         size = path.stat().st_size
-        seen = f"{path} ({size} bytes) cannot be read as PLY: {error}"
-        raise unreadable(path, seen, "a complete PLY file", "Fetch it again") from error
-    return found
+        problem = f"{path} ({size} bytes) cannot be read as PLY: {error}"
+        raise unreadable(path, problem, "a complete PLY file", "Fetch it again") from error
+    return elements

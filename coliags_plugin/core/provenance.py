@@ -17,7 +17,7 @@ class _Record(BaseModel):
 
 
 class SplitRecord(_Record):
-    """Which frames are for training and which for tests, and the options that chose them."""
+    """Split of the frames into training and test frames, and the options that chose it."""
 
     name: str
     frame_step: int = 1
@@ -28,7 +28,7 @@ class SplitRecord(_Record):
 
 
 class PointsRecord(_Record):
-    """Where initial points come from."""
+    """Origin of the initial points."""
 
     source: str
     count: int = 0

@@ -114,12 +114,12 @@ class RenderOutput:
         return self.maps[name]
 
 
-def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
+def check_outputs(wants: Iterable[str], names: Iterable[str]) -> None:
     """Refuse outputs that a renderer does not have."""
-    known = tuple(known)
+    names = tuple(names)
     for name in wants:
-        if name not in known:
-            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(known)}", did_you_mean(name, known))
+        if name not in names:
+            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(names)}", did_you_mean(name, names))
 
 
 def concatenate_pixels(parts: Sequence[RenderOutput]) -> RenderOutput:

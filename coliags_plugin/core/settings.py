@@ -32,13 +32,13 @@ class Settings(BaseModel):
     def _refuse_unknown_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        known = ", ".join(cls.model_fields) or "none"
+        names = ", ".join(cls.model_fields) or "none"
         details = [
             InitErrorDetails(
                 type=PydanticCustomError(
                     "unknown_key",
                     "unknown key '{key}'; known keys: {known}. {hint}",
-                    {"key": str(key), "known": known, "hint": cls._meant(str(key), data)},
+                    {"key": str(key), "known": names, "hint": cls._meant(str(key), data)},
                 ),
                 loc=(key,),
                 input=value,

@@ -162,11 +162,11 @@ def point_normals(
             f"at least {least}",
             "Give the data manager more points, or lower field.normal_neighbours",
         )
-    positions, wanted = (values.detach().cpu().double().numpy() for values in (points, points if at is None else at))
+    positions, queries = (values.detach().cpu().double().numpy() for values in (points, points if at is None else at))
     tree = cKDTree(positions)
-    normals = torch.empty(len(wanted), 3, dtype=torch.float64)
-    for start in range(0, len(wanted), _CHUNK):
-        _, nearest = tree.query(wanted[start : start + _CHUNK], k=least, workers=-1)
+    normals = torch.empty(len(queries), 3, dtype=torch.float64)
+    for start in range(0, len(queries), _CHUNK):
+        _, nearest = tree.query(queries[start : start + _CHUNK], k=least, workers=-1)
         around = torch.from_numpy(positions[np.asarray(nearest).reshape(-1, least)[:, least - neighbours :]])
         around = around - around.mean(1, keepdim=True)
         _, axes = torch.linalg.eigh(around.mT @ around)  # eigenvalues ascend
@@ -205,12 +205,12 @@ def what_triton_lacks() -> str | None:
 
 
 def fit_kernels(*tensors: Tensor) -> bool:
-    """Whether kernels compiled by numba can compute with these tensors: float32 on the CPU."""
+    """True for tensors that kernels compiled by numba can compute with: float32 on the CPU."""
     return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
 
 
 def fit_triton_kernels(*tensors: Tensor) -> bool:
-    """Whether kernels compiled by triton can compute with these tensors: float32 on CUDA, where it can launch them."""
+    """True for tensors that triton's kernels can compute with: float32 on CUDA, where they can be launched."""
     on_device = all(tensor.device.type == "cuda" and tensor.dtype == torch.float32 for tensor in tensors)
     return on_device and what_triton_lacks() is None
 

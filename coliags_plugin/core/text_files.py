@@ -34,10 +34,10 @@ def unreadable(path: Path, seen: str, expected: str, do: str = "") -> InputError
     """Error for a file that cannot be parsed: ``seen``, or that it is a Git LFS pointer or a web page."""
     try:
         with path.open("rb") as file:
-            found = _stand_in(file.read(_START_BYTES))
+            stand_in = _stand_in(file.read(_START_BYTES))
     except OSError:
-        found = ""
-    return InputError(f"cannot read {path}: {found}" if found else seen, expected, "" if found else do)
+        stand_in = ""
+    return InputError(f"cannot read {path}: {stand_in}" if stand_in else seen, expected, "" if stand_in else do)
 
 
 def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
@@ -71,8 +71,8 @@ def _opened(path: Path) -> Iterator[TextIOWrapper]:
     """A text file, opened once, as it may be a pipe; ValueError if something is in its place."""
     with path.open("rb") as file:
         start = file.peek(_START_BYTES)[:_START_BYTES]
-        if found := _stand_in(start):
-            raise ValueError(found)
+        if stand_in := _stand_in(start):
+            raise ValueError(stand_in)
         yield TextIOWrapper(file, encoding=encoding_of(start))
 
 

@@ -68,18 +68,19 @@ def training_tensors(
     return tensors | {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
 
 
-def save_checkpoint(folder: Path, made: Checkpoint) -> None:
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Write ``step-<step>`` into a folder.
 
     Raises:
         NotFiniteError: A number in it is NaN or infinite; nothing was written.
     """
-    _check_finite(made.tensors, made.step)
-    state: JsonObject = {"format": FORMAT, "step": made.step, "method": made.method, "frame_queue": made.frame_queue}
-    if made.cost is not None:
-        state["cost"] = made.cost.model_dump()
-    with atomic_folder(checkpoint_folder(folder, made.step), overwrite=True) as scratch:
-        save_tensors(made.tensors, scratch / "state.safetensors")
+    _check_finite(checkpoint.tensors, checkpoint.step)
+    state: JsonObject = {"format": FORMAT}
+    state |= {name: getattr(checkpoint, name) for name in ("step", "method", "frame_queue")}
+    if checkpoint.cost is not None:
+        state["cost"] = checkpoint.cost.model_dump()
+    with atomic_folder(checkpoint_folder(folder, checkpoint.step), overwrite=True) as scratch:
+        save_tensors(checkpoint.tensors, scratch / "state.safetensors")
         write_json(scratch / "state.json", state)
         write_checksums(scratch)
 
@@ -109,7 +110,7 @@ def _check_finite(tensors: Mapping[str, Tensor], step: int) -> None:
 
 
 def checkpoint_folder(folder: Path, step: int) -> Path:
-    """Where the checkpoint of a step lies."""
+    """Folder of the checkpoint of a step."""
     return folder / f"step-{step:06d}"
 
 

@@ -101,13 +101,13 @@ def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     depths = scene.depths_in_view()
     if (depths > near).any():
         return
-    seen = (
+    problem = (
         f"the initial points in view are at most {float(depths.max()):.2g} from the cameras"
         if len(depths)
         else f"none of the {len(scene.points)} initial points is in view of the training cameras"
     )
     raise InputError(
-        f"{seen}, and nothing nearer than {near:g} is drawn",
+        f"{problem}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
         "`coliags data check` looks into poses, depth and units; small units on purpose need `near_plane=LENGTH`",
     )

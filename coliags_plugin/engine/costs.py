@@ -26,7 +26,7 @@ GROWTH = 512 * 2**20
 
 
 class TrainingCost(BaseModel):
-    """What training cost up to a checkpoint, all resumptions together; kept in the checkpoint. None: not measured.
+    """Cost of training up to a checkpoint, all resumptions together; kept in the checkpoint. None: not measured.
 
     Time is that in the training loop: steps, logging and earlier checkpoints, without what a kill threw away. Memory is
     the largest resident memory of the process; on a GPU, the largest memory allocated there in the loop.
@@ -161,11 +161,11 @@ def seconds_to_psnr(rows: Sequence[Mapping[str, Any]], frames: int) -> dict[str,
     first = np.searchsorted(steps, steps - frames, side="right")
     # Each rounded once: differences of running sums may miss a mark that is reached exactly.
     smoothed = np.array([fmean(psnr[begin : end + 1]) for end, begin in enumerate(first)])
-    found: dict[str, float | None] = {}
+    times: dict[str, float | None] = {}
     for mark in PSNR_MARKS:
         reached = seconds[(steps >= frames) & (smoothed >= mark)]
-        found[str(mark)] = float(reached[0]) if len(reached) else None
-    return found
+        times[str(mark)] = float(reached[0]) if len(reached) else None
+    return times
 
 
 class HeapTrimmer:

@@ -15,30 +15,30 @@ from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.results.hashing import code_key
 
 
-def find_device(wanted: str) -> torch.device:
+def find_device(name: str) -> torch.device:
     """The device of a name: ``cpu``, ``cuda:N``, ``cuda``, which is ``cuda:0``, or ``auto``, ``cuda`` if it is there.
 
     Raises:
         InputError: There is no such name, or no such device.
     """
-    cuda = re.fullmatch(r"cuda(?::(\d+))?", wanted)
-    if wanted == "cpu" or (wanted == "auto" and not torch.cuda.is_available()):
+    cuda = re.fullmatch(r"cuda(?::(\d+))?", name)
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
-    if wanted != "auto" and cuda is None:
-        raise InputError(f"device '{wanted}'", "auto, cpu, cuda or cuda:N, N being the number of a CUDA device")
+    if name != "auto" and cuda is None:
+        raise InputError(f"device '{name}'", "auto, cpu, cuda or cuda:N, N being the number of a CUDA device")
     if not torch.cuda.is_available():
-        seen = f"device {wanted} was requested, but torch finds none"
-        raise InputError(seen, "cpu, or auto", "See `coliags doctor`")
+        problem = f"device {name} was requested, but torch finds none"
+        raise InputError(problem, "cpu, or auto", "See `coliags doctor`")
     index, count = int((cuda and cuda[1]) or 0), torch.cuda.device_count()
     if index >= count:
         there = ", ".join(f"cuda:{number} ({torch.cuda.get_device_name(number)})" for number in range(count))
-        raise InputError(f"device {wanted} was requested, but torch finds {there}", "one of these, cpu or auto")
+        raise InputError(f"device {name} was requested, but torch finds {there}", "one of these, cpu or auto")
     return torch.device("cuda", index)
 
 
-def choose_device(wanted: str) -> torch.device:
+def choose_device(name: str) -> torch.device:
     """:func:`find_device`, made the device that this thread launches kernels on."""
-    device = find_device(wanted)
+    device = find_device(name)
     make_current(device)
     return device
 

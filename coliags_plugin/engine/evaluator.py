@@ -51,8 +51,8 @@ _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "fingerprint
 EXPECTED_DEPTH = "expected_depth"
 
 
-def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None, refine_poses: bool = False) -> Path:
-    """Render every held-out view, write the protocol's metrics and the images, and return their folder.
+def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None, refine_poses: bool = False) -> Result:
+    """Render every held-out view, and write the protocol's metrics and the images.
 
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and
     of it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available,
@@ -71,7 +71,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     scene = trained.scene if truth is None else truth.scene
     check_evaluable(trained.model, scene, scorer)
     sets = {name: frames for name, frames in scene.test_sets.items() if frames}
-    total, done = sum(map(len, sets.values())), 0
+    total, count = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name, against_truth=truth is not None)
     scale = 1.0 if scene.is_metric else trained.model.scale
     evaluated = {name: EvaluatedSet(scene.length_unit, scorer, scale) for name in sets}
@@ -87,15 +87,15 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 _write_images(scratch, set_name, frame, comparison, DEPTH_ERROR_LIMIT_MM / scale)
                 if (depth := output.expected_depth) is not None:
                     write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
-                done += 1
-                progress.update(done)
+                count += 1
+                progress.update(count)
         _write_depth_pictures(scratch, scene.length_unit)
-        result = run_result(trained, scorer, evaluated, meter, truth)
+        result = _result(trained, scorer, evaluated, meter, truth)
         _warn_of_bounds(trained.model.learned)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
-    return target
+    return result
 
 
 def _warn_of_bounds(learned: Mapping[str, Any]) -> None:
@@ -120,10 +120,10 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     write_png(folder / "truth" / f"{name}.png", frame.image)
     if comparison.depth is None or comparison.true_depth is None or comparison.depth_valid is None:
         return
-    known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
+    true_depth = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
-    write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    errors = depth_error(comparison.depth, known, comparison.depth_valid)
+    write_depth_tiff(folder / "true_depth" / f"{name}.tiff", true_depth)
+    errors = depth_error(comparison.depth, true_depth, comparison.depth_valid)
     write_png(folder / "errors" / f"{name}.png", colorize_error(*errors, error_limit))
 
 
@@ -139,12 +139,12 @@ def _write_depth_pictures(evaluation: Path, unit: str) -> None:
     write_png(evaluation / "depth_pictures" / "scale.png", color_bar(limits, unit, "depth"))
 
 
-def run_result(
+def _result(
     trained: TrainedRun,
     scorer: Scorer,
     evaluated: Mapping[str, EvaluatedSet],
     meter: RenderMeter,
-    truth: Truth | None = None,
+    truth: Truth | None,
 ) -> Result:
     """Compose the result of a run from its test sets, at least one, and what rendering them cost.
 
@@ -199,8 +199,11 @@ def run_result(
     )
 
 
-def _described(truth: Truth, own: Scene) -> JsonObject:
-    trained_on = {"name": own.name, **own.provenance.model_dump(include={"dataset", "unit", "fingerprint"})}
+def _described(truth: Truth, original: Scene) -> JsonObject:
+    trained_on = {
+        "name": original.name,
+        **original.provenance.model_dump(include={"dataset", "unit", "fingerprint"}),
+    }
     return {"scene": truth.scene.name, "matched_by": truth.matched_by, "trained_on": trained_on}
 
 
@@ -236,7 +239,7 @@ def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
 
 
 def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> JsonObject:
-    """How a run differs from one that goes through as configured, with this code; empty where it does not."""
+    """Differences of a run from one that goes through as configured, with this code; empty if there are none."""
     lengths = ("steps", "written_for")
     jumps = [
         change

@@ -29,8 +29,8 @@ def mean_camera(cameras: Sequence[Camera], weights: Sequence[float] | None = Non
     poses = torch.stack([camera.camera_to_world.double() for camera in cameras])
     shares = poses.new_full((len(poses),), 1.0 / len(poses)) if weights is None else poses.new_tensor(weights)
     mean = torch.einsum("n,nij->ij", shares, poses)
-    left, _, right = torch.linalg.svd(mean[:3, :3])
-    rotation = left @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(left @ right))], dtype=left.dtype)) @ right
+    u, _, vt = torch.linalg.svd(mean[:3, :3])
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))], dtype=u.dtype)) @ vt
     pose = torch.eye(4, dtype=poses.dtype)
     pose[:3, :3], pose[:3, 3] = rotation, mean[:3, 3]
     return replace(cameras[0], camera_to_world=pose)
@@ -45,9 +45,9 @@ def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
         placed = model.placed(camera).to(device)
         rendered = model.renderer.render(model.field, placed, ("rgb", "alpha", "depth_accumulated"))
         output = model.in_scene_units(rendered)
-        seen = output.alpha >= OPAQUE_ALPHA
-        lengths = placed.rays().norm(dim=-1)[seen]
-        distances.append(output["depth_accumulated"][seen] / output.alpha[seen] * lengths)
+        opaque = output.alpha >= OPAQUE_ALPHA
+        lengths = placed.rays().norm(dim=-1)[opaque]
+        distances.append(output["depth_accumulated"][opaque] / output.alpha[opaque] * lengths)
         cosines.append(1.0 / lengths)
     return FlattenedLight(float(torch.cat(distances).median()), float(torch.cat(cosines).median()))
 

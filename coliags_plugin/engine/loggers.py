@@ -1,4 +1,4 @@
-"""What follows a training run: loggers of the extra ``loggers``, and all followers, none of which can end it."""
+"""Observers of a training run, none of which can end it; loggers of the extra ``loggers``."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Followers(Follower):
         self._followers = list(followers)
 
     def logged(self, row: JsonObject) -> None:
-        """See :class:`Follower`."""
+        """Pass on a row of the log."""
         self._tell(lambda follower: follower.logged(row))
 
     def stepped(self, step: int) -> None:
-        """See :class:`Follower`."""
+        """Pass on that a step was taken."""
         self._tell(lambda follower: follower.stepped(step))
 
     def close(self) -> None:
-        """See :class:`Follower`."""
+        """Close all followers."""
         self._tell(lambda follower: follower.close())
 
     def _tell(self, call: Callable[[Follower], None]) -> None:
@@ -104,8 +104,8 @@ class WandbLogger(Logger):
 
 def find_loggers(names: Iterable[str]) -> list[type[Logger]]:
     """Loggers by their names, once each; InputError where one, or a library that it needs, is not here."""
-    found: list[type[Logger]] = [registry.loggers.get(name) for name in dict.fromkeys(names)]
-    for logger in found:
+    loggers: list[type[Logger]] = [registry.loggers.get(name) for name in dict.fromkeys(names)]
+    for logger in loggers:
         try:
             import_module(logger.library)
         except ImportError as error:
@@ -114,4 +114,4 @@ def find_loggers(names: Iterable[str]) -> list[type[Logger]]:
                 f"the library that {logger.__name__} needs",
                 "Install it: pip install 'coliags_plugin[loggers]' brings those of tensorboard and wandb",
             ) from error
-    return found
+    return loggers

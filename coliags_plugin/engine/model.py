@@ -49,7 +49,7 @@ class Model(nn.Module):
         self._names = tuple(view_modules)
 
     def with_field(self, field: Field, scale: float) -> Model:
-        """The same model of another field, or at another scale; it shares the parts, in the same mode."""
+        """A model that shares all but the field and scale, in the same mode."""
         return Model(field, self.renderer, self.view_modules, self.near_plane, scale).train(self.training)
 
     @property
@@ -63,7 +63,7 @@ class Model(nn.Module):
         return replace(scaled, near_plane=self.near_plane)
 
     def in_scene_units(self, output: RenderOutput) -> RenderOutput:
-        """What was rendered from a :meth:`placed` camera, with its camera and depths in scene units."""
+        """An output rendered from a :meth:`placed` camera, with its camera and depths in scene units."""
         if self.scale == 1.0:
             return output
         factors = {name: self.scale if name.startswith("inverse") else 1.0 / self.scale for name in DEPTH_KINDS}
@@ -131,9 +131,9 @@ class Model(nn.Module):
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
         """Refuse outputs that the renderer lacks for this field, wanted by a module or by ``asking`` (a subject)."""
-        wanted = {asking: frozenset(wants)}
-        wanted |= {f"module '{name}'": module.wants for name, module in self.view_modules.items()}
-        for subject, names in wanted.items():
+        needed = {asking: frozenset(wants)}
+        needed |= {f"module '{name}'": module.wants for name, module in self.view_modules.items()}
+        for subject, names in needed.items():
             missing = sorted(names - self.outputs)
             if missing:
                 raise InputError(

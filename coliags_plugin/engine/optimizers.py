@@ -59,10 +59,10 @@ class Optimizers:
         for name, adam in self.adam.items():
             for parameter, state in adam.state.items():
                 moment = (tuple(parameter.shape), parameter.dtype)
-                wanted = {_COUNT: ((), torch.float32), _MOMENTUM: moment, _MEAN_SQUARE: moment}
-                found = {key: (tuple(value.shape), value.dtype) for key, value in state.items()}
-                if found != wanted:
-                    raise ValueError(f"group {name} has {found}, expected {wanted}")
+                expected = {_COUNT: ((), torch.float32), _MOMENTUM: moment, _MEAN_SQUARE: moment}
+                stored = {key: (tuple(value.shape), value.dtype) for key, value in state.items()}
+                if stored != expected:
+                    raise ValueError(f"group {name} has {stored}, expected {expected}")
 
     def add_rows(self, rows: Mapping[str, Tensor], parents: Tensor | None = None) -> None:
         """Append rows, by group, which have no gradient and no momentum.

@@ -84,12 +84,12 @@ class ProgressReport:
     def _line(self) -> str:
         """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
         (task,) = self._bar.tasks
-        told = [f"{self.title} {task.completed}/{task.total}"]
+        parts = [f"{self.title} {task.completed}/{task.total}"]
         if task.finished:
-            told.append(f"took {duration(task.elapsed or 0.0)}")
+            parts.append(f"took {duration(task.elapsed or 0.0)}")
         elif task.time_remaining is not None:
-            told.append(f"{duration(task.time_remaining)} to go")
-        return f"{', '.join(told)}  {task.fields['facts']}".rstrip()
+            parts.append(f"{duration(task.time_remaining)} to go")
+        return f"{', '.join(parts)}  {task.fields['facts']}".rstrip()
 
     def _show(self, text: str) -> None:
         if not self._console.is_jupyter:

@@ -102,25 +102,25 @@ def choose_frames(scene: Scene, frames: str) -> list[Frame]:
     groups = {"train": scene.train, **scene.test_sets}
     groups["all"] = scene.video
     if not groups.get(frames):
-        known = ", ".join(name for name, group in groups.items() if group)
-        raise InputError(f"scene '{scene.name}' has no frames called '{frames}'", f"one of {known}")
+        names = ", ".join(name for name, group in groups.items() if group)
+        raise InputError(f"scene '{scene.name}' has no frames called '{frames}'", f"one of {names}")
     return groups[frames]
 
 
 def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
-    known = sorted(trained.model.field.feature_channels)
+    names = sorted(trained.model.field.feature_channels)
     for channel in channels:
-        if channel not in known:
+        if channel not in names:
             raise InputError(
                 f"method '{trained.method}' has no feature channel '{channel}'",
-                f"one of {', '.join(known)}" if known else "a method with feature channels, such as pr-endo",
-                did_you_mean(channel, known),
+                f"one of {', '.join(names)}" if names else "a method with feature channels, such as pr-endo",
+                did_you_mean(channel, names),
             )
 
 
 @torch.no_grad()
 def render_view(trained: TrainedRun, of: Frame | Camera, wants: Sequence[str] = _WANTS) -> RenderOutput:
-    """What the model of a run renders of a frame of its scene, or from a free camera."""
+    """Render a frame of a run's scene, or the view of a free camera."""
     if trained.held is not None:
         camera = of if isinstance(of, Camera) else of.camera
         return render_held(trained.model, camera.to(trained.device), trained.held, wants)
@@ -153,8 +153,8 @@ def _write_frame(
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:
     """A rendered depth in colours between two limits, hatched where alpha is below :data:`OPAQUE_ALPHA`."""
-    known = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
-    return colorize_depth(known, limits, hatched=True)
+    depths = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
+    return colorize_depth(depths, limits, hatched=True)
 
 
 def _film(

@@ -41,7 +41,7 @@ _TAIL_BYTES = 8192
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What a run is, from its provenance."""
+    """Identity of a run, from its provenance."""
 
     method: str
     scene_name: str
@@ -99,12 +99,12 @@ class RunFolder:
     @property
     def newest_checkpoint(self) -> Path:
         """The checkpoint of the highest step; refused where there is none."""
-        found = checkpoints_in_order(self.checkpoints)
-        if not found:
+        checkpoints = checkpoints_in_order(self.checkpoints)
+        if not checkpoints:
             raise InputError(
                 f"no checkpoint in {self.checkpoints}", "at least one step-* folder", "Train first: `coliags train`"
             )
-        return found[-1]
+        return checkpoints[-1]
 
     @classmethod
     def default(cls, scene: str, method: str) -> RunFolder:
@@ -117,10 +117,10 @@ class RunFolder:
     def newest(cls, scene: str, method: str) -> RunFolder:
         """The latest run of a method on a scene under the working directory."""
         parent = Path("runs") / scene / method
-        found = sorted(path for path in parent.glob("*") if (path / "config.yaml").is_file())
-        if not found:
+        runs = sorted(path for path in parent.glob("*") if (path / "config.yaml").is_file())
+        if not runs:
             raise InputError(f"no run under {parent}", "one to resume", "Name it with `output=RUN`")
-        return cls(found[-1])
+        return cls(runs[-1])
 
     @classmethod
     def existing(cls, path: Path) -> RunFolder:
@@ -167,30 +167,30 @@ class RunFolder:
 
     def provenance(self) -> JsonObject:
         """Content of the provenance file."""
-        found: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
-        if (written := found.get("format")) != FORMAT:
-            version = found.get("package_version", "?")
+        provenance: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
+        if (written := provenance.get("format")) != FORMAT:
+            version = provenance.get("package_version", "?")
             raise InputError(
                 f"{self.provenance_file} is of coliags_plugin {version}, in format {written}",
                 f"format {FORMAT}, of version {__version__}",
                 "Train again, or use the version that wrote it",
             )
-        return found
+        return provenance
 
     def identity(self) -> RunIdentity:
-        """What the run is."""
-        found = self.provenance()
+        """Method, scene, seed and length of the run."""
+        provenance = self.provenance()
         try:
-            scene = found["scene"]
+            scene = provenance["scene"]
             origin = validated(Provenance, scene["provenance"], f"{self.provenance_file}:")
             return RunIdentity(
-                method=found["method"],
+                method=provenance["method"],
                 scene_name=scene["name"],
                 scene_path=(self.path.resolve() / scene["path"]).resolve(),
                 fingerprint=origin.fingerprint,
                 scale=origin.training_scale,
-                seed=int(found["seed"]),
-                steps=int(found["steps"]),
+                seed=int(provenance["seed"]),
+                steps=int(provenance["steps"]),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error

@@ -16,11 +16,11 @@ PURPOSES = ("initialisation", "frame_order", "densification", "rendering")
 
 def generators(seed: int) -> dict[str, torch.Generator]:
     """CPU generators by purpose; a purpose's stream depends on the seed and its own name only."""
-    found = {}
+    streams = {}
     for purpose in PURPOSES:
         digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
-        found[purpose] = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
-    return found
+        streams[purpose] = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+    return streams
 
 
 class FrameSampler(Sampler):

@@ -54,13 +54,13 @@ class Scorer:
     def _made(
         self, table: Mapping[str, tuple[str, Mapping[str, Any]]], only: Sequence[str] | None
     ) -> dict[str, Metric]:
-        made = {}
+        metrics = {}
         for key, (name, options) in table.items():
             if only is None or key in only:
                 asking = f"protocol '{self.protocol.name}', metric '{key}'"
                 component = named_component("metrics", {"name": name, **options}, asking)
-                made[key] = component.target(component.settings)
-        return made
+                metrics[key] = component.target(component.settings)
+        return metrics
 
     @torch.no_grad()
     def render(self, model: Model, frame: Frame) -> RenderOutput:
@@ -95,18 +95,18 @@ class Scorer:
 
     def refined(self, model: Model, frame: Frame) -> tuple[Comparison, Comparison]:
         """A frame, on the model's device, from its refined pose, as it is rendered, and with its colours fitted."""
-        found = replace(frame, camera=refined_camera(model, frame))
-        view = self.compare(model, found, frame.image.device)
+        moved = replace(frame, camera=refined_camera(model, frame))
+        view = self.compare(model, moved, frame.image.device)
         factors = color_factors(view.rgb, view.true_rgb, view.valid)
         return view, replace(view, rgb=(view.rgb * factors).clamp(0.0, 1.0))
 
     @property
     def further_metrics(self) -> dict[str, Metric]:
         """Metrics that only some frames have: optional ones, those over seen pixels, and those from refined poses."""
-        known = self.metrics | self.optional_metrics
+        metrics = self.metrics | self.optional_metrics
         named = {name + SEEN_SUFFIX: name for name in SEEN_METRICS}
         named |= {name + suffix: name for suffix, name in product(REFINED_SUFFIXES, REFINED_METRICS)}
-        return self.optional_metrics | {name: known[base] for name, base in named.items() if base in known}
+        return self.optional_metrics | {name: metrics[base] for name, base in named.items() if base in metrics}
 
 
 class EvaluatedSet:
@@ -189,6 +189,6 @@ def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
     """A comparison restricted to pixels that a training frame sees, where the frame has a seen mask."""
     if frame.seen is None:
         return comparison
-    seen = frame.seen.to(comparison.valid.device)
-    depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & seen
-    return replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
+    mask = frame.seen.to(comparison.valid.device)
+    depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & mask
+    return replace(comparison, valid=comparison.valid & mask, depth_valid=depth_valid)

@@ -41,7 +41,7 @@ class TrainedRun:
 
     @property
     def relit(self) -> bool:
-        """Whether it is rendered in another light than the data were recorded with."""
+        """True if it is rendered in another light than the data were recorded with."""
         return self.lamp is not None or self.held is not None
 
     @cached_property
@@ -51,8 +51,8 @@ class TrainedRun:
         if scale == 1.0:
             return self
         model = self.model.with_field(self.model.field, 1.0)
-        held = None if self.held is None else self.held.scaled(scale)
-        return replace(self, model=model, scene=self.scene.scaled(scale), held=held)
+        light = None if self.held is None else self.held.scaled(scale)
+        return replace(self, model=model, scene=self.scene.scaled(scale), held=light)
 
     @cached_property
     def training_frames(self) -> frozenset[str]:

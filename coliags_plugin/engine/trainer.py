@@ -185,9 +185,9 @@ class Trainer:
         self.model.field.before_step(step, self.schedule)
         self.strategy.before_step(step, self.model.field, self.optimizers)
         output, target, views = self._render(self.sampler.next())
-        seen = TrainingStep(output, target, self.model, step, self.schedule)
+        training_step = TrainingStep(output, target, self.model, step, self.schedule)
         active = {key: loss for key, loss in self.losses.items() if loss.settings.active(step, self.schedule)}
-        terms = {key: loss(seen) for key, loss in active.items()}
+        terms = {key: loss(training_step) for key, loss in active.items()}
         weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in active.items()}
         total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
         with torch.no_grad():
@@ -204,12 +204,12 @@ class Trainer:
         self._check_drawn(alpha, step)
         if total.requires_grad:
             torch.autograd.backward(total)
-        done = self.strategy.after_backward(seen, self.optimizers)
+        changes = self.strategy.after_backward(training_step, self.optimizers)
         self.optimizers.step(step)
-        done = done | self.strategy.after_step(seen, self.optimizers)
+        changes = changes | self.strategy.after_step(training_step, self.optimizers)
         for view, stages in views:
-            for module, given in zip(self.model.view_modules.values(), stages, strict=False):
-                module.after_step(view, given)
+            for module, stage in zip(self.model.view_modules.values(), stages, strict=False):
+                module.after_step(view, stage)
         self.step = step
         drawn = None if output.splats is None else output.splats.gaussians
         return {
@@ -219,7 +219,7 @@ class Trainer:
             "psnr": min(MAX_PSNR, -10.0 * math.log10(max(error, 1e-30))),
             # Of Gaussians, and of the field's elements that they come from.
             **({} if drawn is None else {"gaussians": len(drawn), "visible": len(drawn.visible_sources)}),
-            **done,
+            **changes,
         }
 
     def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target, list[tuple[View, list[RenderOutput]]]]:
@@ -239,11 +239,11 @@ class Trainer:
         """Write a checkpoint of the current step."""
         tensors = checkpoints.training_tensors(self.model, self.optimizers, self.strategy, self.generators)
         queue, cost = self.sampler.queue, self.costs.cost()
-        made = checkpoints.Checkpoint(self.step, self.method.name, queue, tensors, cost)
-        checkpoints.save_checkpoint(self.run.checkpoints, made)
+        checkpoint = checkpoints.Checkpoint(self.step, self.method.name, queue, tensors, cost)
+        checkpoints.save_checkpoint(self.run.checkpoints, checkpoint)
 
     def provenance(self) -> JsonObject:
-        """What the run is and is made with."""
+        """Provenance of the run: method, scene, renderer, software and plan."""
         scene, footprint = self.scene, self.scene.pixel_footprint
         return {
             "method": self.method.name,
@@ -333,13 +333,13 @@ def deferred_stop() -> Iterator[Callable[[], bool]]:
 
     The second one raises KeyboardInterrupt. SIGHUP stays ignored where it is, as under nohup.
     """
-    asked = False
+    is_asked = False
 
     def remember(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
+        nonlocal is_asked
+        if is_asked:
             raise KeyboardInterrupt
-        asked = True
+        is_asked = True
         logger.info("%s: stopping after this step; once more to stop at once", signal.Signals(number).name)
 
     if threading.current_thread() is not threading.main_thread():  # signals arrive at the main thread only
@@ -351,7 +351,7 @@ def deferred_stop() -> Iterator[Callable[[], bool]]:
     try:
         for number in before:
             signal.signal(number, remember)
-        yield lambda: asked
+        yield lambda: is_asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

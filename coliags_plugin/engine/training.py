@@ -47,7 +47,7 @@ def open_training(
     if_exists: IfExists = "refuse",
     owned: bool = False,
 ) -> Iterator[Trainer]:
-    """What trains a run, from its newest whole checkpoint or from the start, after everything has been checked.
+    """Trainer of a run, from its newest whole checkpoint or from the start, after everything has been checked.
 
     ============  ====================  ============================================
     ``if_exists`` no or an empty folder a run

@@ -213,11 +213,10 @@ def evaluate(context: StageContext) -> StageRecord:
     """Evaluate the held-out frames."""
     from coliags_plugin.engine import evaluator
     from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.results.reading import RESULT_FILE, read_result
 
     trained = load_trained(context.run, context.device, context.scene)
-    folder = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
-    result = read_result(folder / RESULT_FILE)
+    result = evaluator.evaluate(trained, trained.config.protocol, refine_poses=True)
+    folder = trained.run.evaluations / result.evaluation_name
     figures = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
     figures = {name: value for name, value in figures.items() if value is not None}
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)

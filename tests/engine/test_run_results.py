@@ -84,7 +84,7 @@ def whole(loaded):
 
 @pytest.fixture(scope="module")
 def result(whole):
-    return read_result(evaluate(whole, "paper") / RESULT_FILE)
+    return evaluate(whole, "paper")
 
 
 def test_it_says_what_the_run_was(result, whole, scene):
@@ -129,7 +129,7 @@ def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
 
 @pytest.mark.thorough
 def test_refined_poses_add_metrics_and_change_no_other(result, whole):
-    found = read_result(evaluate(whole, "paper", refine_poses=True) / RESULT_FILE)
+    found = evaluate(whole, "paper", refine_poses=True)
     added = ["psnr_pose_refined", "ssim_pose_refined", "psnr_pose_color_refined", "ssim_pose_color_refined"]
     assert list(found.metrics) == [*result.metrics, *added]
     for name, part in result.sets.items():
@@ -144,6 +144,7 @@ def test_refined_poses_add_metrics_and_change_no_other(result, whole):
 
 def test_the_other_files_are_made_of_it(result, whole):
     folder = whole.run.evaluation("paper")
+    assert read_result(folder / RESULT_FILE) == result
     assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(means_summary(result)))
     assert (folder / "per_frame.csv").read_text() == per_frame_table(result)
 
@@ -163,13 +164,13 @@ def test_profiles_and_metrics_agree(result):
 
 def test_a_killed_and_resumed_run_has_the_same_result(loaded, result):
     resumed = loaded(stop=4, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
-    found = read_result(evaluate(resumed, "paper") / RESULT_FILE)
+    found = evaluate(resumed, "paper")
     assert found.sets == result.sets
     assert found.metrics_sha256 == result.metrics_sha256
 
 
 def test_another_model_has_other_predictions_and_the_same_truth(loaded, result):
-    found = read_result(evaluate(loaded(seed=1), "paper") / RESULT_FILE)
+    found = evaluate(loaded(seed=1), "paper")
     assert found.key != result.key and found.metrics_sha256 != result.metrics_sha256
     for name, part in result.sets.items():
         assert found.sets[name].predictions_sha256 != part.predictions_sha256
@@ -180,7 +181,7 @@ def test_other_truth_has_another_hash(loaded, result, whole, scene):
     frames = scene.test_sets["rotation"]
     everything = [frame.with_maps(seen=torch.ones(24, 32, dtype=torch.bool)) for frame in frames]
     other = replace(whole, scene=replace(scene, test_sets={"rotation": everything}))
-    found = read_result(evaluate(other, "paper") / RESULT_FILE).sets["rotation"]
+    found = evaluate(other, "paper").sets["rotation"]
     assert found.predictions_sha256 == result.sets["rotation"].predictions_sha256
     assert found.truth_sha256 != result.sets["rotation"].truth_sha256
 
@@ -192,7 +193,7 @@ def test_runs_that_did_not_go_as_configured_have_keys_of_their_own(loaded, resul
     straight = loaded(overrides=["schedule.checkpoint_every=3"])
     jumped = loaded(steps=3, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
     logged = loaded(stop=4, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
-    keys = [read_result(evaluate(run, "paper") / RESULT_FILE).key for run in (half, straight, jumped, logged)]
+    keys = [evaluate(run, "paper").key for run in (half, straight, jumped, logged)]
     assert half.step == 3
     assert len(set(keys[:3])) == 3 and keys[3] == keys[1]
 
@@ -203,7 +204,7 @@ def test_a_run_that_other_code_trained_has_a_key_of_its_own(whole, result):
         {**whole.provenance, "code": "0123456789abcdef"},
         {**whole.provenance, "code_changes": [{"at_step": 3, "code": "0123456789abcdef"}]},
     ]
-    keys = [read_result(evaluate(replace(whole, provenance=own), "paper") / RESULT_FILE).key for own in others]
+    keys = [evaluate(replace(whole, provenance=own), "paper").key for own in others]
     assert len({*keys, result.key}) == 3
 
 

@@ -468,7 +468,7 @@ def too_much(*args, **kwargs):
     raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
 
 
-TOLD = r"step 1, 2,464 elements: .* ran out \(CUDA out of memory.*2.00 GiB\).*whole.*points_count.*width.*--device cpu"
+TOLD = r"step 1, 2,464 elements: .* ran out \(CUDA out of memory.*2.00 GiB\).*whole.*points_count.*width.*device=cpu"
 
 
 def test_memory_that_runs_out_is_told(tmp_path, monkeypatch):

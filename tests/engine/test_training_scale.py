@@ -26,7 +26,6 @@ from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
 from coliags_plugin.export.splats.cloud import read_splats, write_splats
 from coliags_plugin.reporting.image_files import read_depth_tiff
-from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.views import MeshSettings
 from tests.comparison.small import TINY
@@ -108,7 +107,7 @@ def test_views_have_depths_in_their_own_unit(runs, factor):
 
 
 def test_evaluations_are_in_its_own_unit(runs, factor):
-    results = [read_result(evaluate(run, "paper") / RESULT_FILE) for run in runs]
+    results = [evaluate(run, "paper") for run in runs]
     assert results[0].metrics["depth_median_error"].unit == "units"
     assert results[0].mean("psnr") == pytest.approx(results[1].mean("psnr"), abs=0.01)
     depths = [read_depth_tiff(next((run.run.evaluations / "paper/expected_depth/test").iterdir())) for run in runs]
@@ -147,5 +146,5 @@ def test_meshes_and_gaussians_are_in_its_own_world(runs, factor, small, tmp_path
         import_run(file, tmp_path, folder, CPU, "c3vd")
         again = load_trained(folder.path, CPU)
         assert again.model.scale == pytest.approx(factor / length)
-        psnr = read_result(evaluate(again, "paper") / RESULT_FILE).mean("psnr")
+        psnr = evaluate(again, "paper").mean("psnr")
         assert psnr == pytest.approx(export["psnr_recorded"], abs=0.01)

@@ -14,7 +14,6 @@ from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.truth import match_truth
-from coliags_plugin.results.reading import RESULT_FILE, read_result
 from tests.engine.test_trainer import make_trainer
 from tests.scenes import wall_scene
 
@@ -105,7 +104,7 @@ def test_other_frames_and_other_worlds_are_refused(true, estimated):
 
 
 def test_on_its_own_scene_depth_metrics_have_a_reason(trained):
-    result = read_result(evaluate(trained, "paper") / RESULT_FILE)
+    result = evaluate(trained, "paper")
     assert result.scene.name == "estimate"
     assert result.mean("depth_mse") is None and result.mean("psnr") is not None
     assert result.sets["test"].reasons["depth_mse"] == "estimated depth is no truth"
@@ -117,10 +116,8 @@ def test_on_its_own_scene_depth_metrics_have_a_reason(trained):
 
 
 def test_against_the_truth_they_are_measured(trained, true):
-    folder = evaluate(trained, "paper", true)
-    result = read_result(folder / RESULT_FILE)
-    own = read_result(evaluate(trained, "paper") / RESULT_FILE)
-    assert folder.name == result.evaluation_name == "paper-truth" and own.evaluation_name == "paper"
+    result, own = evaluate(trained, "paper", true), evaluate(trained, "paper")
+    assert result.evaluation_name == "paper-truth" and own.evaluation_name == "paper"
     assert result.key != own.key
     assert result.title.startswith("coliags-estimated-depth on phantom (trained on estimate), seed 0")
     assert result.scene.name == "phantom" and result.scene.fingerprint == "true" and result.scene.split == "every-8th"
@@ -130,4 +127,4 @@ def test_against_the_truth_they_are_measured(trained, true):
     assert result.metrics["depth_mse"].unit == "mm^2" and "sparse_depth_median" not in result.metrics
     assert result.provenance["truth"]["matched_by"] == "name"
     assert result.provenance["truth"]["trained_on"]["fingerprint"] == "estimated"
-    assert (folder / "depth" / "rotation").is_dir()
+    assert (trained.run.evaluations / "paper-truth" / "depth" / "rotation").is_dir()
