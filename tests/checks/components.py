@@ -119,7 +119,7 @@ class Colour(Loss):
 
     Settings = LossSettings
 
-    def __call__(self, step):
+    def __cgaussians_(self, step):
         return masked_mean((step.output.rgb - step.target.rgb).abs(), step.target.mask)
 
 
@@ -225,8 +225,8 @@ def loss(change):
     """The loss with its value, at a step, changed by a function."""
 
     class Changed(Colour):
-        def __call__(self, step):
-            return change(super().__call__(step), step)
+        def __cgaussians_(self, step):
+            return change(super().__cgaussians_(step), step)
 
     return Changed
 
@@ -249,9 +249,9 @@ def balls(change):
     return Changed
 
 
-HasADetachedGroup = balls(lambda made: replace(made, means=made.means.detach()))
-RendersWithChance = balls(lambda made: replace(made, means=made.means + 0.01 * torch.randn(3)))
-CrashesInALibrary = balls(lambda made: torch.cat([made.means, torch.zeros(2, 2)]))
+HasADetachedGroup = balls(lambda gaussians: replace(gaussians, means=gaussians.means.detach()))
+RendersWithChance = balls(lambda gaussians: replace(gaussians, means=gaussians.means + 0.01 * torch.randn(3)))
+CrashesInALibrary = balls(lambda gaussians: torch.cat([gaussians.means, torch.zeros(2, 2)]))
 
 
 class NaNFeature(Balls):
@@ -270,8 +270,8 @@ def spoiling(name, spoil):
             output = super().render(field, camera, wants, pixels)
             if name is None:
                 return spoil(output)
-            kept = {key: spoil(values) if key == name else values for key, values in output.maps.items()}
-            return replace(output, maps={key: values for key, values in kept.items() if values is not None})
+            maps = {key: spoil(values) if key == name else values for key, values in output.maps.items()}
+            return replace(output, maps={key: values for key, values in maps.items() if values is not None})
 
     return Spoilt
 
@@ -327,8 +327,8 @@ class ForgetsABuffer(Balls):
         self.glow = 0.01 * step
 
     def gaussians(self, camera):
-        made = super().gaussians(camera)
-        return replace(made, colors=(made.colors + self.glow).clamp_max(1.0))
+        plain = super().gaussians(camera)
+        return replace(plain, colors=(plain.colors + self.glow).clamp_max(1.0))
 
 
 class ForgetsItsPlace(FrameSampler):
@@ -384,7 +384,7 @@ class GoesPastAdam(Division):
 
 
 class ForgetsAfterAnEvent(Division):
-    """What it remembers of the last event is in no counter."""
+    """Remembers the last event in an attribute that is no counter."""
 
     born_last = 0
 

@@ -49,19 +49,22 @@ def each(scene: Scene, change) -> Scene:
 def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Scene:
     """The scene with every frame's pose, depth, camera or image put through a function of it and its place."""
 
-    def of(frame: Frame) -> Frame:
-        own = (
-            frame.camera if pose is None else replace(frame.camera, camera_to_world=pose(frame.camera.camera_to_world))
-        )
+    def change(frame: Frame) -> Frame:
+        cam = frame.camera
+        cam = cam if pose is None else replace(cam, camera_to_world=pose(cam.camera_to_world))
         return replace(
             frame.with_maps(
                 depth=frame.depth if depth is None else depth(frame.depth),
                 image=frame.image if image is None else image(frame.image, frame.index),
             ),
-            camera=own if camera is None else camera(own),
+            camera=cam if camera is None else camera(cam),
         )
 
-    return each(scene, of)
+    return each(scene, change)
+
+
+def scene_of(frames) -> Scene:
+    return Scene("made up", frames, {}, PointCloud(torch.zeros(0, 3)))
 
 
 def whats(scene: Scene) -> str:
@@ -72,6 +75,17 @@ def scaled_translation(pose, factor):
     moved = pose.clone()
     moved[:3, 3] *= factor
     return moved
+
+
+def jumping(at, by):
+    """A function of poses that moves those beyond ``at``, mm along z, sideways by ``by`` mm."""
+
+    def jumped(pose):
+        moved = pose.clone()
+        moved[0, 3] += by * (pose[2, 3] > at)
+        return moved
+
+    return jumped
 
 
 def test_a_sound_scene_is_not_suspected(scene):
@@ -145,13 +159,13 @@ def test_estimated_depth_is_judged_where_it_is_confident(estimate):
 )
 def test_estimated_depth_contradicts_wrong_poses(estimate, wrong):
     poses = [frame.camera.camera_to_world for frame in estimate.video]
-    given = {
+    wrong_poses = {
         "scaled": [scaled_translation(pose, 3.0) for pose in poses],
         "late": poses[3:] + poses[-1:] * 3,
         "reversed": poses[::-1],
         "inverted": [torch.linalg.inv(pose) for pose in poses],
     }[wrong]
-    of = {frame.name: pose for frame, pose in zip(estimate.video, given, strict=True)}
+    of = {frame.name: pose for frame, pose in zip(estimate.video, wrong_poses, strict=True)}
 
     def posed(frame: Frame) -> Frame:
         return replace(frame, camera=replace(frame.camera, camera_to_world=of[frame.name].clone()))
@@ -166,12 +180,36 @@ def test_depth_that_is_not_confident_anywhere_leaves_poses_to_the_images(estimat
     assert (check.findings, check.agreement, check.matched_by) == ([], {}, "features")
 
 
+NOISE = torch.rand(128, 160, generator=torch.Generator().manual_seed(0))
+
+
+def in_metres(pose):
+    return scaled_translation(pose, 1e-3)
+
+
+def of_twice_the_size(camera):
+    return replace(camera, fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * camera.cx, cy=2 * camera.cy)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        ({"pose": in_metres, "depth": lambda depth: depth * 1e-3}, "depth looks like metres"),
+        ({"camera": of_twice_the_size}, "principal point is far from the middle"),
+        ({"depth": lambda depth: torch.full_like(depth, 30.0)}, "depth is the same everywhere: "),
+        ({"depth": lambda depth: 30.0 + 0.1 * NOISE}, ""),
+        ({"depth": lambda depth: torch.full_like(depth, torch.nan)}, "most of the depth is unknown"),
+    ],
+)
+def test_spoilt_scenes_are_called_by_name(scene, spoil, found):
+    findings = whats(changed(scene, **spoil))
+    assert found in findings and "different units" not in findings
+    assert "everywhere" not in found or "; " not in findings
+
+
 @pytest.mark.thorough
-def test_everything_in_metres(scene):
-    metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
-    findings = whats(metres)
-    assert "depth looks like metres" in findings
-    assert "different units" not in findings
+def test_lengths_of_unknown_unit(scene):
+    metres = changed(scene, pose=in_metres, depth=lambda depth: depth * 1e-3)
     unknown = replace(metres, provenance=metres.provenance.model_copy(update={"unit": "unknown"}))
     check = check_scene(unknown)
     assert check.findings == []
@@ -180,45 +218,22 @@ def test_everything_in_metres(scene):
 
 def test_depth_of_other_frames(frames):
     mixed = [frame.with_maps(depth=frames[7 * frame.index % len(frames)].depth) for frame in frames]
-    assert "frames do not agree on the surface" in whats(Scene("mixed", mixed, {}, PointCloud(torch.zeros(0, 3))))
+    assert "frames do not agree on the surface" in whats(scene_of(mixed))
 
 
-def test_intrinsics_of_another_size(scene):
-    doubled = changed(scene, camera=lambda c: replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy))
-    assert "principal point is far from the middle" in whats(doubled)
-
-
-def test_a_jump_a_standstill_black_and_repeated_images(scene):
-    middle = torch.stack([frame.camera.center for frame in scene.train])[:, 2].median()
-
-    def jumping(pose):
-        moved = pose.clone()
-        moved[0, 3] += 500.0 * (pose[2, 3] > middle)
-        return moved
-
-    def first_of(wrong: Scene, about: str) -> str:
-        facts = path_facts(wrong.video) if about == "path" else image_facts(wrong.video) | {"repeats": 2}
-        return next(findings_of(about, facts)).what
-
-    assert "the camera jumps" in whats(changed(scene, pose=jumping))
-    assert first_of(changed(scene, pose=lambda pose: torch.eye(4)), "path") == "the camera does not move"
-    assert first_of(changed(scene, image=lambda image, index: image * (index != 5)), "images") == "an image is black"
-    first = scene.train[0].image
-    repeated = changed(scene, image=lambda image, index: first if index in (1, 2, 3) else image)
-    assert first_of(repeated, "images") == "images repeat"
-
-
-@pytest.mark.thorough
-def test_constant_and_unknown_depth(scene):
-    flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
-    findings = whats(flat)
-    assert findings.startswith("depth is the same everywhere: ")
-    assert "; " not in findings
-    noise = torch.rand(128, 160, generator=torch.Generator().manual_seed(0))
-    dummy = changed(scene, depth=lambda depth: 30.0 + 0.1 * noise)
-    assert "different units" not in whats(dummy)
-    unknown = changed(scene, depth=lambda depth: torch.full_like(depth, torch.nan))
-    assert "most of the depth is unknown" in whats(unknown)
+@pytest.mark.parametrize(
+    ("spoil", "about", "expected"),
+    [
+        ({"pose": jumping(7.0, 500.0)}, "path", "the camera jumps"),
+        ({"pose": lambda pose: torch.eye(4)}, "path", "the camera does not move"),
+        ({"image": lambda image, index: image * (index != 5)}, "images", "an image is black"),
+        ({"image": lambda image, index: 0 * image + 90 if index in (1, 2, 3) else image}, "images", "images repeat"),
+    ],
+)
+def test_suspect_paths_and_images(scene, spoil, about, expected):
+    video = changed(scene, **spoil).video
+    facts = path_facts(video) if about == "path" else image_facts(video) | {"repeats": 2}
+    assert findings_of(about, facts)[0].what == expected
 
 
 def test_carrying_a_plane_is_exact(tmp_path):
@@ -251,7 +266,7 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
         camera = replace(frame.camera, camera_to_world=pose)
         name, index, image = f"{len(video):04d}", len(video), frame.image + noise
         video.append(replace(frame.with_maps(depth=None, image=image), name=name, index=index, camera=camera))
-    return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)))
+    return scene_of(video)
 
 
 @pytest.mark.thorough
@@ -264,12 +279,7 @@ def test_a_camera_that_pauses_is_not_suspected_and_its_pauses_are_not_compared(f
     assert min(ways) > 2.0
     assert "world-to-camera" in whats(changed(sound, pose=CHANGES["world-to-camera"]))
 
-    def jumping(pose):
-        moved = pose.clone()
-        moved[0, 3] += 100.0 * (pose[2, 3] > 7.0)
-        return moved
-
-    jumped = findings_of("path", path_facts(changed(sound, pose=jumping).video))
+    jumped = findings_of("path", path_facts(changed(sound, pose=jumping(7.0, 100.0)).video))
     assert [finding.what for finding in jumped] == ["the camera jumps"]
 
 
@@ -290,9 +300,6 @@ def lit(frames: list[Frame]) -> list[Frame]:
 
 @pytest.mark.thorough
 def test_reversed_depth_contradicts_the_lamp(frames):
-    def scene_of(frames):
-        return Scene("lit", frames, {}, PointCloud(torch.zeros(0, 3)))
-
     def only_points(frame):
         pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(frame.index)) * torch.tensor([160, 128])
         column, row = pixels.long().unbind(1)
@@ -324,11 +331,11 @@ def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys, caplo
     size = ("--set", "width=40", "--set", "datamanager.height=32")  # with and without the prefix
     with caplog.at_level(logging.INFO):
         status = run("data", "check", tmp_path / "tube", *size)
-    told, log = capsys.readouterr().out, [record.getMessage() for record in caplog.records]
+    out, log = capsys.readouterr().out, [record.getMessage() for record in caplog.records]
     assert status == 0
-    assert "40 x 32 px, stored 160 x 128" in told
-    given = next(line for line in told.splitlines() if line.startswith("given"))
-    assert int(given.split()[-1]) > 500
+    assert "40 x 32 px, stored 160 x 128" in out
+    row = next(line for line in out.splitlines() if line.startswith("given"))
+    assert int(row.split()[-1]) > 500
     for fact in ("format c3vd", "12 frames"):  # the scene is read twice, and told once
         assert sum(fact in line for line in log) == 1
 
@@ -412,10 +419,10 @@ def test_images_that_show_nothing_again_leave_poses_undecided(unmatched):
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
     argv = ("data", "check", folder, "--html", tmp_path / "check.html")
     assert run(*argv) == 0
-    told = capsys.readouterr().out
-    assert "nothing suspect" in told
-    assert "c3vd (undistorted layout)" in told
-    assert told.endswith(f"written: {tmp_path / 'check.html'}\nnext:    coliags train coliags --data {folder}\n")
+    out = capsys.readouterr().out
+    assert "nothing suspect" in out
+    assert "c3vd (undistorted layout)" in out
+    assert out.endswith(f"written: {tmp_path / 'check.html'}\nnext:    coliags train coliags --data {folder}\n")
     assert run(*argv, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["suspect"] is False

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.findings import Finding
@@ -30,10 +30,14 @@ from coliags_plugin.core.scenes import Frame, Scene
 
 #: Largest number of frame pairs.
 _PAIRS = 12
-#: Shares of the pairs that must have matches: of features, else points are followed; of either, else nothing is judged.
-_MATCHED, _JUDGED = 0.5, 0.25
+#: Smallest share of the pairs that must have matches of features, else points are followed.
+_MATCHED = 0.5
 #: Steps count as at most this many typical ones, so that no jump takes all pairs.
 _LONGEST_STEP = 3.0
+
+#: Source and target frames.
+FramePairs = list[tuple[Frame, Frame]]
+Matcher = Literal["features", "tracks"]
 
 
 @dataclass(frozen=True)
@@ -41,18 +45,18 @@ class SceneCheck:
     """Result of the consistency checks."""
 
     scene: Scene  # the scene checked
-    pairs: list[tuple[Frame, Frame]]  # source and target frames of the reprojection or matching
+    pairs: FramePairs  # source and target frames of the reprojection or matching
     facts: dict[str, Any]  # JSON objects of depth, path, images and lamp; None where there is nothing to measure
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
     #: epipolar errors of matched points, by pose hypothesis; empty where there is depth or too few are matched
     matches: dict[str, EpipolarAgreement]
-    matched_by: Literal["features", "tracks"] | None  # how they are matched; None where there is depth
+    matched_by: Matcher | None  # how they are matched; None where there is depth
     findings: list[Finding]  # suspected problems
     undecided: list[Finding]  # what the data are not enough to check
 
     def as_json(self) -> JsonObject:
-        """The same as JSON values; unavailable ones are null."""
+        """The result as JSON values; unavailable ones are null."""
         values = {
             "scene": self.scene.name,
             "suspect": bool(self.findings),
@@ -67,7 +71,7 @@ class SceneCheck:
             "matches": self.matches,
             "matched_by": self.matched_by,
         }
-        return {key: _json_value(value) for key, value in values.items()}
+        return dict(to_jsonable_python(values, inf_nan_mode="null"))
 
 
 def check_scene(
@@ -79,54 +83,35 @@ def check_scene(
     """Run all checks on a scene; without matching of images they take about a second for any number of frames.
 
     ``at_stored_size`` loads the same scene with images of the stored size, in which points are matched if there is no
-    depth, or hardly any that can be trusted; None: those of ``scene``. They are matched by features. Where these fail,
-    as in patients, or contradict poses with which points followed from frame to frame clearly agree, these count.
+    depth, or hardly any that can be trusted; None: those of ``scene``.
     """
     video = scene.video
-    sample = rules.sampled_frames(video)
     pairs = video_pairs(video)
     stored = [(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
-    known = {(a, b): pair for a, b in stored if (pair := Pair(a, b)).is_known}
-    with_depth = list(known.values()) if len(known) >= _JUDGED * len(pairs) else []
+    with_depth = {(a, b): pair for a, b in stored if (pair := Pair(a, b)).has_depth}
     agreements: dict[str, Agreement] = {}
     matches: dict[str, EpipolarAgreement] = {}
-    matched_by: Literal["features", "tracks"] | None = None
-    undecided: list[Finding] = []
-    if with_depth:
-        pairs = [*known]
+    matched_by: Matcher | None = None
+    scale, undecided = None, []
+    if len(with_depth) >= rules.MIN_MATCHED * len(pairs) and with_depth:
+        pairs = [*with_depth]
         for name in with_progress(list(CHANGES), "compare frames", progress):
-            agreements[name] = agreement(with_depth, name)
+            agreements[name] = agreement([*with_depth.values()], name)
+        scale = best_scale([*with_depth.values()])
     elif match_images:
-        # Epipolar errors grow with the baseline, so frames further apart are compared.
-        pairs = video_pairs(video, farther=3)
-        full = video if at_stored_size is None else at_stored_size().video
-        place = {frame.name: number for number, frame in enumerate(full)}
-
-        def followed(chosen: list[tuple[Frame, Frame]]) -> list[FrameMatches]:
-            return follow([full[place[source.name] : place[target.name] + 1] for source, target in chosen], progress)
-
-        matched_by = "features"
-        matched = match([(full[place[source.name]], full[place[target.name]]) for source, target in pairs])
-        readings = _readings(matched)
-        if len(matched) < _MATCHED * len(pairs):
-            matched_by, pairs = "tracks", video_pairs(video)
-            matched = followed(pairs)
-            readings = _readings(matched)
-        elif any(rules.match_findings(readings)):
-            # Points are lost over long ways, and short ones tell less of the poses.
-            tried = ((chosen, followed(chosen)) for chosen in (pairs, video_pairs(video)))
-            enough = next((each for each in tried if len(each[1]) >= _JUDGED * len(each[0])), None)
-            if enough is not None and rules.clearly_agrees(others := _readings(enough[1]), readings):
-                matched_by, (pairs, matched), readings = "tracks", enough, others
-        if len(matched) < _JUDGED * len(pairs):
-            undecided = list(rules.unmatched(len(matched), len(pairs)))
-        else:
-            matches = readings
-            undecided = list(rules.undecided(matches))
-    scale = best_scale(with_depth) if with_depth else None
+        pairs, matched, matched_by = _match(
+            video, video if at_stored_size is None else at_stored_size().video, progress
+        )
+        undecided = rules.findings_of("matched", {"matched": len(matched), "count": len(pairs)})
+        matches = {} if undecided else _readings(matched)
+        undecided = undecided or rules.findings_of("parallax", rules.match_facts(matches))
+    sample = rules.sampled_frames(video)
     depth, path = rules.depth_facts(sample), rules.path_facts(video)
     images, lamp = rules.image_facts(sample), rules.lamp_facts(sample)
+    can_disagree = path and path["length"] and depth and not rules.is_flat(depth)
     measured = [
+        ("agreement", rules.agreement_facts(agreements, scale, is_estimated(video)) if can_disagree else None),
+        ("matches", rules.match_facts(matches)),
         ("points", dict(vars(scene.provenance))),
         ("depth", depth and depth | {"metric": scene.is_metric}),
         ("lamp", lamp),
@@ -134,18 +119,44 @@ def check_scene(
         *(("camera", camera) for camera in rules.camera_facts(video)),
         ("images", images | {"repeats": len(images["repeated"])}),
     ]
-    findings = [
-        *rules.agreement_findings(agreements, scale, path, depth, is_estimated(video)),
-        *rules.match_findings(matches),
-        *(finding for about, values in measured for finding in rules.findings_of(about, values)),
-    ]
+    findings = [finding for about, values in measured for finding in rules.findings_of(about, values)]
     facts = {"depth": depth, "path": path, "images": images, "lamp": lamp}
     return SceneCheck(scene, pairs, facts, agreements, scale, matches, matched_by, findings, undecided)
 
 
 def is_estimated(frames: Sequence[Frame]) -> bool:
-    """Whether the depth of frames is an estimate, with a confidence."""
+    """Return whether the depth of frames is an estimate, with a confidence."""
     return any(frame.depth_confidence is not None for frame in frames)
+
+
+def _match(
+    video: Sequence[Frame], stored: Sequence[Frame], progress: Progress | None
+) -> tuple[FramePairs, list[FrameMatches], Matcher]:
+    """Match points between frames of the stored size: the pairs, those that have matches, and by what.
+
+    They are matched by features. Where these fail, as in patients, or contradict poses with which points followed from
+    frame to frame clearly agree, these count.
+    """
+    place = {frame.name: number for number, frame in enumerate(stored)}
+    # Epipolar errors grow with the baseline, so frames further apart are compared.
+    far, near = video_pairs(video, farther=3), video_pairs(video)
+
+    def followed(pairs: FramePairs) -> list[FrameMatches]:
+        return follow([stored[place[source.name] : place[target.name] + 1] for source, target in pairs], progress)
+
+    matched = match([(stored[place[source.name]], stored[place[target.name]]) for source, target in far])
+    if len(matched) < _MATCHED * len(far):
+        return near, followed(near), "tracks"
+    readings = _readings(matched)
+    if rules.findings_of("matches", rules.match_facts(readings)):
+        # Points are lost over long ways, and short ones tell less of the poses.
+        for pairs in (far, near):
+            tracks = followed(pairs)
+            if len(tracks) >= rules.MIN_MATCHED * len(pairs):
+                if rules.clearly_agrees(_readings(tracks), readings):
+                    return pairs, tracks, "tracks"
+                break
+    return far, matched, "features"
 
 
 def _readings(matched: Sequence[FrameMatches]) -> dict[str, EpipolarAgreement]:
@@ -154,7 +165,7 @@ def _readings(matched: Sequence[FrameMatches]) -> dict[str, EpipolarAgreement]:
     return {name: error for name, error in errors.items() if error is not None}
 
 
-def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, Frame]]:
+def video_pairs(frames: Sequence[Frame], farther: int = 1) -> FramePairs:
     """Pairs of frames with a short baseline: long enough to reveal wrong poses, short enough to overlap.
 
     They are spread evenly over the camera's path, not over time, so that none lies in a pause. ``farther`` multiplies
@@ -177,14 +188,3 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, 
     return [
         (video[here], video[there]) for here, there in dict.fromkeys(zip(first, second, strict=True)) if here < there
     ]
-
-
-def _json_value(value: Any) -> Any:
-    """The value as JSON takes it: dataclasses become mappings, numbers that are not finite None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, dict):
-        return {key: _json_value(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json_value(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

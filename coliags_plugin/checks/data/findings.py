@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ from coliags_plugin.core.scenes import Frame
 _FRAMES = 64
 #: For the correlation of brightness and distance: largest number of frames and of pixels per frame, and fewest pixels.
 _LAMP_FRAMES, _LAMP_PIXELS, _LAMP_MIN_PIXELS = 16, 4000, 30
+#: Smallest share of the pairs of frames in which points must be found again, else nothing is judged.
+MIN_MATCHED = 0.25
 #: Grey levels outside these are clipped.
 _DARKEST, _BRIGHTEST = 3, 253
 #: Smallest ratio of the 90th to the 10th percentile of the distances in a frame.
@@ -34,7 +36,7 @@ def sampled_frames(frames: Sequence[Frame], count: int = _FRAMES) -> list[Frame]
 
 def depth_facts(frames: Sequence[Frame]) -> JsonObject | None:
     """Statistics of z-depth, scene units; shares are of the unmasked pixels. None where no frame has depth."""
-    known, pixels, clipped = [], 0, 0
+    finite, pixels, clipped = [], 0, 0
     for frame in frames:
         depth, bound = frame.depth, frame.depth_at_least
         if depth is None:
@@ -42,10 +44,10 @@ def depth_facts(frames: Sequence[Frame]) -> JsonObject | None:
         inside = depth[frame.valid]
         pixels += len(inside)
         clipped += 0 if bound is None else int(torch.isfinite(bound[frame.valid]).sum())
-        known.append(inside[torch.isfinite(inside)])
+        finite.append(inside[torch.isfinite(inside)])
     if not pixels:
         return None
-    values = torch.cat(known).double().numpy()
+    values = torch.cat(finite).double().numpy()
     quantiles = np.quantile(values, (0.01, 0.5, 0.99)).tolist() if len(values) else [math.nan] * 3
     shares = {"invalid_share": 1.0 - len(values) / pixels, "clipped_share": clipped / pixels}
     return dict(zip(("nearest", "median", "farthest"), quantiles, strict=True)) | shares
@@ -133,11 +135,15 @@ def lamp_facts(frames: Sequence[Frame]) -> JsonObject | None:
 
     It is -1 where every farther pixel is darker, as under a lamp at the camera. None where no frame has enough depth.
     """
-    values = [_correlation(frame) for frame in sampled_frames(frames, _LAMP_FRAMES)]
-    known = np.array([value for value in values if value is not None])
-    if not len(known):
+    correlations = [_correlation(frame) for frame in sampled_frames(frames, _LAMP_FRAMES)]
+    values = np.array([value for value in correlations if value is not None])
+    if not len(values):
         return None
-    return {"correlation": float(np.median(known)), "rising_share": float(np.mean(known > 0.0)), "frames": len(known)}
+    return {
+        "correlation": float(np.median(values)),
+        "rising_share": float(np.mean(values > 0.0)),
+        "frames": len(values),
+    }
 
 
 def _correlation(frame: Frame) -> float | None:
@@ -185,6 +191,80 @@ SCALE_TOLERANCE = 0.1
 MIN_SHARE, MIN_IN_FRONT = 0.3, 0.6
 
 
+def agreement_facts(
+    readings: Mapping[str, Agreement], scale: BestScale | None, is_estimated: bool
+) -> JsonObject | None:
+    """Depth errors with the poses as given, in the best other reading, and with the best factor on depth.
+
+    Infinite where too little overlaps or the factor is no better than half and twice of it; None without readings.
+    """
+    given = readings.get(GIVEN)
+    if given is None:
+        return None
+    errors = {
+        name: math.inf if reading.depth_error is None or reading.share < MIN_SHARE else reading.depth_error
+        for name, reading in readings.items()
+    }
+    best, by_scale, factor = min(ADVICE, key=errors.__getitem__), math.inf, 1.0
+    if scale is not None and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
+        # With dummy depth any factor does that makes the motion negligible.
+        factor = scale.factor
+        by_scale = scale.depth_error if scale.depth_error * CLEARLY_BETTER < scale.beside else math.inf
+    return {
+        "error": errors[GIVEN],
+        "best": best,
+        "least": errors[best],
+        "advice": ADVICE[best],
+        "by_scale": by_scale,
+        "factor": factor,
+        "inverse": 1.0 / factor,
+        "tolerance": MAX_ESTIMATE_ERROR if is_estimated else MAX_DEPTH_ERROR,
+        "errors": f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels "
+        "project into the other image",
+        "still": _percent(readings[NO_MOTION].depth_error),
+    }
+
+
+def match_facts(readings: Mapping[str, EpipolarAgreement]) -> JsonObject | None:
+    """Epipolar errors with the poses as given, and in the best reading with which the matches agree, if any."""
+    given = readings.get(GIVEN)
+    if given is None:
+        return None
+    is_in_front = given.in_front is None or given.in_front >= MIN_IN_FRONT
+    better = {
+        name: reading
+        for name, reading in readings.items()
+        if name in ADVICE
+        and (reading.in_front or 0.0) >= MIN_IN_FRONT
+        and (
+            (given.error > EPIPOLAR_RESOLUTION and reading.error * CLEARLY_BETTER < given.error)
+            or (not is_in_front and reading.agrees and reading.error <= max(EPIPOLAR_RESOLUTION, given.error))
+        )
+    }
+    best = min(better, key=lambda name: better[name].error, default=GIVEN)
+    return vars(given) | {
+        "errors": f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median)",
+        "agrees": given.agrees and is_in_front,
+        "front": f"with a parallax of {given.parallax:.2g} px"
+        if given.in_front is None
+        else f"{given.in_front:.0%} in front of both cameras",
+        "best": best,
+        "least": readings[best].error,
+        "best_front": _percent(readings[best].in_front),
+        "advice": ADVICE.get(best, ""),
+    }
+
+
+def clearly_agrees(readings: Mapping[str, EpipolarAgreement], others: Mapping[str, EpipolarAgreement]) -> bool:
+    """Return whether matches agree with poses that others contradict, and by far: then these others are wrong."""
+    given = readings.get(GIVEN)
+    return (
+        given is not None
+        and not findings_of("matches", match_facts(readings))
+        and given.error * CLEARLY_BETTER < others[GIVEN].error
+    )
+
+
 @dataclass(frozen=True)
 class Finding:
     """One suspected problem."""
@@ -203,236 +283,153 @@ def is_flat(depth: JsonObject) -> bool:
     return bool(depth["farthest"] - depth["nearest"] < 1e-3 * depth["median"])
 
 
-#: By the facts they are about: the test, what is suspect, the evidence, with the facts' values, and the advice.
-RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str, str, str]]] = {
+#: By the facts they are about: the test, and what is suspect, the evidence and the advice, with the facts' values.
+RULES: dict[str, list[tuple[Callable[[JsonObject], bool], str]]] = {
+    "agreement": [
+        (
+            lambda errors: (
+                errors["error"] > DEPTH_RESOLUTION
+                and errors["by_scale"] * CLEARLY_BETTER < min(errors["error"], errors["least"] * CLEARLY_BETTER)
+            ),
+            "depth and poses are in different units | as given, {errors}; with depth times {factor:.3g}, "
+            "{by_scale:.2%} | Check the units: depth seems to be {inverse:.3g} times what the poses expect",
+        ),
+        (
+            lambda errors: (
+                errors["error"] > max(DEPTH_RESOLUTION, errors["least"] * CLEARLY_BETTER)
+                and errors["least"] < 2.0 * errors["tolerance"]
+            ),
+            "poses agree with depth when read as: {best} | as given, {errors}; read this way, {least:.2%} | {advice}",
+        ),
+        (
+            lambda errors: errors["error"] > errors["tolerance"],
+            "frames do not agree on the surface | {errors}; without motion, {still} | "
+            "Check that images, depth and poses match frame by frame, and the calibration",
+        ),
+    ],
+    "matches": [
+        (
+            lambda errors: errors["best"] != GIVEN,
+            "poses agree with the images when read as: {best} | as given, {errors}, {front}; read this way, "
+            "{least:.2g} px, {best_front} in front | {advice}",
+        ),
+        (
+            lambda errors: not errors["agrees"],
+            "images do not agree with the poses | {errors}, {front} | "
+            "Check that images and poses match frame by frame, and the calibration",
+        ),
+    ],
+    "parallax": [
+        (
+            lambda errors: errors["agrees"] and errors["in_front"] is None,
+            "poses may be right or wrong | {count} matches lie {error:.2g} px from their epipolar lines, but the "
+            "camera moves them by {parallax:.2g} px only (median), beside its rotation | "
+            "Look at frames further apart, `datamanager.frame_step=N`, or at a part of the video with more motion",
+        ),
+    ],
+    "matched": [
+        (
+            lambda pairs: pairs["matched"] < MIN_MATCHED * pairs["count"],
+            "the images cannot tell whether the poses are right | points are found again in {matched} of {count} pairs "
+            "of frames only | Judge the poses by what comes of them: held-out frames, and the depth and mesh by eye; "
+            "or check a part of the video that is sharper or has less motion between frames",
+        ),
+    ],
     "points": [
         (
             lambda data: data["misplaced_observations"] > 0.5 * data["observations"],
-            "poses and points of the model contradict each other",
-            "{misplaced_observations} of {observations} observations of points are not where the poses project them",
-            "Take poses, points and intrinsics from one model: a factor on the poses alone, another camera or poses of "
-            "other images do this",
+            "poses and points of the model contradict each other | {misplaced_observations} of {observations} "
+            "observations of points are not where the poses project them | Take poses, points and intrinsics from one "
+            "model: a factor on the poses alone, another camera or poses of other images do this",
         ),
     ],
     "depth": [
         (
             lambda depth: depth["invalid_share"] > 0.5,
-            "most of the depth is unknown",
-            "{invalid_share:.0%} of the unmasked pixels",
+            "most of the depth is unknown | {invalid_share:.0%} of the unmasked pixels | "
             "Check that the depth files belong to these images and are read with the right number of bits",
         ),
         (
             is_flat,
-            "depth is the same everywhere",
-            "{nearest:.4g} to {farthest:.4g}",
+            "depth is the same everywhere | {nearest:.4g} to {farthest:.4g} | "
             "Check the depth files: a failed export can leave images of one value",
         ),
         (
             lambda depth: depth["metric"] and depth["median"] < 1.0,
-            "depth looks like metres",
-            "median {median:.4g} mm; renderers clip at a near plane of 0.2 mm",
+            "depth looks like metres | median {median:.4g} mm; renderers clip at a near plane of 0.2 mm | "
             "State the unit of the files: `datamanager.unit=m`, or unit.txt with m",
         ),
         (
             lambda depth: depth["metric"] and depth["median"] > 1000.0,
-            "depth is too far for an endoscope",
-            "median {median:.4g} mm",
-            "Check the unit of the depth files",
+            "depth is too far for an endoscope | median {median:.4g} mm | Check the unit of the depth files",
         ),
     ],
     "lamp": [
         (
             lambda lamp: lamp["frames"] >= 4 and lamp["correlation"] > 0.3 and lamp["rising_share"] > 0.75,
-            "the far is brighter than the near",
-            "brightness rises with distance (rank correlation {correlation:.2f}, the median of {frames} frames), "
-            "though the lamp is at the camera",
+            "the far is brighter than the near | brightness rises with distance (rank correlation {correlation:.2f}, "
+            "the median of {frames} frames), though the lamp is at the camera | "
             "Check whether the depth is reversed: a disparity, inverse or inverted depth, or one of other images",
         ),
     ],
     "path": [
         (
             lambda path: path["length"] == 0.0,
-            "the camera does not move",
-            "all poses have one centre",
-            "Check the pose file",
+            "the camera does not move | all poses have one centre | Check the pose file",
         ),
         (
             lambda path: path["largest_step"] > 10.0 * max(path["moving_step"], 1e-3 * path["mean_step"]),
-            "the camera jumps",
-            "{largest_step:.4g} to {largest_step_at}, {moving_step:.4g} typically while it moves",
+            "the camera jumps | {largest_step:.4g} to {largest_step_at}, {moving_step:.4g} typically while it moves | "
             "Check the poses around that frame: a cut in the video, or lines missing",
         ),
     ],
     "camera": [
         (
             lambda camera: camera["off_middle"] > 0.2,
-            "the principal point is far from the middle",
-            "{frame}: ({cx:.4g}, {cy:.4g}) of {width} x {height} px",
+            "the principal point is far from the middle | {frame}: ({cx:.4g}, {cy:.4g}) of {width} x {height} px | "
             "Check that the intrinsics are for images of this size",
         ),
         (
             lambda camera: not 1 / 1.15 < camera["ratio"] < 1.15,
-            "pixels are far from square",
-            "{frame}: fx / fy = {ratio:.3g}",
+            "pixels are far from square | {frame}: fx / fy = {ratio:.3g} | "
             "Check the intrinsics, or the working width and height",
         ),
         (
             lambda camera: not 25.0 < camera["angle"] < 160.0,
-            "the field of view is implausible for an endoscope",
-            "{frame}: {angle:.3g} degrees across",
+            "the field of view is implausible for an endoscope | {frame}: {angle:.3g} degrees across | "
             "Check the focal length and the image size it is for",
         ),
     ],
     "images": [
         (
             lambda images: images["darkest_frame"] < 4.0,
-            "an image is black",
-            "{darkest_at}: mean {darkest_frame:.2g} of 255",
-            "Leave it out",
+            "an image is black | {darkest_at}: mean {darkest_frame:.2g} of 255 | Leave it out",
         ),
         (
             lambda images: images["overexposed_share"] > 0.25,
-            "images are overexposed",
-            "{overexposed_share:.0%} of the pixels are white",
-            "",
+            "images are overexposed | {overexposed_share:.0%} of the pixels are white | ",
         ),
         (
             lambda images: images["masked_share"] > 0.75,
-            "most pixels are masked",
-            "{masked_share:.0%} of the pixels are ignored",
+            "most pixels are masked | {masked_share:.0%} of the pixels are ignored | "
             "Check the meaning of the mask: black is ignored here",
         ),
         (
             lambda images: bool(images["repeated"]),
-            "images repeat",
-            "{repeats} of the images looked at equal the one before, {repeated[0]} first",
-            "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
-            "endoscope's",
+            "images repeat | {repeats} of the images looked at equal the one before, {repeated[0]} first | Leave "
+            "repeated images and their poses out: the video was captured at a higher frame rate than the endoscope's",
         ),
     ],
 }
 
 
-def findings_of(about: str, facts: JsonObject | None) -> Iterator[Finding]:
-    """Findings by the rules about one kind of facts; none where there are no facts."""
-    if facts is not None:
-        yield from (Finding(what, said.format(**facts), do) for test, what, said, do in RULES[about] if test(facts))
-
-
-def agreement_findings(
-    readings: Mapping[str, Agreement],
-    scale: BestScale | None,
-    path: JsonObject | None,
-    depth: JsonObject | None,
-    estimated: bool,
-) -> Iterator[Finding]:
-    """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
-    given = readings.get(GIVEN)
-    if given is None or not (path and path["length"] and depth) or is_flat(depth):
-        return
-    tolerance = MAX_ESTIMATE_ERROR if estimated else MAX_DEPTH_ERROR
-    error = math.inf if given.depth_error is None or given.share < MIN_SHARE else given.depth_error
-    errors = (
-        f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels project into "
-        "the other image"
-    )
-    better = {
-        name: reading
-        for name, reading in readings.items()
-        if name in ADVICE and reading.depth_error is not None and reading.share >= MIN_SHARE
-    }
-    best = min(better, key=lambda name: better[name].depth_error or 0.0, default=None)
-    least = math.inf if best is None else better[best].depth_error or 0.0
-    by_scale = math.inf
-    if scale is not None and error > DEPTH_RESOLUTION and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
-        # With dummy depth any factor does that makes the motion negligible.
-        by_scale = scale.depth_error if scale.depth_error * CLEARLY_BETTER < scale.beside else math.inf
-    if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
-        yield Finding(
-            "depth and poses are in different units",
-            f"as given, {errors}; with depth times {scale.factor:.3g}, {_percent(by_scale)}",
-            f"Check the units: depth seems to be {1.0 / scale.factor:.3g} times what the poses expect",
-        )
-    elif best is not None and error > DEPTH_RESOLUTION and least * CLEARLY_BETTER < error and least < 2.0 * tolerance:
-        yield Finding(
-            f"poses agree with depth when read as: {best}",
-            f"as given, {errors}; read this way, {_percent(least)}",
-            ADVICE[best],
-        )
-    elif error > tolerance:
-        still = readings[NO_MOTION].depth_error
-        yield Finding(
-            "frames do not agree on the surface",
-            f"{errors}; without motion, {_percent(still)}",
-            "Check that images, depth and poses match frame by frame, and the calibration",
-        )
-
-
-def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Contradictions of poses and matched points."""
-    given = readings.get(GIVEN)
-    if given is None:
-        return
-    errors = f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), " + (
-        f"with a parallax of {given.parallax:.2g} px"
-        if given.in_front is None
-        else f"{given.in_front:.0%} in front of both cameras"
-    )
-    in_front = given.in_front is None or given.in_front >= MIN_IN_FRONT
-    right = [
-        name
-        for name, reading in readings.items()
-        if name in ADVICE
-        and (reading.in_front or 0.0) >= MIN_IN_FRONT
-        and (
-            (given.error > EPIPOLAR_RESOLUTION and reading.error * CLEARLY_BETTER < given.error)
-            or (not in_front and reading.agrees and reading.error <= max(EPIPOLAR_RESOLUTION, given.error))
-        )
-    ]
-    best = min(right, key=lambda name: readings[name].error, default=None)
-    if best is not None:
-        reading = readings[best]
-        yield Finding(
-            f"poses agree with the images when read as: {best}",
-            f"as given, {errors}; read this way, {reading.error:.2g} px, {_percent(reading.in_front)} in front",
-            ADVICE[best],
-        )
-    elif not given.agrees or not in_front:
-        yield Finding(
-            "images do not agree with the poses",
-            errors,
-            "Check that images and poses match frame by frame, and the calibration",
-        )
-
-
-def clearly_agrees(readings: Mapping[str, EpipolarAgreement], others: Mapping[str, EpipolarAgreement]) -> bool:
-    """Whether matches agree with poses that others contradict, and by far: then these others are wrong."""
-    given = readings.get(GIVEN)
-    return (
-        given is not None and not any(match_findings(readings)) and given.error * CLEARLY_BETTER < others[GIVEN].error
-    )
-
-
-def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Poses that matched points can neither confirm nor refute, for lack of parallax."""
-    given = readings.get(GIVEN)
-    if given is not None and given.in_front is None and given.agrees:
-        yield Finding(
-            "poses may be right or wrong",
-            f"{given.count} matches lie {given.error:.2g} px from their epipolar lines, but the camera moves them by "
-            f"{given.parallax:.2g} px only (median), beside its rotation",
-            "Look at frames further apart, `datamanager.frame_step=N`, or at a part of the video with more motion",
-        )
-
-
-def unmatched(matched: int, pairs: int) -> Iterator[Finding]:
-    """Poses that cannot be judged, as too few points are found again in other frames."""
-    yield Finding(
-        "the images cannot tell whether the poses are right",
-        f"points are found again in {matched} of {pairs} pairs of frames only",
-        "Judge the poses by what comes of them: held-out frames, and the depth and mesh by eye; or check a part of the "
-        "video that is sharper or has less motion between frames",
-    )
+def findings_of(about: str, facts: JsonObject | None) -> list[Finding]:
+    """Findings by the rules about one kind of facts; of agreement and matches the first. None without facts."""
+    if facts is None:
+        return []
+    texts = [text.split(" | ") for test, text in RULES[about] if test(facts)]
+    findings = [Finding(*(part.format(**facts) for part in parts)) for parts in texts]
+    return findings[:1] if about in ("agreement", "matches") else findings
 
 
 def _percent(value: float | None) -> str:

@@ -77,9 +77,9 @@ class Pair:
     """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses."""
 
     def __init__(self, source: Frame, target: Frame) -> None:
-        depth, there = _known_depth(source), _known_depth(target)
-        known = torch.isfinite(depth).reshape(-1).nonzero()[:, 0]
-        chosen = known[:: max(1, len(known) // _PIXELS)]
+        depth, there = _trusted_depth(source), _trusted_depth(target)
+        finite = torch.isfinite(depth).reshape(-1).nonzero()[:, 0]
+        chosen = finite[:: max(1, len(finite) // _PIXELS)]
         own_axes = replace(source.camera, camera_to_world=torch.eye(4, dtype=torch.float64))
         self._source, self._target = source.camera, target.camera
         #: Points in the source camera's axes. [K, 3]
@@ -89,8 +89,8 @@ class Pair:
         self._colors_there = target.image.reshape(-1, 3).double()
 
     @property
-    def is_known(self) -> bool:
-        """Whether there is depth to compare in both frames."""
+    def has_depth(self) -> bool:
+        """Return whether there is depth to compare in both frames."""
         return bool(len(self._points) and torch.isfinite(self._depth_there).any())
 
     def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> tuple[float, Tensor, Tensor, Tensor]:
@@ -107,9 +107,9 @@ class Pair:
         hit = row[lands] * camera.width + column[lands]
         there = self._depth_there[hit] * scale
         difference = (z[lands] - there).abs()
-        known = torch.isfinite(difference)
+        finite = torch.isfinite(difference)
         colors = _color_difference(self._colors[::every][lands], self._colors_there[hit])
-        return float(lands.double().mean()), (difference / there)[known], difference[known], colors
+        return float(lands.double().mean()), (difference / there)[finite], difference[finite], colors
 
 
 @dataclass(frozen=True)
@@ -158,14 +158,14 @@ def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
 
 def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
-    depth = _known_depth(target)
+    depth = _trusted_depth(target)
     pixels, z = changed(source.camera).project(changed(target.camera).unproject(depth).reshape(-1, 3))
     camera = source.camera
     grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
     image = source.image.permute(2, 0, 1)[None].double()
     painted = torch.nn.functional.grid_sample(image, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
     z_there = torch.nn.functional.grid_sample(
-        _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
+        _trusted_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
     )[0, 0]
     z = z.reshape(depth.shape)
     # Points occluded in the source image are left out.
@@ -173,7 +173,7 @@ def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bo
     return painted / 255.0, shown
 
 
-def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
+def _trusted_depth(frame: Frame) -> Float[Tensor, "H W"]:
     """A frame's z-depth, NaN where it is unknown, masked, or estimated with confidence below the least. [H, W]"""
     depth, confidence = frame.depth, frame.depth_confidence
     if depth is None:
@@ -242,7 +242,7 @@ class EpipolarAgreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether the error is that of right poses: real ones are off by some share of the image."""
+        """Return whether the error is that of right poses: real ones are off by some share of the image."""
         return self.error <= max(_MAX_ERROR, _MAX_ERROR_SHARE * self.width)
 
 
@@ -255,9 +255,9 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FrameMatches]:
     with quiet_colmap(0):
         extract = feature_extractor(_FEATURES)
         for pair in pairs:
-            one, other = (extract(frame.image.numpy(), frame.valid.numpy()) for frame in pair)
-            here, there = mutual_matches(one, other, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE).T
-            matches += _explained(*pair, one.pixels[here], other.pixels[there])
+            first, second = (extract(frame.image.numpy(), frame.valid.numpy()) for frame in pair)
+            here, there = mutual_matches(first, second, _MAX_RATIO, _MAX_DESCRIPTOR_DISTANCE).T
+            matches += _explained(*pair, first.pixels[here], second.pixels[there])
     return matches
 
 
@@ -289,10 +289,10 @@ def supported(here: Float[np.ndarray, "K 2"], there: Float[np.ndarray, "K 2"]) -
     if len(here) < _MIN_MATCHES:
         return None
     try:
-        _, found = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _MAX_RESIDUAL, 0.999, 10_000)
+        _, mask = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _MAX_RESIDUAL, 0.999, 10_000)
     except cv2.error:  # raised instead of returning nothing where all samples are degenerate
-        found = None
-    inlier = np.zeros(len(here), bool) if found is None else np.asarray(found[:, 0] > 0)
+        return None
+    inlier = np.zeros(len(here), bool) if mask is None else np.asarray(mask[:, 0] > 0)
     return inlier if inlier.sum() >= max(_MIN_MATCHES, _FREE + _MIN_EXPLAINED * (len(here) - _FREE)) else None
 
 
@@ -318,10 +318,10 @@ def _epipolar_errors(pair: FrameMatches, change: str) -> tuple[np.ndarray, np.nd
     length = float(np.linalg.norm(translation))
     if length == 0.0:
         return None
-    turned, seen = rays(pair.pixels, camera) @ rotation.T, rays(pair.pixels_there, there)
+    turned, target = rays(pair.pixels, camera) @ rotation.T, rays(pair.pixels_there, there)
     lines, focal = np.cross(translation / length, turned), np.array([there.fx, there.fy])
-    distance = np.abs((seen * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2] / focal, axis=1)
+    distance = np.abs((target * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2] / focal, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved = np.linalg.norm((turned[:, :2] / turned[:, 2:] - seen[:, :2]) * focal, axis=1)
+        moved = np.linalg.norm((turned[:, :2] / turned[:, 2:] - target[:, :2]) * focal, axis=1)
     parallax = np.where(turned[:, 2] > 0.0, moved, np.inf)
-    return distance, have_positive_depths(turned, seen, translation), parallax
+    return distance, have_positive_depths(turned, target, translation), parallax

@@ -44,7 +44,7 @@ def _bullets(findings: Sequence[Finding]) -> list[model.Bullets]:
 
 
 def verdict(check: SceneCheck) -> str:
-    """How many findings there are."""
+    """Number of findings, in words."""
     return counted(len(check.findings), "suspect finding") if check.findings else "nothing suspect"
 
 
@@ -67,11 +67,11 @@ def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     stated = "unknown (`datamanager.unit=mm` or a file unit.txt states it)"
     yield model.Fact("unit of length", unit if scene.is_metric else stated)
     depth, path, images, lamp = check.facts.values()
-    known = (
+    depths = (
         "median {median:.4g}, 1 % to 99 %: {nearest:.4g} to {farthest:.4g} {unit}; {invalid_share:.1%} unknown, of "
         "which {clipped_share:.1%} clipped"
     )
-    yield model.Fact("depth", known.format(**depth, unit=unit) if depth else "none")
+    yield model.Fact("depth", depths.format(**depth, unit=unit) if depth else "none")
     if path:
         steps = (
             "steps {mean_step:.3g} (largest {largest_step:.3g} to {largest_step_at}), turns {turn:.3g} degrees in all"
@@ -137,7 +137,7 @@ def _percent(share: float | None) -> str | None:
 
 
 def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
-    """Both images; the source warped into the target view and its difference; and the target's depth."""
+    """The two images; the source warped into the target view and its difference; and the target's depth."""
     images: list[tuple[np.ndarray | torch.Tensor, str]] = [(source.image, source.name), (target.image, target.name)]
     if source.depth is not None and target.depth is not None:
         painted, shown = warp_image(source, target)
@@ -153,9 +153,9 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
         ]
     if target.depth is not None:
         depth = target.depth.numpy()
-        known = depth[np.isfinite(depth)]
-        if len(known):
-            low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
+        finite = depth[np.isfinite(depth)]
+        if len(finite):
+            low, high = (float(value) for value in np.quantile(finite, (0.01, 0.99)))
             limits = (low, max(high, low * 1.001))
             images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} {unit}"))
     return model.Figures(
