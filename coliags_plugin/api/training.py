@@ -48,7 +48,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     request = TrainingRequest(options.method, options.data, overrides, options.seed, options.data_format)
     chosen_loggers = find_loggers(options.loggers)
     if view_port is not None:
-        from coliags_plugin.export.viewer.serving import check_server
+        from coliags_plugin.export.viewer.live import check_server
 
         check_server("127.0.0.1", view_port)
     folder = _run_folder(options)

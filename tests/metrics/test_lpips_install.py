@@ -341,4 +341,4 @@ def test_nothing_else_in_the_package_reaches_for_the_network():
             if roots & {"urllib", "http", "socket", "requests", "pooch", "ftplib"}:
                 users.add(path.relative_to(package).as_posix())
     # The executor only asks whether the cluster that the user named answers, the viewer whether its own port is free.
-    assert users == {"metrics/lpips_install.py", "engine/ray_executor.py", "export/viewer/serving.py"}
+    assert users == {"metrics/lpips_install.py", "engine/ray_executor.py", "export/viewer/live.py"}

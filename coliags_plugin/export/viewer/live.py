@@ -1,16 +1,22 @@
-"""A run in browsers, drawn by its own renderer: viser carries cameras here and pictures there."""
+"""Live view of a run in browsers: its own renderer draws, viser carries cameras here and pictures there."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
 import logging
 import math
+import os
 import shlex
+import socket
+import sys
 import threading
 import time
+import warnings
 import webbrowser
 from dataclasses import replace
 from functools import cached_property
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -30,7 +36,6 @@ from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_
 from coliags_plugin.engine.trained import TrainedRun, load_newer
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.export.viewer.page import look_distance, mesh_files
-from coliags_plugin.export.viewer.serving import has_display, start_server, stop_server
 from coliags_plugin.geometry.meshes.files import encode_mesh, read_mesh
 from coliags_plugin.reporting.image_files import as_array, eight_bit
 
@@ -54,11 +59,40 @@ _SHARE = 0.2
 _FRUSTA, _FRUSTUM_SIZE = 40, 0.03
 
 
-class Viewer:
-    """A run that is being served to browsers, until it is closed. Use it as a context manager, or close it.
+def check_server(host: str, port: int) -> None:
+    """Raise InputError where viser is not installed, or cannot listen at an address."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"viser cannot be imported ({error})",
+            "viser, which draws runs in the browser",
+            "Install it with `pip install 'coliags_plugin[viewer]'`",
+        ) from error
+    if not 0 <= port <= 65535:
+        raise InputError(f"`port={port}`", "a number from 0 (any free port) to 65535")
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except PermissionError as error:
+        raise InputError(f"`port={port}`: {error.strerror}", "a port above 1023") from error
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            message = f"`port={port}` is in use on {host}"
+            raise InputError(message, "a free port", f"Pass another, for instance `port={port + 1}`") from error
+        expected = "a name or address of this machine, for instance 127.0.0.1"
+        raise InputError(f"`host={host}`: {error.strerror or error}", expected) from error
 
-    It listens on the name or address ``host``, at a port, any free one for 0. A thread draws for all browsers in turn,
-    and takes up newer checkpoints of the run; not ``threaded``, whoever made the viewer calls :meth:`draw`.
+
+class Viewer:
+    """A run that is served to browsers, until it is closed. Use it as a context manager, or close it.
+
+    A thread draws for all browsers in turn, and takes up newer checkpoints of the run.
+
+    Args:
+        trained: The run.
+        host: Name or address to listen on.
+        port: 0: any free one.
+        threaded: False: there is no thread, and the caller calls :meth:`draw`.
     """
 
     def __init__(
@@ -67,13 +101,16 @@ class Viewer:
         self.trained, self._host = trained, host
         self._sessions: dict[int, Session] = {}
         self._wake, self._closed = threading.Event(), False
-        self._server = start_server(host, port)
+        check_server(host, port)
+        import viser
+
+        # A browser may leave while something is computed for it.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # else it reports each start and end of a server
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
-        try:
-            self._set_start()
-        except BaseException:
-            stop_server(self._server)
-            raise
+        self._set_start()
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._sessions.pop(client.client_id, None))
         if threaded:
@@ -81,7 +118,7 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port of the server."""
         return int(self._server.get_port())
 
     @property
@@ -91,7 +128,7 @@ class Viewer:
 
     @property
     def sessions(self) -> list[Session]:
-        """One for each browser that looks at it."""
+        """Sessions of the browsers that are connected."""
         return list(self._sessions.values())
 
     @cached_property
@@ -107,7 +144,7 @@ class Viewer:
 
     @cached_property
     def depth_limits(self) -> tuple[float, float]:
-        """One scale of depth for the whole video."""
+        """Depths of the first and the last colour, the same for the whole video."""
         return sampled_depth_limits(self.trained, self.trained.scene.video, OUTPUTS["depth"])
 
     def picture(self, camera: Camera, kind: str, light: str = "") -> UInt8[np.ndarray, "H W 3"]:
@@ -122,7 +159,7 @@ class Viewer:
         return as_array(eight_bit(output.rgb))
 
     def wake(self) -> None:
-        """Something is to be drawn."""
+        """Let the thread draw what is due."""
         self._wake.set()
 
     def draw(self) -> float:
@@ -143,7 +180,11 @@ class Viewer:
 
     def open(self) -> bool:
         """Open a browser on this machine; False where there is no display, or none could be opened."""
-        return has_display() and webbrowser.open(self.url)
+        if sys.platform in ("darwin", "win32"):
+            has_display = "SSH_CONNECTION" not in os.environ
+        else:
+            has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        return has_display and webbrowser.open(self.url)
 
     def close(self) -> None:
         """Stop serving, once what is being drawn is done: threads that end later crash the process."""
@@ -151,15 +192,17 @@ class Viewer:
         self.wake()
         if self._thread.is_alive():
             self._thread.join()
-        stop_server(self._server)
+        self._stop_server()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _stop_server(self) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints that it stops
+            self._server.stop()
 
     def _set_start(self) -> None:
         """Let browsers start at the first training camera, upright, before black, with a plain panel and one light."""
@@ -168,11 +211,8 @@ class Viewer:
         server.scene.set_up_direction(tuple(-axes[:, 1]))
         start = server.initial_camera
         start.position, start.up, start.look_at = position, -axes[:, 1], position + self.distance * axes[:, 2]
-        start.fov, start.near, start.far = (
-            _fov(camera),
-            min(camera.near_plane, 0.02 * self.distance),
-            1e3 * self.distance,
-        )
+        start.fov, start.far = _fov(camera), 1e3 * self.distance
+        start.near = min(camera.near_plane, 0.02 * self.distance)
         server.scene.configure_default_lights(enabled=False)
         server.scene.configure_environment_map(hdri=None)
         server.scene.add_light_ambient("/light", intensity=3.0)
@@ -238,29 +278,30 @@ class Session:
         with gui.add_folder("Frames of the video"):
             self.frame = gui.add_slider("Frame", 0, max(1, len(frames) - 1), 1, 0)
             self.frame.on_update(lambda _: self.go_to(frames[min(int(self.frame.value), len(frames) - 1)]))
-            self._recorded = gui.add_image(as_array(frames[0].image), label=self._said_of(frames[0]))
+            self._recorded = gui.add_image(as_array(frames[0].image), label=self._label_of(frames[0]))
             cameras = gui.add_checkbox("Cameras", False)
             cameras.on_update(lambda _: self._show_cameras(cameras.value))
         with gui.add_folder("Camera path"):
-            gui.add_button("Add keyframe").on_click(lambda _: self.add_keyframe())
-            gui.add_button("Remove the last").on_click(lambda _: self.remove_keyframe())
+            add, remove = gui.add_button("Add keyframe"), gui.add_button("Remove the last")
+            add.on_click(lambda _: self.change_path([*self.keyframes, Keyframe.of(self.camera())]))
+            remove.on_click(lambda _: self.change_path(self.keyframes[:-1]))
             self._seconds = gui.add_slider("Seconds between", 0.5, 10.0, 0.5, 2.0)
             gui.add_button("Save").on_click(lambda _: self.save_path())
             self.path_line = gui.add_markdown("No keyframes yet.")
         self.status = gui.add_markdown("")
 
     def camera_moved(self) -> None:
-        """The camera of the browser has moved."""
+        """Note that the camera of the browser has moved."""
         self._moved, self._small_due, self._full_due = time.monotonic(), True, True
         self._viewer.wake()
 
     def redraw(self) -> None:
-        """The picture is to be drawn again from the same camera."""
+        """Note that the picture is to be drawn again from the same camera."""
         self._full_due = True
         self._viewer.wake()
 
     def model_changed(self) -> None:
-        """The run has been trained on."""
+        """Tell the step of the run, and draw the picture again."""
         scene, step = self._viewer.trained.scene, self._viewer.trained.step
         self._about.content = (
             f"Step {step}; {len(scene.video)} frames, {len(scene.video) - len(scene.train)} held out; lengths in "
@@ -316,7 +357,7 @@ class Session:
 
     def go_to(self, frame: Frame) -> None:
         """Show a frame of the video, and move the browser's camera there."""
-        self._recorded.image, self._recorded.label = as_array(frame.image), self._said_of(frame)
+        self._recorded.image, self._recorded.label = as_array(frame.image), self._label_of(frame)
         pose = as_array(frame.camera.camera_to_world.double())
         theirs, axes, position = self._client.camera, pose[:3, :3], pose[:3, 3]
         with self._client.atomic():
@@ -324,41 +365,34 @@ class Session:
             theirs.look_at, theirs.fov = position + self._viewer.distance * axes[:, 2], _fov(frame.camera)
         self.camera_moved()
 
-    def _said_of(self, frame: Frame) -> str:
+    def _label_of(self, frame: Frame) -> str:
         held_out = frame.name not in self._viewer.trained.training_frames
         return f"recorded {frame.name}{', held out' if held_out else ''}"
 
     def _show_cameras(self, visible: bool) -> None:
+        from viser.transforms import SO3
+
         frames = self._viewer.trained.scene.video
         for index in range(0, 0 if self._frusta else len(frames), -(-len(frames) // _FRUSTA)):
-            self._frusta.append(self._frustum(index, frames[index]))
+            camera, pose = frames[index].camera, as_array(frames[index].camera.camera_to_world.double())
+            frustum = self._client.scene.add_camera_frustum(
+                f"/cameras/{frames[index].name}",
+                fov=_fov(camera),
+                aspect=camera.width / camera.fx * camera.fy / camera.height,
+                scale=_FRUSTUM_SIZE * self._viewer.distance,
+                color=(30, 120, 200),
+                wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+                position=pose[:3, 3],
+            )
+            frustum.on_click(lambda _, index=index: setattr(self.frame, "value", index))
+            self._frusta.append(frustum)
         for frustum in self._frusta:
             frustum.visible = visible
 
-    def _frustum(self, index: int, frame: Frame) -> Any:
-        from viser.transforms import SO3
-
-        camera, pose = frame.camera, as_array(frame.camera.camera_to_world.double())
-        aspect = camera.width / camera.fx * camera.fy / camera.height
-        handle = self._client.scene.add_camera_frustum(
-            *(f"/cameras/{frame.name}", _fov(camera), aspect),
-            scale=_FRUSTUM_SIZE * self._viewer.distance,
-            color=(30, 120, 200),
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
-            position=pose[:3, 3],
-        )
-        handle.on_click(lambda _: setattr(self.frame, "value", index))
-        return handle
-
-    def add_keyframe(self) -> None:
-        """Add the browser's camera to the path."""
-        self.keyframes.append(Keyframe.of(self.camera()))
-        self.path_line.content = f"Keyframes: {len(self.keyframes)}, not saved."
-
-    def remove_keyframe(self) -> None:
-        """Remove the keyframe that was added last."""
-        del self.keyframes[-1:]
-        self.path_line.content = f"Keyframes: {len(self.keyframes)}, not saved."
+    def change_path(self, keyframes: list[Keyframe]) -> None:
+        """Take other keyframes for the camera path."""
+        self.keyframes = keyframes
+        self.path_line.content = f"Keyframes: {len(keyframes)}, not saved."
 
     def save_path(self) -> None:
         """Write the path beside what else the run has; an earlier one is replaced."""

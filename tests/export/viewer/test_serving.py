@@ -23,7 +23,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.camera_path import CameraPath
 from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import depth_picture, render_view, sampled_depth_limits
-from coliags_plugin.export.viewer import live, serving
+from coliags_plugin.export.viewer import live
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.image_files import as_array, eight_bit
@@ -176,16 +176,22 @@ def test_a_browser_that_leaves_is_forgotten(viewer):
 
 def test_a_path_that_is_set_in_the_view(viewer):
     run, file = viewer.trained.run.path, viewer.trained.run.path / "camera-path.json"
-    with connected(viewer) as (_, camera):
-        session = session_of(viewer)
-        session.add_keyframe()
-        session.save_path()
-        assert session.path_line.content == "A path needs two keyframes or more." and not file.exists()
-        session.add_keyframe()
-        session.add_keyframe()
-        session.remove_keyframe()
-        session.save_path()
-        assert session.path_line.content == f"Saved. Its video: `coliags render {run} --path {file}`"
+    with connected(viewer) as (client, camera):
+        line = session_of(viewer).path_line
+        for button, text in (
+            ("Add keyframe", "Keyframes: 1, not saved."),
+            ("Save", "A path needs two keyframes or more."),
+            ("Add keyframe", "Keyframes: 2, not saved."),
+            ("Add keyframe", "Keyframes: 3, not saved."),
+            ("Remove the last", "Keyframes: 2, not saved."),
+            ("Save", f"Saved. Its video: `coliags render {run} --path {file}`"),
+        ):
+            assert not file.exists()
+            client.set(button, True)
+            ends = time.monotonic() + 10.0
+            while line.content != text:
+                assert time.monotonic() < ends, line.content
+                time.sleep(0.01)
     path = CameraPath.read(file)
     assert len(path.keyframes) == 2 and json.loads(file.read_text())["seconds"] == 2.0
     np.testing.assert_allclose(path.keyframes[0].camera_to_world, camera.camera_to_world, atol=1e-6)
@@ -286,7 +292,7 @@ def test_without_viser_it_is_said_how_to_install_it(anchors, monkeypatch):
 
 
 def test_no_browser_is_opened_without_a_display(viewer, monkeypatch):
-    monkeypatch.setattr(serving.sys, "platform", "linux")
+    monkeypatch.setattr(live.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     opened = []
