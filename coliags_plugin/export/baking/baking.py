@@ -33,7 +33,7 @@ _NONE = 1e-12
 
 
 def blending_weights(renderer: SplattingRenderer, gaussians: Gaussians, camera: Camera) -> Float[Tensor, "N"]:
-    """How many pixels each Gaussian fills in a view: its blending weights, summed over the pixels. [N]
+    """Blending weights of each Gaussian in a view, summed over the pixels: the number of pixels it fills. [N]
 
     These are the gradients of the image's sum with respect to the colours.
     """
@@ -80,36 +80,22 @@ class GaussianAverages:
         self._rotations.index_add_(0, slots, weights[:, None, None] * products)
 
     def visible(self) -> Int[Tensor, "N"]:
-        """Slots of the Gaussians that are visible in a view, ascending. [N]"""
+        """Slots of the Gaussians that are visible in a view, ascending; InputError where none is. [N]"""
         visible = (self._weights >= _LEAST_WEIGHT) & (self._mean_opacities() >= _LEAST_OPACITY)
+        if not visible.any():
+            raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
         return visible.nonzero().squeeze(1)
 
-    def kept(self) -> Int[Tensor, "N"]:
-        """The same, at least one; refuses a run of which nothing is visible. [N]"""
-        visible = self.visible()
-        if not len(visible):
-            raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
-        return visible
-
     def heaviest(self, most: int, share: float = 1.0) -> Int[Tensor, "N"]:
-        """Those of the visible slots with the largest weights, ascending: so many that they hold a share of all. [N]"""
+        """The fewest visible slots that hold a share of all weights, at most ``most``, ascending. [N]"""
         visible = self.visible()
         weights, order = self._weights[visible].double().sort(descending=True, stable=True)
         below = int((weights.cumsum(0) < share * weights.sum()).sum()) + 1
         return visible[order[: min(most, below)]].sort().values
 
-    def gaussians(self, kept: Int[Tensor, "N"]) -> Gaussians:
-        """The averages of some slots, of no view in particular."""
-        weights = self._weights[kept][:, None]
-        return Gaussians(
-            means=self._means[kept] / weights,
-            quats_wxyz=torch.linalg.eigh(self._rotations[kept]).eigenvectors[:, :, -1],
-            scales=(self._log_scales[kept] / weights).exp(),
-            opacities=self._mean_opacities()[kept],
-            colors=self._colors[kept] / weights,
-            source_index=kept,
-            visible_sources=kept,
-        )
+    def mean_colors(self, slots: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
+        """Mean colours (RGB) of some slots. [N, 3]"""
+        return self._colors[slots] / self._weights[slots][:, None]
 
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)
@@ -117,27 +103,30 @@ class GaussianAverages:
 
     def field(
         self,
-        kept: Int[Tensor, "N"],
+        slots: Int[Tensor, "N"],
         harmonics: Float[Tensor, "N B 3"],
         kind: type[ExplicitGaussians] = ExplicitGaussians,
     ) -> ExplicitGaussians:
         """The averages of some slots as an explicit field of a kind, with colours to degree D, B = (D + 1)^2."""
-        degree = round(harmonics.shape[1] ** 0.5) - 1
-        made = kind(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
-        mean = self.gaussians(kept)
+        weights = self._weights[slots][:, None]
+        log_scales = self._log_scales[slots] / weights
+        thickness = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)  # of surfels, as in files
+        values = {
+            "means": self._means[slots] / weights,
+            "scales": torch.cat([log_scales, thickness], dim=1)[:, :3],
+            "quats": torch.linalg.eigh(self._rotations[slots]).eigenvectors[:, :, -1],
+            "opacities": torch.logit(self._mean_opacities()[slots].clamp(1e-4, 1.0 - 1e-4)),
+            "sh0": harmonics[:, :1],
+            "shN": harmonics[:, 1:],
+            "degree": torch.tensor(math.isqrt(harmonics.shape[1]) - 1),
+        }
+        if issubclass(kind, AttenuatedGaussians):
+            values["distances"] = (self._log_distances[slots] / weights).exp()
+        field = kind(ExplicitGaussiansSettings(sh_degree=int(values["degree"])), len(slots)).to(slots.device)
         with torch.no_grad():
-            if isinstance(made, AttenuatedGaussians):
-                made.distances.copy_((self._log_distances[kept] / self._weights[kept][:, None]).exp())
-            made.means.copy_(mean.means)
-            log_scales = self._log_scales[kept] / self._weights[kept][:, None]
-            thickness = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)  # of surfels, as in files
-            made.scales.copy_(torch.cat([log_scales, thickness], dim=1)[:, :3])
-            made.quats.copy_(mean.quats_wxyz)
-            made.opacities.copy_(torch.logit(mean.opacities.clamp(1e-4, 1.0 - 1e-4)))
-            made.sh0.copy_(harmonics[:, :1])
-            made.shN.copy_(harmonics[:, 1:])
-            made.degree.fill_(degree)
-        return made
+            for name, value in values.items():
+                getattr(field, name).copy_(value)
+        return field
 
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
@@ -157,7 +146,7 @@ def bake(
     kind: type[ExplicitGaussians] = ExplicitGaussians,
     most_steps: int | None = None,
 ) -> tuple[SplatCloud, dict[str, Any]]:
-    """One cloud of Gaussians for all views, under a held light, if any, and facts for its record, if it is changed.
+    """Convert a field to one cloud of Gaussians for all views, under a held light; facts are empty if unchanged.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
@@ -171,27 +160,26 @@ def bake(
     trained = trained.in_model_units
     explicit = trained.model.field
     if most is None and isinstance(explicit, ExplicitGaussians):
-        made = field_of_cloud(cloud_of_field(explicit).with_thickness())
-        needs = explicit.scale_count < 3 and needs_distillation(made, trained, light)
-        facts = {"steps": distil(made, trained, light, seconds, most_steps), "seconds": seconds} if needs else {}
-        return cloud_of_field(made).scaled(1.0 / scale), facts
+        baked = field_of_cloud(cloud_of_field(explicit).with_thickness())
+        needs = explicit.scale_count < 3 and needs_distillation(baked, trained, light)
+        facts = {"steps": distil(baked, trained, light, seconds, most_steps), "seconds": seconds} if needs else {}
+        return cloud_of_field(baked).scaled(1.0 / scale), facts
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     averages, seen = _averaged(trained, views, light)
-    kept = averages.kept()
-    visible, steps = len(kept), 0
+    slots = averages.visible()
+    visible, steps = len(slots), 0
 
-    def field() -> ExplicitGaussians:
-        return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, degree), kind)
+    def field(slots: Int[Tensor, "N"]) -> ExplicitGaussians:
+        return averages.field(slots, fit_harmonics(seen, slots, averages.mean_colors(slots), degree), kind)
 
     if most is not None:
-        kept = averages.heaviest(most)
-    made = field()
-    if needs_distillation(made, trained, light):
-        kept = averages.heaviest(len(kept), _FITTED_SHARE)
-        made = field()
-        steps = distil(made, trained, light, seconds, most_steps)
+        slots = averages.heaviest(most)
+    baked = field(slots)
+    if needs_distillation(baked, trained, light):
+        baked = field(averages.heaviest(len(slots), _FITTED_SHARE))
+        steps = distil(baked, trained, light, seconds, most_steps)
     facts = {"steps": steps, "seconds": seconds, "views": len(views), "visible": visible}
-    return cloud_of_field(made).scaled(1.0 / scale), facts
+    return cloud_of_field(baked).scaled(1.0 / scale), facts
 
 
 def _averaged(
@@ -199,7 +187,9 @@ def _averaged(
 ) -> tuple[GaussianAverages, list[SeenColors]]:
     """Gaussians of a run averaged over views, and their colours in some of these."""
     field, renderer = gaussians_of(trained.model), splatting_of(trained.model)
-    averages: GaussianAverages | None = None
+    averages = GaussianAverages(
+        field.element_count, field.slots_per_element, 2 if field.primitive == "surfels" else 3, trained.device
+    )
     seen: list[SeenColors] = []
     every = -(-len(views) // _COLOR_VIEWS)
     with ProgressReport("bake: average over views", len(views)) as progress:
@@ -208,15 +198,10 @@ def _averaged(
             with torch.no_grad():
                 gaussians = field.gaussians_in_light(camera, light)
             weights = blending_weights(renderer, gaussians, camera)
-            if averages is None:
-                sizes = field.element_count, field.slots_per_element, gaussians.scales.shape[1]
-                averages = GaussianAverages(*sizes, trained.device)
             averages.add(gaussians, weights, camera)
             if index % every == 0:
                 seen.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)
-    if averages is None:
-        raise InputError("no training view", "a run with at least one")
     return averages, seen
 
 
@@ -245,23 +230,27 @@ class SeenColors:
 
 
 def fit_harmonics(
-    views: Sequence[SeenColors], kept: Int[Tensor, "N"], mean_colors: Float[Tensor, "N 3"], degree: int
+    views: Sequence[SeenColors], slots: Int[Tensor, "N"], mean_colors: Float[Tensor, "N 3"], degree: int
 ) -> Float[Tensor, "N B 3"]:
     """Coefficients that reproduce the colours best: weighted least squares per Gaussian, ridge above degree 0.
 
-    Of ascending slots, with B = (degree + 1)^2 each; ``mean_colors`` are theirs where no view shows them.
+    Args:
+        views: Colours in some views.
+        slots: Gaussians to fit, ascending.
+        mean_colors: RGB of these where no view shows them.
+        degree: Degree D of the harmonics; B = (D + 1)^2.
     """
     bases = (degree + 1) ** 2
-    rows = torch.full((int(kept[-1]) + 1,), -1, dtype=torch.int64, device=kept.device)
-    rows[kept] = torch.arange(len(kept), device=kept.device)
-    ridge = torch.full((bases,), RIDGE, device=kept.device)
+    rows = torch.full((int(slots[-1]) + 1,), -1, dtype=torch.int64, device=slots.device)
+    rows[slots] = torch.arange(len(slots), device=slots.device)
+    ridge = torch.full((bases,), RIDGE, device=slots.device)
     ridge[0] = 0.0
     parts = []
-    for start in range(0, len(kept), _CHUNK):
-        count = min(_CHUNK, len(kept) - start)
-        normal = torch.zeros(count, bases, bases, device=kept.device)
-        right = torch.zeros(count, bases, 3, device=kept.device)
-        total = torch.zeros(count, device=kept.device)
+    for start in range(0, len(slots), _CHUNK):
+        count = min(_CHUNK, len(slots) - start)
+        normal = torch.zeros(count, bases, bases, device=slots.device)
+        right = torch.zeros(count, bases, 3, device=slots.device)
+        total = torch.zeros(count, device=slots.device)
         for view in views:
             row = rows[view.slots.clamp_max(len(rows) - 1)] - start
             here = (view.slots < len(rows)) & (row >= 0) & (row < count)

@@ -81,12 +81,12 @@ def test_averages_of_the_same_gaussians_are_these():
     averages, camera = GaussianAverages(12, 1, 3, torch.device("cpu")), camera_at(0, 0, 0)
     for flip in (1.0, -1.0, 2.5):  # a quaternion and its negative are the same rotation
         averages.add(replace(gaussians, quats_wxyz=flip * gaussians.quats_wxyz), torch.rand(12) + 0.1, camera)
-    field = averages.field(averages.kept(), torch.zeros(12, 16, 3))
+    field = averages.field(averages.visible(), torch.zeros(12, 16, 3))
     assert int(field.degree) == 3
     torch.testing.assert_close(field.means, gaussians.means)
     torch.testing.assert_close(field.scales.exp(), gaussians.scales)
     torch.testing.assert_close(field.opacities.sigmoid(), gaussians.opacities)
-    torch.testing.assert_close(averages.gaussians(averages.kept()).colors, gaussians.colors)
+    torch.testing.assert_close(averages.mean_colors(averages.visible()), gaussians.colors)
     expected = rotation_matrices(gaussians.quats_wxyz)
     torch.testing.assert_close(rotation_matrices(field.quats), expected, atol=1e-5, rtol=0)
 
@@ -99,7 +99,7 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
     averages = GaussianAverages(1, 2, 3, torch.device("cpu"))
     averages.add(both, torch.tensor([3.0, 1.0]), camera_at(0, 0, 0))
     averages.add(first, torch.tensor([4.0]), camera_at(0, 0, 0))
-    field = averages.field(averages.kept(), torch.zeros(2, 1, 3))
+    field = averages.field(averages.visible(), torch.zeros(2, 1, 3))
     # Both views show 4 pixels of the anchor; the second child is in the first view only.
     torch.testing.assert_close(field.opacities.sigmoid(), torch.tensor([0.8, 0.3]))
     torch.testing.assert_close(field.means, both.means)
@@ -118,7 +118,7 @@ def test_nothing_visible_is_an_error():
     averages = GaussianAverages(3, 1, 3, torch.device("cpu"))
     averages.add(some_gaussians(3), torch.zeros(3), camera_at(0, 0, 0))
     with pytest.raises(InputError, match="visible"):
-        averages.kept()
+        averages.visible()
 
 
 def test_the_mean_camera_is_between_the_cameras():
