@@ -131,7 +131,7 @@ class CoverageCommand(RunCommand, options.CoverageOptions):
         is_run = (self.path / "config.yaml").is_file()
         measured = self.opened().coverage(self) if is_run else measure_scene_coverage(self.path, self)
         print_summary(
-            "\n".join(measured.summary),
+            measured.summary,
             measured.values,
             written=[measured.folder],
             then=[view_command(self.path, self.data)] if is_run else [],

@@ -268,7 +268,7 @@ def coverage(context: StageContext) -> StageRecord:
     what = "what was seen and missed, for research use only"
     values = made.values
     return StageRecord(
-        "; ".join(" ".join(line.split()).rstrip(";") for line in made.summary),
+        "; ".join(f"{fact.name}: {fact.text}" for fact in made.facts),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
         figures={name: values[name] for name in ("seen", "seen_area") if values[name] is not None},
     )

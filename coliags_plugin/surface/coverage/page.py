@@ -171,7 +171,7 @@ def coverage_page(
             "reconstructed wall is a result all the same; what was not reconstructed is not counted."
         )
         shown = Image(EncodedImage.png(picture), "reconstructed wall", wide=True)
-        sections = [Section("Seen wall", [Paragraph(note, hint=False), Figures([shown]), _level_table(coverage)])]
+        sections = [Section("Seen wall", [Paragraph(note, hint=False), Figures([shown]), level_table(coverage)])]
     else:
         note = (
             "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from "
@@ -181,7 +181,7 @@ def coverage_page(
         )
         shown = Image(EncodedImage.png(picture), "unrolled map", wide=True)
         sections = [
-            Section("Map", [Paragraph(note), Figures([shown]), _level_table(coverage)]),
+            Section("Map", [Paragraph(note), Figures([shown]), level_table(coverage)]),
             Section("Missed regions", list(_missed_regions(coverage, views))),
         ]
         method += (
@@ -191,7 +191,7 @@ def coverage_page(
         )
     settings = record("Settings", coverage.settings.model_dump())
     sections.append(Section("How it is measured", [Paragraph(method), settings]))
-    return Page(f"{name}: coverage", sections, _facts(coverage), note=RESEARCH_USE)
+    return Page(f"{name}: coverage", sections, coverage_facts(coverage), note=RESEARCH_USE)
 
 
 def _levels_note(settings: CoverageSettings) -> str:
@@ -202,21 +202,6 @@ def _levels_note(settings: CoverageSettings) -> str:
         f"{settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its normal. At a glance: fewer "
         "frames do. Too dark or too far: frames show it, but none so near and bright."
     )
-
-
-def summary(coverage: WallCoverage | PartialCoverage) -> list[str]:
-    """A few lines for a terminal."""
-    levels = [f"{share:>5} %  {label} ({area})" for label, area, share in _levels(coverage)]
-    if isinstance(coverage, PartialCoverage):
-        seen = area_text(coverage.area(coverage.level != Level.UNSEEN), coverage.metric)
-        first = f"{seen} of reconstructed wall seen"
-        last = f"no map along the lumen, no length and no missed regions: {coverage.reason}"
-    else:
-        first = f"section of {coverage.section.length:.0f} mm"
-        missed = sum(region.area for region in coverage.regions)
-        limit = f"{coverage.settings.region_diameter:g} mm"
-        last = f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²"
-    return [f"{first}, {len(coverage.names)} frames", *levels, last, RESEARCH_USE]
 
 
 def _levels(coverage: SeenWall) -> list[tuple[str, str, str]]:
@@ -232,11 +217,12 @@ def clock_text(degrees: float) -> str:
     return f"{minutes // 60 or 12}:{minutes % 60:02d}"
 
 
-def _facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
+def coverage_facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
+    """Seen wall, section and missed regions, for the page and the terminal."""
     total, seen = coverage.area(), coverage.area(coverage.level != Level.UNSEEN)
     frames = Fact("frames", str(len(coverage.names)))
     if isinstance(coverage, PartialCoverage):
-        return [Fact("seen", area_text(seen, coverage.metric)), Fact("section", "none"), frames]
+        return [Fact("seen", area_text(seen, coverage.metric)), Fact("section", "none", note=coverage.reason), frames]
     missed = sum(region.area for region in coverage.regions)
     return [
         Fact("seen", f"{100.0 * seen / total:.0f} % of the wall"),
@@ -247,7 +233,8 @@ def _facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
     ]
 
 
-def _level_table(coverage: SeenWall) -> Table:
+def level_table(coverage: SeenWall) -> Table:
+    """Area and share of each level."""
     return simple_table(["wall", "area", "share, %"], [list(row) for row in _levels(coverage)])
 
 

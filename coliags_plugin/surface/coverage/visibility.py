@@ -6,7 +6,7 @@ Rays go through the lens of the stored images, which are not undistorted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -239,9 +239,11 @@ def facing_cameras(
     if not views:
         raise InputError("a recording without frames", "one frame or more")
     _check_not_empty(mesh)
-    grids = RayGrids(_PROBE_RAYS)
     probes = views[:: max(1, len(views) // _PROBE_FRAMES)]
-    hits = [view_hits(mesh, view, grids.of(view), settings.max_distance, both_sides=True) for view in probes]
+    hits = [
+        view_hits(mesh, view, grid, settings.max_distance, both_sides=True)
+        for view, grid in _with_grids(probes, _PROBE_RAYS)
+    ]
     cosines = np.concatenate([each.cosine for each in hits])
     if not len(cosines):
         raise InputError(
@@ -268,13 +270,12 @@ def see_faces(
     """
     settings = settings or CoverageSettings()
     _check_not_empty(mesh)
-    grids, tally = RayGrids(settings.rays), _Tally(len(mesh))
-    for number, view in enumerate(with_progress(views, "cast viewing rays", progress)):
-        grid = grids.of(view)
+    tally = _Tally(len(mesh))
+    shown = with_progress(views, "cast viewing rays", progress)
+    for number, (view, grid) in enumerate(_with_grids(shown, settings.rays)):
         tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
     between = np.flatnonzero(tally.counts[0] == 0)
-    for number, view in enumerate(views):
-        grid = grids.of(view)
+    for number, (view, grid) in enumerate(_with_grids(views, settings.rays)):
         hits = _visible_centroids(mesh, view, grid, between, settings.max_distance)
         tally.add(number, hits, grid, view, settings)
     return tally.result()
@@ -285,22 +286,18 @@ def _check_not_empty(mesh: TriangleMesh) -> None:
         raise InputError("a mesh without triangles", "the surface that the camera filmed")
 
 
-class RayGrids:
-    """The ray grid of the last lens asked for, as frames of one lens usually follow each other."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._last: tuple[CoverageView, RayGrid] | None = None
-
-    def of(self, view: CoverageView) -> RayGrid:
-        """The grid of a view's lens and mask."""
-        if self._last is None or self._last[0].lens != view.lens or not _same(self._last[0].mask, view.mask):
-            self._last = view, RayGrid.of(view.lens, view.mask, self._most)
-        return self._last[1]
+def _with_grids(views: Iterable[CoverageView], most: int) -> Iterator[tuple[CoverageView, RayGrid]]:
+    """Views with the ray grids of their lenses and masks, made anew only where lens or mask change."""
+    last: CoverageView | None = None
+    for view in views:
+        if last is None or last.lens != view.lens or not _same(last.mask, view.mask):
+            grid = RayGrid.of(view.lens, view.mask, most)
+        last = view
+        yield view, grid
 
 
-def _same(one: Bool[np.ndarray, "H W"] | None, other: Bool[np.ndarray, "H W"] | None) -> bool:
-    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+def _same(first: Bool[np.ndarray, "H W"] | None, second: Bool[np.ndarray, "H W"] | None) -> bool:
+    return first is second or (first is not None and second is not None and np.array_equal(first, second))
 
 
 class _Tally:

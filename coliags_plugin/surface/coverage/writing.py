@@ -20,14 +20,17 @@ from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import write_png
+from coliags_plugin.reporting.model import Fact, FactList, Paragraph
+from coliags_plugin.reporting.text_formats import terminal_text
 from coliags_plugin.surface.coverage.measure import PartialCoverage, SeenWall, WallCoverage, measure_coverage
 from coliags_plugin.surface.coverage.page import (
     RESEARCH_USE,
+    coverage_facts,
     coverage_page,
     draw_map,
     draw_partial,
     face_colors,
-    summary,
+    level_table,
 )
 from coliags_plugin.surface.coverage.visibility import CoverageSettings, Level, recorded_views
 
@@ -39,7 +42,16 @@ class MeasuredCoverage:
     folder: Path  # with ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``
     coverage: WallCoverage | PartialCoverage = field(repr=False)
     values: dict[str, Any] = field(repr=False)  # the contents of ``coverage.json``
-    summary: list[str] = field(repr=False)  # a few lines for a terminal
+
+    @property
+    def facts(self) -> list[Fact]:
+        """Seen wall, section and missed regions."""
+        return coverage_facts(self.coverage)
+
+    @property
+    def summary(self) -> str:
+        """A few lines for a terminal."""
+        return terminal_text([FactList(self.facts), level_table(self.coverage), Paragraph(RESEARCH_USE)])
 
 
 def measure_scene(
@@ -66,7 +78,7 @@ def measure_scene(
         write_png(folder / "map.png", picture)
         write_mesh(folder / "coverage.ply", colored_mesh(coverage))
         write_html(page, folder / "coverage.html")
-    return MeasuredCoverage(output, coverage, values, summary(coverage))
+    return MeasuredCoverage(output, coverage, values)
 
 
 def open_recording(path: Path) -> Scene:
