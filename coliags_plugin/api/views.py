@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from coliags_plugin.reporting.colormaps import (
     depth_error,
     depth_limits,
 )
-from coliags_plugin.reporting.image_files import as_array, eight_bit, encode_png
+from coliags_plugin.reporting.image_files import EncodedImage, as_array, eight_bit
 
 #: Smallest width of an image in a notebook, px on the screen.
 _SHOWN_WIDTH = 200
@@ -80,7 +79,7 @@ class RenderedView:
             '<div style="display:flex;flex-wrap:wrap;gap:8px">'
             + "".join(
                 f'<figure style="margin:0"><img alt="{escape(caption)}" width="{width}" '
-                f'src="data:image/png;base64,{base64.b64encode(encode_png(image)).decode()}">'
+                f'src="{EncodedImage.png(image).uri}">'
                 f"<figcaption>{escape(caption)}</figcaption></figure>"
                 for caption, image in self.images().items()
             )

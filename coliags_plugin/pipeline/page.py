@@ -29,12 +29,12 @@ from coliags_plugin.pipeline.timeline import (
     timeline,
 )
 from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
     Block,
     Bullet,
     Bullets,
     Column,
-    EncodedImage,
     Fact,
     Figures,
     Folded,

@@ -10,7 +10,6 @@ from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
@@ -18,8 +17,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
 from coliags_plugin.reporting.charts import COLORS
-from coliags_plugin.reporting.image_files import encode_jpeg
-from coliags_plugin.reporting.model import EncodedImage, Template
+from coliags_plugin.reporting.image_files import EncodedImage
+from coliags_plugin.reporting.model import Template
 from coliags_plugin.reporting.numbers import counted, linear_ticks, tick_label
 
 #: Columns of the ribbon and of the curves, and pictures above it.
@@ -151,13 +150,9 @@ def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | No
 def _small_picture(file: Path) -> EncodedImage | None:
     """An image reduced to the width of a picture, as JPEG; None if it cannot be read."""
     try:
-        image = read_rgb(file)
+        return EncodedImage.jpeg(read_rgb(file), 80, _WIDTH)
     except (InputError, OSError, ValueError):
         return None
-    if image.shape[1] > _WIDTH:
-        size = (_WIDTH, max(1, round(image.shape[0] * _WIDTH / image.shape[1])))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    return EncodedImage(encode_jpeg(image, 80), "image/jpeg", image.shape[1], image.shape[0])
 
 
 def timeline(contents: Contents, states: FrameStates) -> Template:

@@ -9,7 +9,6 @@ import hashlib
 import math
 import re
 import shutil
-from base64 import b64encode
 from collections.abc import Sequence
 from functools import cache, cached_property
 from pathlib import Path
@@ -22,14 +21,14 @@ from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.reporting.charts import Axes, color_stops, style_classes
-from coliags_plugin.reporting.model import Block, Chart, EncodedImage, Figure, Page
+from coliags_plugin.reporting.image_files import EncodedImage
+from coliags_plugin.reporting.model import Block, Chart, Figure, Page
 from coliags_plugin.reporting.numbers import DASH, counted, linear_ticks, sentence, tick_label, unit_text
 
 #: Largest page, bytes; pictures that have no room in it are written into a folder beside it.
 PAGE_LIMIT = 40_000_000
 
 _ASSETS = Path(__file__).with_name("assets")
-_SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png", "image/webp": ".webp"}
 #: Names of pictures beside a page; nothing else is ever removed.
 _NAME = re.compile(r"[0-9a-f]{20}\.(jpg|png|webp)")
 #: Bytes of a note, and where it is: how many pictures are beside the page.
@@ -109,9 +108,9 @@ def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | 
         image = pictures[key]
         room -= 4 * ((len(image.data) + 2) // 3)
         if folder is None or (room >= 0 and not beside):
-            return f"data:{image.mime};base64,{b64encode(image.data).decode('ascii')}"
+            return image.uri
         if key not in beside:
-            beside[key] = key + _SUFFIXES[image.mime]
+            beside[key] = key + image.suffix
             atomic_write(folder / beside[key], image.data)
         return f"{folder.name}/{beside[key]}"
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,26 +38,55 @@ def eight_bit(rgb: Tensor) -> Tensor:
     return (rgb.clamp(0.0, 1.0) * 255.0).round().byte()
 
 
-def encode_png(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
-    """An 8-bit RGB image as PNG."""
-    return encode_image(checked_rgb(rgb))
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image file with its size, px."""
 
+    data: bytes
+    suffix: str  # its kind: ``.png``, ``.jpg`` or ``.webp``
+    width: int  # px
+    height: int  # px
 
-def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> bytes:
-    """An 8-bit RGB image as JPEG without chroma subsampling, which visibly degrades red mucosa; quality 1 to 100."""
-    sampling = int(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
-    return encode_image(checked_rgb(rgb), ".jpg", options)
+    @classmethod
+    def png(cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> EncodedImage:
+        """An 8-bit RGB image as PNG."""
+        return cls._encoded(checked_rgb(rgb), ".png")
 
+    @classmethod
+    def jpeg(
+        cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95, width: int | None = None
+    ) -> EncodedImage:
+        """An 8-bit RGB image as JPEG, reduced to a width in px if wider; quality 1 to 100.
 
-def encode_webp(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
-    """An 8-bit RGB image as WebP without loss: a third of a PNG's size for colour-mapped images."""
-    return encode_image(checked_rgb(rgb), ".webp", [cv2.IMWRITE_WEBP_QUALITY, _WEBP_LOSSLESS])
+        Chroma is not subsampled, which would visibly degrade red mucosa.
+        """
+        image = checked_rgb(rgb)
+        if width is not None and image.shape[1] > width:
+            size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        sampling = int(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+        options = (cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling)
+        return cls._encoded(image, ".jpg", options)
+
+    @classmethod
+    def webp(cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> EncodedImage:
+        """An 8-bit RGB image as WebP without loss: a third of a PNG's size for colour-mapped images."""
+        return cls._encoded(checked_rgb(rgb), ".webp", (cv2.IMWRITE_WEBP_QUALITY, _WEBP_LOSSLESS))
+
+    @classmethod
+    def _encoded(cls, image: np.ndarray, suffix: str, options: Sequence[int] = ()) -> EncodedImage:
+        return cls(encode_image(image, suffix, options), suffix, image.shape[1], image.shape[0])
+
+    @property
+    def uri(self) -> str:
+        """Data URI with the whole image."""
+        kind = "jpeg" if self.suffix == ".jpg" else self.suffix.removeprefix(".")
+        return f"data:image/{kind};base64,{b64encode(self.data).decode('ascii')}"
 
 
 def write_png(path: Path, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> None:
     """Write an 8-bit RGB PNG atomically; its folder is created."""
-    atomic_write(path, encode_png(rgb))
+    atomic_write(path, encode_image(checked_rgb(rgb)))
 
 
 def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) -> None:

@@ -10,12 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from coliags_plugin.reporting.numbers import Direction, column_decimals, number_text, plain, ranks_of, unit_text
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import UInt8
-    from torch import Tensor
-
     from coliags_plugin.reporting.charts import Series
     from coliags_plugin.reporting.colormaps import ColorMap
+    from coliags_plugin.reporting.image_files import EncodedImage
 
 #: What a table may hold besides cells; None is shown as a dash.
 Value = str | int | float | None
@@ -164,23 +161,6 @@ class FactList(Block):
 
     kind: ClassVar[str] = "facts"
     facts: Sequence[Fact]
-
-
-@dataclass(frozen=True)
-class EncodedImage:
-    """An image file with its size, px."""
-
-    data: bytes
-    mime: str  # its kind, for instance ``image/png``
-    width: int  # px
-    height: int  # px
-
-    @classmethod
-    def png(cls, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> EncodedImage:
-        """Colours as a PNG."""
-        from coliags_plugin.reporting.image_files import encode_png
-
-        return cls(encode_png(rgb), "image/png", rgb.shape[1], rgb.shape[0])
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.reporting.image_files import (
-    encode_jpeg,
-    encode_png,
-    encode_webp,
+    EncodedImage,
     read_depth_tiff,
     write_depth_tiff,
     write_png,
@@ -34,11 +32,13 @@ def test_png_round_trip_and_channel_order(tmp_path, rgb):
 
 
 def test_jpeg_keeps_full_chroma(rgb):
-    data = encode_jpeg(rgb)
+    data = EncodedImage.jpeg(rgb).data
     frame = data.index(b"\xff\xc0")
     assert data[frame + 11] == 0x11  # sampling of the luma component: 1 x 1, as the chroma's
+    small = EncodedImage.jpeg(np.zeros((30, 40, 3), np.uint8), width=20)
+    assert (small.width, small.height) == (20, 15) and small.uri.startswith("data:image/jpeg;base64,/9j/")
     flat = np.full((8, 8, 3), (200, 60, 30), np.uint8)
-    decoded = cv2.imdecode(np.frombuffer(encode_jpeg(flat), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+    decoded = cv2.imdecode(np.frombuffer(EncodedImage.jpeg(flat).data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
     assert np.abs(decoded.astype(int) - flat).max() <= 3
 
 
@@ -57,7 +57,7 @@ def test_tiff_keeps_float32_nan_and_infinity(tmp_path):
 def test_what_is_no_image_or_no_depth_is_refused(tmp_path):
     four, grey = np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4), np.uint8)
     for wrong in (grey, four, np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)):
-        for encode in (encode_png, encode_webp):
+        for encode in (EncodedImage.png, EncodedImage.webp):
             with pytest.raises(InputError, match="8-bit RGB, uint8"):
                 encode(wrong)
     for wrong in (np.zeros((3, 3), int), np.zeros((3, 3, 1)), np.zeros((0, 3))):
@@ -79,6 +79,6 @@ def test_nothing_is_converted_on_reading(tmp_path, rgb):
 
 def test_webp_loses_nothing():
     rgb = np.random.default_rng(0).integers(0, 256, (13, 17, 3), dtype=np.uint8)
-    data = encode_webp(rgb)
+    data = EncodedImage.webp(rgb).data
     assert data[:4] == b"RIFF" and data[8:12] == b"WEBP"
     assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] == rgb).all()

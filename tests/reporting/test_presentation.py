@@ -17,6 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting import html_page, text_formats
 from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
+from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
     Block,
     Bullet,
@@ -24,7 +25,6 @@ from coliags_plugin.reporting.model import (
     Chart,
     ColorBar,
     Column,
-    EncodedImage,
     Fact,
     Figures,
     Folded,

@@ -16,7 +16,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reporting import model
 from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.colormaps import RGB_ERROR_LIMIT, colorize_depth, colorize_error, rgb_error
-from coliags_plugin.reporting.image_files import eight_bit
+from coliags_plugin.reporting.image_files import EncodedImage, eight_bit
 from coliags_plugin.reporting.numbers import counted, sentence, short_number
 
 #: Number of pairs shown.
@@ -159,7 +159,7 @@ def _pair_images(source: Frame, target: Frame, unit: str) -> model.Figures:
             limits = (low, max(high, low * 1.001))
             images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} {unit}"))
     return model.Figures(
-        [model.Image(model.EncodedImage.png(rgb), caption) for rgb, caption in images],
+        [model.Image(EncodedImage.png(rgb), caption) for rgb, caption in images],
         f"{source.name} and {target.name}",
     )
 

@@ -23,8 +23,8 @@ from coliags_plugin.reporting.colormaps import (
     hatch,
     rgb_error,
 )
-from coliags_plugin.reporting.image_files import encode_jpeg, encode_webp, read_depth_tiff
-from coliags_plugin.reporting.model import Block, ColorBar, EncodedImage, Paragraph, Section, Template
+from coliags_plugin.reporting.image_files import EncodedImage, read_depth_tiff
+from coliags_plugin.reporting.model import Block, ColorBar, Paragraph, Section, Template
 from coliags_plugin.reporting.numbers import column_decimals, number_text, round_up, unit_text
 
 #: Wider images are reduced by an integer factor, to limit the size of the report, px.
@@ -210,7 +210,7 @@ def view_section(study: Study, reference: str, count: int) -> Section:
         bars.append(ColorBar(scales.depth, unit, "depth", "depth", "depth-scale"))
     values = {
         "bars": bars,
-        "hatch": None if scales.depth is None else _webp(hatch(14, 34)),
+        "hatch": None if scales.depth is None else EncodedImage.webp(hatch(14, 34)),
         "reference": reference,
         "orders": {name: metric_title(name) for name in _SORTED_BY if name in study.metrics},
         "scenes": [
@@ -266,11 +266,11 @@ def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, 
     """
     frame, where = view.frame, f"frame {view.frame.name}"
     study, test_set = frame.test_set.study, frame.test_set
-    truth = _jpeg(view.truth)
+    truth = EncodedImage.jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
     if view.true_depth is not None and scales.depth is not None:
-        tiles.append((_webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
+        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
         caption = ["above: camera image", "below: true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
@@ -278,15 +278,15 @@ def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, 
     kind = "depth" if view.of_depth else "colour"
     for rendering in view.renderings:
         name = rendering.run.method
-        tiles = [(_jpeg(rendering.rgb), f"{where}, rendered by {name}")]
+        tiles = [(EncodedImage.jpeg(rendering.rgb), f"{where}, rendered by {name}")]
         if rendering.error is None:
             tiles.append((None, "no depth to compare"))
         else:
             drawn = colorize_error(rendering.error, ~np.isnan(rendering.error), scales.error_ends[view.of_depth])
-            tiles.append((_webp(drawn), f"{where}, absolute {kind} error of {name}"))
+            tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {kind} error of {name}"))
             if rendering.expected is not None and scales.depth is not None:
                 drawn = colorize_depth(rendering.expected, scales.depth, hatched=True)
-                tiles.append((_webp(drawn), f"{where}, expected depth of {name}"))
+                tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
     runs = test_set.evaluated(reference, frame.scene)
     values = frame.values(runs[0][0]) if runs else {}
@@ -322,11 +322,3 @@ def error_limit(errors: Sequence[np.ndarray]) -> float:
     pooled = np.concatenate([*samples, np.zeros(0)])
     finite = pooled[np.isfinite(pooled)]
     return round_up(max(float(np.percentile(finite, _SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0
-
-
-def _jpeg(rgb: np.ndarray) -> EncodedImage:
-    return EncodedImage(encode_jpeg(rgb), "image/jpeg", rgb.shape[1], rgb.shape[0])
-
-
-def _webp(rgb: np.ndarray) -> EncodedImage:
-    return EncodedImage(encode_webp(rgb), "image/webp", rgb.shape[1], rgb.shape[0])

@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
@@ -39,7 +38,7 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
 from coliags_plugin.reporting.html_page import environment, refuse_folder
-from coliags_plugin.reporting.image_files import as_array, encode_jpeg
+from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.numbers import counted
 from coliags_plugin.surface.coverage.visibility import MAP_LEGEND
 
@@ -129,7 +128,7 @@ class CameraPath:
                 "axes": camera.camera_to_world[:3, :3].tolist(),
                 "center": camera.camera_to_world[:3, 3].tolist(),
                 "held_out": frame.name not in self.training,
-                "picture": _picture(frame) if index % every == 0 else None,
+                "picture": EncodedImage.jpeg(frame.image, _QUALITY, _WIDTH).uri if index % every == 0 else None,
             }
             for index, (frame, camera) in enumerate(zip(self.frames, self.cameras, strict=True))
         ]
@@ -179,14 +178,6 @@ def _packed_attenuation(
     rounded = np.stack([np.exp(logs), exponents], axis=1).astype(np.float32)
     packed = {"low": low.tolist(), "span": span.tolist(), "farthest": math.log(FARTHEST), "data": data}
     return packed, rounded
-
-
-def _picture(frame: Frame) -> str:
-    image = as_array(frame.image)
-    size = _WIDTH, max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
-    if image.shape[1] > _WIDTH:
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return f"data:image/jpeg;base64,{b64encode(encode_jpeg(image, _QUALITY)).decode('ascii')}"
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.reporting.colormaps import INK, draw_text, side_by_side, stacked, text_width
+from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
     Block,
-    EncodedImage,
     Fact,
     Figures,
     Image,

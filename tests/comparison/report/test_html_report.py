@@ -19,7 +19,7 @@ from coliags_plugin.comparison.report.views import error_limit, evenly
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.colormaps import color_table, hatch
-from coliags_plugin.reporting.image_files import encode_png, write_depth_tiff
+from coliags_plugin.reporting.image_files import EncodedImage, write_depth_tiff
 from tests.comparison.report.made import (
     FRAMES,
     HEIGHT,
@@ -361,7 +361,7 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
         ("depth/test/0004.tiff", b"x", r"depth/test/0004\.tiff .*cannot be decoded"),
         (
             "renders/test/0004.png",
-            encode_png(np.zeros((5, 6, 3), np.uint8)),
+            EncodedImage.png(np.zeros((5, 6, 3), np.uint8)).data,
             r"6 x 5 px\. Expected 16 x 12 px, as the truth",
         ),
     ],
