@@ -32,7 +32,6 @@ from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.results.reading import find_results
 from coliags_plugin.surface.coverage.visibility import CoverageSettings
-from coliags_plugin.testing import METHOD_CHECKS, name_of_check
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -335,12 +334,6 @@ def test_every_key_of_a_method_is_in_the_table():
     said = (DOCS / "configs.md").read_text()
     for key, field in ScheduleSettings.model_fields.items():
         assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
-
-
-def test_the_table_of_checks_is_the_list():
-    assert [row[0] for row in table_rows("configs.md", "| check | what must hold |")] == [
-        name_of_check(check) for check in METHOD_CHECKS
-    ]
 
 
 def test_rates_in_the_table_are_coliags():
