@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 from typing_extensions import Self
 
-from coliags_plugin.datamanagers.colmap import find_models
-from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
+from coliags_plugin.datamanagers.colmap import find_models, read_model
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.pipeline.survey import Segment
 
 #: Fewest frames that both models have to have posed.
@@ -71,30 +71,26 @@ def _is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """Frames of a model: rotations and centres of the cameras, and median depths of the points that they see."""
+    """Frames of a model, by the stems of their names: poses, and median depths of the points that they see."""
 
     model: str  # folder, relative to the scene
-    rotations: dict[str, Float[np.ndarray, "3 3"]]  # camera to world, by the stem of the frame's name
-    centers: dict[str, Float[np.ndarray, "3"]]
+    c2w: dict[str, Float[np.ndarray, "4 4"]]
     depths: dict[str, float]
 
 
 def read_posed(scene: Path) -> list[PosedFrames]:
-    """The models of a scene, the largest first."""
-    found = []
+    """Read the models of a scene, the largest first."""
+    models = []
     for folder in find_models(scene):
-        suffix = model_suffix(folder, ("images", "points3D"))
-        positions = {point.number: point.position for point in read_points(folder / f"points3D{suffix}")}
-        frames = PosedFrames(folder.relative_to(scene).as_posix(), {}, {}, {})
-        for image in read_images(folder / f"images{suffix}"):
-            turn = Rotation.from_quat(image.quat_wxyz, scalar_first=True).as_matrix()
-            name, shift = Path(image.name).stem, np.array(image.translation)
-            seen = np.array([positions[number] for number in image.points.tolist() if number in positions])
-            if len(seen):
-                frames.rotations[name], frames.centers[name] = turn.T, -turn.T @ shift
-                frames.depths[name] = float(np.median(seen @ turn[2] + shift[2]))
-        found.append(frames)
-    return found
+        model = read_model(folder)
+        frames = PosedFrames(folder.relative_to(scene).as_posix(), {}, {})
+        for image, c2w, w2c in zip(model.images, model.camera_to_world, inverse(model.camera_to_world), strict=True):
+            if len(image.points):
+                frames.c2w[Path(image.name).stem] = c2w
+                z_depths = model.positions[image.points] @ w2c[2, :3] + w2c[2, 3]
+                frames.depths[Path(image.name).stem] = float(np.median(z_depths))
+        models.append(frames)
+    return models
 
 
 def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
@@ -105,18 +101,18 @@ def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
     for (first, before), (second, after) in pairwise(zip(segments, posed, strict=True)):
         names, gap = (first.name, second.name), second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"
-        found += joins(names, before, after) if gap < 0 else [apart(names, why)]
+        found += joins(names, before, after) if gap < 0 else [_apart(names, why)]
     return found
 
 
 def joins(segments: tuple[str, str], first: list[PosedFrames], second: list[PosedFrames]) -> list[SegmentJoin]:
     """Joins of models of one segment with those of the next: of all that share frames, or why there is none."""
-    tried = sorted((_join_models(segments, *pair) for pair in product(first, second)), key=lambda one: -one.frames)
-    sharing = [one for one in tried if one.frames >= _FEWEST]
-    return sharing or tried[:1] or [apart(segments, "no frame has a pose on one side")]
+    tried = sorted((_join_models(segments, *pair) for pair in product(first, second)), key=lambda join: -join.frames)
+    sharing = [join for join in tried if join.frames >= _FEWEST]
+    return sharing or tried[:1] or [_apart(segments, "no frame has a pose on one side")]
 
 
-def apart(segments: tuple[str, str], reason: str, models: tuple[str, str] = ("", ""), frames: int = 0) -> SegmentJoin:
+def _apart(segments: tuple[str, str], reason: str, models: tuple[str, str] = ("", ""), frames: int = 0) -> SegmentJoin:
     """A place at which nothing could be compared."""
     return SegmentJoin(segments=segments, models=models, frames=frames, joined=False, reason=reason)
 
@@ -127,22 +123,21 @@ def _join_models(segments: tuple[str, str], first: PosedFrames, second: PosedFra
     The scale is that of the depths that the shared frames see, which are far less uncertain than the short way of the
     cameras between them.
     """
-    names = sorted(first.rotations.keys() & second.rotations.keys())
+    names = sorted(first.c2w.keys() & second.c2w.keys())
     models = (first.model, second.model)
     if len(names) < _FEWEST:
         reason = f"{len(names)} frames have a pose on both sides, fewer than {_FEWEST}"
-        return apart(segments, reason, models, len(names))
+        return _apart(segments, reason, models, len(names))
     ratios = np.array([first.depths[name] / second.depths[name] for name in names])
     scale = float(np.median(ratios))
     spread = float(np.median(np.abs(ratios / scale - 1.0)))
-    turns = Rotation.from_matrix([first.rotations[name] @ second.rotations[name].T for name in names])
+    targets, sources = (np.array([frames.c2w[name] for name in names]) for frames in (first, second))
+    turns = Rotation.from_matrix(targets[:, :3, :3] @ sources[:, :3, :3].transpose(0, 2, 1))
     turn = turns.mean()
     rotation = float(np.degrees(np.sqrt(np.mean((turns * turn.inv()).magnitude() ** 2))))
-    mine, other = (np.array([frames.centers[name] for name in names]) for frames in (first, second))
-    moved = scale * turn.apply(other)
-    shift = (mine - moved).mean(0)
-    depth = float(np.median([first.depths[name] for name in names]))
-    position = float(np.sqrt(np.mean(np.square(mine - moved - shift).sum(1)))) / depth
+    offsets = targets[:, :3, 3] - scale * turn.apply(sources[:, :3, 3])
+    shift, depth = offsets.mean(0), float(np.median([first.depths[name] for name in names]))
+    position = float(np.sqrt(np.square(offsets - shift).sum(1).mean())) / depth
     reason = ""
     if rotation > _ROTATION or position > _POSITION or spread > _SCALE:
         reason = (

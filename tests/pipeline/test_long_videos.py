@@ -102,12 +102,13 @@ def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
     """Cameras on a bent path that look at points 30 away; in a world of its own."""
     generator = np.random.default_rng(7)
     scale, turn, shift = (1.0, Rotation.identity(), np.zeros(3)) if transform is None else transform
-    frames = PosedFrames(model, {}, {}, {})
+    frames = PosedFrames(model, {}, {})
     for index in range(first, first + count):
         name, center = f"frame_{index:06d}", np.array([0.1 * index, 0.02 * index**2 / 10, 0.3 * index])
         rotation = Rotation.from_rotvec([0.02 * index, 0.1, 0.0])
-        frames.rotations[name] = (turn * rotation).as_matrix()
-        frames.centers[name] = scale * turn.apply(center + noise * generator.normal(size=3)) + shift
+        frames.c2w[name] = np.eye(4)
+        frames.c2w[name][:3, :3] = (turn * rotation).as_matrix()
+        frames.c2w[name][:3, 3] = scale * turn.apply(center + noise * generator.normal(size=3)) + shift
         frames.depths[name] = scale * 30.0
     return frames
 
@@ -118,8 +119,8 @@ def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
     (found,) = joins(BOTH, [posed(4, model="sparse/1", first=90), first], [second])
     assert (found.reason, found.frames, found.models) == ("", 8, ("sparse/0", "sparse/0"))
     for name in ("frame_000012", "frame_000019"):
-        place = np.array(found.transform) @ [*second.centers[name], 1.0]
-        np.testing.assert_allclose(place[:3], first.centers[name], atol=1e-9)
+        place = np.array(found.transform) @ second.c2w[name][:, 3]
+        np.testing.assert_allclose(place, first.c2w[name][:, 3], atol=1e-9)
     assert (
         found.joined
         and found.rotation_deg == pytest.approx(0.0, abs=1e-5)
