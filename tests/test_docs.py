@@ -25,8 +25,8 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings, held_out
+from coliags_plugin.engine.data_formats import formats
 from coliags_plugin.engine.samplers import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings

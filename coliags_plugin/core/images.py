@@ -90,19 +90,19 @@ def has_alpha(path: Path) -> bool:
     return False
 
 
-def tell_of_alpha(where: Path, images: Sequence[Path]) -> None:
-    """Log how many images have an alpha channel, if any, and what becomes of it."""
-    if count := sum(map(has_alpha, images)):
-        said = "%s: %d of %d images have an alpha channel: pixels of alpha below 128 are masked, if it shows any at all"
-        log.info(said, where, count, len(images))
+def tell_of_alpha(where: Path, images: Sequence[bool]) -> None:
+    """Log how many images have an alpha channel, by :func:`has_alpha` of each, and what becomes of it."""
+    if any(images):
+        text = "%s: %d of %d images have an alpha channel: pixels of alpha below 128 are masked, if it shows any at all"
+        log.info(text, where, sum(images), len(images))
 
 
 def read_alpha(path: Path) -> Bool[np.ndarray, "H W"] | None:
-    """The mask in an image's alpha channel: False below 128 of 255.
+    """The mask in the alpha channel of an image, see :func:`has_alpha`: False below 128 of 255.
 
     None where no pixel is, or all are, as of a fourth byte that is not used.
     """
-    image = decode_image(path) if has_alpha(path) else np.zeros(0)
+    image = decode_image(path)
     if image.ndim != 3 or image.shape[2] != 4 or image.dtype not in (np.uint8, np.uint16):
         return None
     shown = np.asarray(image[..., 3] > np.iinfo(image.dtype).max // 2)

@@ -21,19 +21,12 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH, DepthSteps, size_of
+from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH, ScaledDepth
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import (
-    ROTATION,
-    Recording,
-    Shot,
-    find_seen_masks,
-    fingerprint,
-    make_shots,
-    poses_of_images,
-)
-from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
+from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint, poses_of_images
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
+from coliags_plugin.datamanagers.shots import ASPECT_TOLERANCE, Rectification, Shot, make_shots
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses
@@ -215,7 +208,7 @@ OPTIMIZED = "_endogslam_optimized"
 #: pixel centres at integers: hence + 0.5.
 PREPARED_PINHOLE = Intrinsics(401.1595, 400.9425, 334.1430 + 0.5, 273.8665 + 0.5, 675, 540)
 #: EndoGSLAM's 8-bit depth: 2.55 steps per mm, rounded down; 255 is the end of C3VD's range.
-PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
+PREPARED_DEPTH = ScaledDepth(100.0 / 255.0, 8, 255)
 #: How far a principal point may be from the middle, as a share of the image; prepared images have 0.7 %.
 MIDDLE_TOLERANCE = 0.1
 #: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
@@ -328,7 +321,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         return make_shots(files.images, rectification, camera_to_world, files.depths, form, f"{ROTATION}-")
 
 
-def _depth_format(files: PreparedFiles) -> DepthSteps | None:
+def _depth_format(files: PreparedFiles) -> ScaledDepth | None:
     """EndoGSLAM's 8-bit or C3VD's 16-bit format, by the first file; all files must have the same."""
     if files.depths is None:
         return None

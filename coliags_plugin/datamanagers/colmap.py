@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.atlas import model_unit, read_atlas
+from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import DepthFormat, InverseDepth, depth_format
+from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, scaled_depth
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.rectification import Rectification, rectifications
-from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit
+from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit, read_unit
+from coliags_plugin.datamanagers.shots import Rectification, Shot, rectifications
 from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 
@@ -156,6 +156,66 @@ def _lens(camera: colmap_poses.ColmapCamera, file: Path) -> ColmapLens:
             "finite parameters, size and focal length above 0",
         )
     return lens
+
+
+# The record of a video's sub-maps beside its models (docs/poses.md 9.4)
+
+#: Name of the file, in the scene's folder.
+ATLAS_FILE = "atlas.json"
+_ATLAS_EXPECTED = "what `coliags poses sfm` wrote"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class AtlasStretch(_Part):
+    """Frames, by number, of one model between two places at which few points are seen from both sides."""
+
+    model: str  # folder of the model, relative to the scene
+    unit: Unit  # of the model
+    frames: list[int]
+
+
+class AtlasJoin(_Part):
+    """A place between two stretches."""
+
+    after: int  # last frame before it
+    joined: bool  # whether both sides are of one model
+    reason: str
+
+
+class LostFrame(_Part):
+    """A frame without a pose."""
+
+    frame: int
+    reason: str
+
+
+class AtlasRecord(_Part):
+    """Which frames of a video have a pose, in which models, and why the others have none."""
+
+    frames: list[str]  # names of the images in order: frames are numbered from 0
+    submaps: list[AtlasStretch]
+    joins: list[AtlasJoin]
+    lost: list[LostFrame]
+
+
+def read_atlas(scene: Path) -> AtlasRecord | None:
+    """Read a scene's ``atlas.json``; None if it has none."""
+    file = scene / ATLAS_FILE
+    if not file.is_file():
+        return None
+    return read_validated(AtlasRecord, file, _ATLAS_EXPECTED)
+
+
+def model_unit(scene: Path, model: Path, atlas: AtlasRecord | None) -> Unit:
+    """Unit of length of one of a scene's models: from its atlas if that lists the model, else from ``unit.txt``.
+
+    COLMAP's own models are of an arbitrary scale: unknown where neither states it.
+    """
+    units = {} if atlas is None else {scene / stretch.model: stretch.unit for stretch in atlas.submaps}
+    return units.get(model) or read_unit(scene)
 
 
 _DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif")
@@ -338,7 +398,7 @@ class ColmapDataManager(RecordedDataManager):
         if depth_unit is None and any(depths):
             log.info("%s/depths is read at 1 mm a step; `datamanager.depth_unit=MM` changes that", path)
         size = (depth_unit or 1.0) / FACTORS[unit]
-        return [None if depth is None else depth_format(depth, size) for depth in depths]
+        return [None if depth is None else scaled_depth(depth, size) for depth in depths]
 
     def _sparse_depth(
         self,

@@ -24,11 +24,12 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import depth_format, size_of
+from coliags_plugin.datamanagers.reading.depth import scaled_depth
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.rectification import rectifications
+from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import FACTORS, POINTS_FILE, SceneSettings, Unit, printed_unit
+from coliags_plugin.datamanagers.shots import Shot, rectifications
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
@@ -316,7 +317,7 @@ class NerfstudioDataManager(RecordedDataManager):
                 rectification_of[lenses[index]],
                 camera_to_world[index],
                 depth,
-                None if depth is None else depth_format(depth, depth_unit),
+                None if depth is None else scaled_depth(depth, depth_unit),
                 masks[index],
                 confidence=confidences[index],
             )

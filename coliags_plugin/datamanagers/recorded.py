@@ -6,7 +6,6 @@ import logging
 import shlex
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,8 +24,7 @@ from coliags_plugin.core.provenance import PointsRecord, Provenance, SplitRecord
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, first_few, parallel_map
-from coliags_plugin.datamanagers.recording import Recording, Shot, StoredPixels, portable_name
-from coliags_plugin.datamanagers.rectification import PAPER_SIZE, Rectification, fitted, rectifications
+from coliags_plugin.datamanagers.recording import Recording, portable_name
 from coliags_plugin.datamanagers.scene_settings import (
     FACTORS,
     POINTS_FILE,
@@ -36,6 +34,7 @@ from coliags_plugin.datamanagers.scene_settings import (
     divide,
     read_unit,
 )
+from coliags_plugin.datamanagers.shots import PAPER_SIZE, Rectification, Shot, StoredPixels, fitted, rectifications
 from coliags_plugin.geometry.lenses.models import Lens
 
 log = logging.getLogger(__name__)
@@ -175,7 +174,7 @@ class RecordedDataManager(DataManager):
             left = len(files.difference(masks, (shot.image for shot in shots)))
             others = f"; {left} other files beside the masks" if left else ""
             log.log(level, "%s: %d of %d frames have a mask%s", path, len(masks), len(shots), others)
-        tell_of_alpha(path, [shot.image for shot in shots])
+        tell_of_alpha(path, [shot.has_alpha for shot in shots])
         used = {path / self.masks_at, *(shot.image for shot in shots), *masks, *(p for m in masks for p in m.parents)}
         folders = {path, *(shot.image.parent for shot in shots)}
         named = {file for folder in folders for file in folder.glob("*[mM][aA][sS][kK]*")} - used
@@ -203,9 +202,9 @@ class RecordedDataManager(DataManager):
     def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen: Mapping[int, Path]) -> list[Frame]:
         frames = []
         for index in indices:
-            shot = replace(shots[index], seen=seen.get(index))
+            shot = shots[index]
             camera = shot.rectification.camera(shot.camera_to_world)
-            source = StoredPixels(shot, self.settings.keep_pixels)
+            source = StoredPixels(shot, self.settings.keep_pixels, seen.get(index))
             frames.append(Frame(shot.name, index, source, camera, shot.sparse_depth))
         return frames
 

@@ -16,10 +16,12 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import DepthFormat, read_gray, read_mask
+from coliags_plugin.datamanagers.reading.depth import DepthFormat
+from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import SceneSettings, Split
+from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order

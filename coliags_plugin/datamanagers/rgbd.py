@@ -19,10 +19,12 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.images import depth_format, size_of
+from coliags_plugin.datamanagers.reading.depth import scaled_depth
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
+from coliags_plugin.datamanagers.shots import Shot
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
 from coliags_plugin.geometry.meshes.files import read_mesh
@@ -142,7 +144,7 @@ class RGBDDataManager(RecordedDataManager):
                 rectification,
                 trajectory.camera_to_world[pose],
                 depth,
-                None if depth is None or scale is None else depth_format(depth, 1.0 / scale),
+                None if depth is None or scale is None else scaled_depth(depth, 1.0 / scale),
                 mask=mask,
                 confidence=confidence,
             )

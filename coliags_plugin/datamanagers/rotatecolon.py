@@ -2,100 +2,30 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Sequence
-from contextlib import redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float32, Shaped
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.libraries import decoder_messages
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.core.text_files import unreadable
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio import camera_of
-from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder, required_file
-from coliags_plugin.datamanagers.reading.images import DepthFormat, size_of
+from coliags_plugin.datamanagers.reading.depth import ExrDepth
+from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder
+from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import ROTATION, Recording, Shot, find_seen_masks, fingerprint, make_shots
+from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
+from coliags_plugin.datamanagers.shots import Shot, make_shots
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)
-
-#: Stored depth from this value on is background; Blender writes 1e10.
-BACKGROUND = 1e6
-
-
-@dataclass(frozen=True)
-class ExrDepth(DepthFormat):
-    """One channel proportional to z-depth; unknown where not finite, not positive or at least ``BACKGROUND``.
-
-    ``divisor`` turns stored values into scene units.
-    """
-
-    channel: str
-    divisor: float = 1.0
-
-    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`; float32, 0 where unknown."""
-        stored = read_exr_channel(path, self.channel)
-        known = np.isfinite(stored) & (stored > 0.0) & (stored < BACKGROUND)
-        return np.where(known, stored, np.float32(0.0))
-
-    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`."""
-        return np.where(stored > 0.0, stored / np.float32(self.divisor), np.float32(np.nan)).astype(np.float32)
-
-
-#: Files are read one at a time, as what OpenEXR prints is diverted for all threads.
-_ALONE = Lock()
-
-
-_CHANNEL = "Choose the one that holds depth with `datamanager.depth_channel=NAME`"
-
-
-def read_exr_channel(path: Path, channel: str, do: str = _CHANNEL) -> Float32[np.ndarray, "H W"]:
-    """Read a channel of an EXR file by its full name, from any part; what to ``do`` without it is for the error."""
-    import OpenEXR
-
-    required_file(path, "an OpenEXR file")
-    try:
-        with (
-            _ALONE,
-            redirect_stdout(io.StringIO()),  # OpenEXR prints warnings
-            decoder_messages(),
-            OpenEXR.File(str(path), separate_channels=True) as file,
-        ):
-            # OpenEXR returns no parts for a damaged file.
-            channels = {name: stored.pixels for part in file.parts for name, stored in part.channels.items()}
-            if not channels:
-                raise ValueError("no channels")
-    except (OSError, RuntimeError, ValueError) as error:
-        raise unreadable(
-            path,
-            f"{path} ({path.stat().st_size} bytes) cannot be decoded",
-            "a complete OpenEXR file",
-            "It is damaged or cut short: fetch it again",
-        ) from error
-    if channel not in channels:
-        raise InputError(
-            f"{path} has the channels {', '.join(sorted(channels))}",
-            f"a channel {channel}",
-            do,
-        )
-    return np.asarray(channels[channel]).astype(np.float32)
-
 
 _LAYOUT = "RotateColon's transforms.json, train_views/NNNN.png and perhaps depth_train/NNNN.exr"
 TRAIN, TRAIN_VIEWS, TRAIN_DEPTH = "transforms.json", "train_views", "depth_train"

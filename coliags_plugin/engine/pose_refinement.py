@@ -14,7 +14,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import OPAQUE_ALPHA
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.tensors import masked_mean
-from coliags_plugin.datamanagers.rectification import fitted
+from coliags_plugin.datamanagers.shots import fitted
 from coliags_plugin.engine.model import Model
 
 #: Adam steps on each view; the first and last of their lengths, in pixels of the image that is rendered in them.

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
-from coliags_plugin.datamanagers.atlas import AtlasJoin, AtlasRecord, read_atlas
+from coliags_plugin.datamanagers.colmap import AtlasJoin, AtlasRecord, read_atlas
 from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord

@@ -15,7 +15,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_overlap
 from coliags_plugin.core.jobs import Progress, locked
-from coliags_plugin.datamanagers.recognition import find_format, recognised
+from coliags_plugin.engine.data_formats import find_format, recognised
 from coliags_plugin.engine.task_queue import make_executor
 from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.pipeline.contents import figures_as

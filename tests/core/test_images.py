@@ -107,12 +107,12 @@ READ = """if True:
     from coliags_plugin.core.libraries import separate_stderr
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.core.images import decode_image
-    from coliags_plugin.datamanagers.rotatecolon import read_exr_channel
+    from coliags_plugin.datamanagers.reading.depth import read_exr_channel
     separate_stderr()
     logging.basicConfig(format="log: %(message)s")
     for path in map(Path, sys.argv[1:]):
         try:
-            read_exr_channel(path, "Y") if path.suffix == ".exr" else decode_image(path)
+            read_exr_channel(path, "Y", "") if path.suffix == ".exr" else decode_image(path)
         except InputError as error:
             print("refused:", error, file=sys.stderr)
 """

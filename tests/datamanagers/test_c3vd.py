@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings, read_camera_intrinsics
-from coliags_plugin.datamanagers.reading.images import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.phantom.layouts.built_in import depth_steps
 from tests.datamanagers.kinds import remove, repaint

@@ -11,7 +11,7 @@ import torch
 
 from coliags_plugin.core.scenes import Frame, concatenate_targets
 from coliags_plugin.datamanagers.reading.images import resize_nearest
-from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.engine.data_formats import find_format
 from tests.datamanagers.kinds import change_frames, change_json, files
 from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, manager
 from tests.scenes import camera_at

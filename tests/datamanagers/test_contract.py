@@ -16,7 +16,7 @@ import torch
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.recognition import find_format, formats, recognised
+from coliags_plugin.engine.data_formats import find_format, formats, recognised
 from tests.datamanagers.kinds import (
     GROUPS,
     KINDS,

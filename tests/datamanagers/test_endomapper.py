@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from coliags_plugin.datamanagers.recognition import find_format, recognised
+from coliags_plugin.engine.data_formats import find_format, recognised
 from coliags_plugin.geometry.lenses.vicalib import read_calibration
 from tests.datamanagers.kinds import edit
 from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, layout_of, load_scene

@@ -17,8 +17,8 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recording import Recording
+from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, OpenCVLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z

@@ -13,12 +13,13 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_8_bit, read_alpha, read_rgb
+from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha, read_rgb
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
+from coliags_plugin.datamanagers.reading.depth import scaled_depth
 from coliags_plugin.datamanagers.reading.files import named_file, numbered, short_names
-from coliags_plugin.datamanagers.reading.images import depth_format, read_mask, resize_nearest, resize_rgb
-from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
+from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 
 # Images
 
@@ -75,7 +76,7 @@ def test_alpha_below_half_is_a_mask(tmp_path, name, pixels, options, binary):
             image = PIL.Image.fromarray(pixels).convert("P")
             image.putpalette([200, 100, 10, 255, 0, 255])
         image.save(path, **options)
-    mask = read_alpha(path)
+    mask = read_alpha(path) if has_alpha(path) else None
     assert mask is None if binary else (mask == (ALPHA >= 128)).all()
     color = (100, 100, 100) if "la" in name or "grey" in name else (200, 100, 10)
     read = read_8_bit(path)
@@ -196,7 +197,7 @@ def test_depth_files_hold_numbers_proportional_to_depth(tmp_path, suffix):
         np.save(path, steps) if suffix == ".npy" else cv2.imwrite(str(path), steps)
     else:
         cv2.imwrite(str(path), steps.astype(np.uint16))
-    form = depth_format(path, 0.02)
+    form = scaled_depth(path, 0.02)
     np.testing.assert_allclose(form.z_depth(form.read(path)), np.where(unknown, np.nan, 0.02 * steps), rtol=1e-6)
 
 
@@ -211,13 +212,13 @@ def test_depth_files_hold_numbers_proportional_to_depth(tmp_path, suffix):
 def test_depth_arrays_of_another_kind(tmp_path, array, message):
     np.save(tmp_path / "0.npy", array)
     with pytest.raises(InputError, match=message):
-        depth_format(tmp_path / "0.npy", 1.0).read(tmp_path / "0.npy")
+        scaled_depth(tmp_path / "0.npy", 1.0).read(tmp_path / "0.npy")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".EXR"])
 def test_depth_files_that_are_not_read_are_refused_by_kind(suffix):
     with pytest.raises(InputError, match=rf"0\{suffix}: depth in \{suffix}\. Expected .*\.npy\. Convert"):
-        depth_format(Path(f"0{suffix}"), 1.0)
+        scaled_depth(Path(f"0{suffix}"), 1.0)
 
 
 def test_numbered_files_of_no_known_kind_are_said(tmp_path, caplog):

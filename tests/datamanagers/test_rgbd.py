@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.rotatecolon import ExrDepth, read_exr_channel
+from coliags_plugin.datamanagers.reading.depth import ExrDepth, read_exr_channel
 from tests.datamanagers.kinds import change_exr, change_json, files, remove, renumber
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, names, poses
 from tests.layouts.rotatecolon import write_exr
@@ -116,7 +116,7 @@ def test_the_named_channel_is_taken_from_many_in_any_part(tmp_path, kind, parts)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         split = ({"Y": color}, "one"), (channels, "two")
         OpenEXR.File([OpenEXR.Part(dict(header), *part) for part in split]).write(str(tmp_path / "z.exr"))
-    np.testing.assert_array_equal(read_exr_channel(tmp_path / "z.exr", Z), stored.astype(np.float32))
+    np.testing.assert_array_equal(read_exr_channel(tmp_path / "z.exr", Z, ""), stored.astype(np.float32))
 
 
 def test_another_channel_may_be_chosen(mine):

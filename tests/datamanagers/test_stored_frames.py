@@ -16,9 +16,9 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, PixelTensors
 from coliags_plugin.datamanagers import recording
+from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.files import parallel_map
-from coliags_plugin.datamanagers.reading.images import DepthSteps
-from coliags_plugin.datamanagers.recording import StoredPixels
+from coliags_plugin.datamanagers.shots import StoredPixels
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses
 
 
@@ -40,7 +40,7 @@ def reads(monkeypatch):
         return call
 
     monkeypatch.setattr(recording, "read_rgb", counted(recording.read_rgb))
-    monkeypatch.setattr(DepthSteps, "read", counted(DepthSteps.read))
+    monkeypatch.setattr(ScaledDepth, "read", counted(ScaledDepth.read))
     return read
 
 

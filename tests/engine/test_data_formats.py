@@ -8,8 +8,7 @@ import tests.layouts  # noqa: F401  (registers them)
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.recognition import find_format
-from coliags_plugin.engine.data_formats import data_manager, load_method_for, open_scene
+from coliags_plugin.engine.data_formats import data_manager, find_format, load_method_for, open_scene
 
 #: Layouts of the phantom whose name is not their format's.
 FORMAT_OF = {"c3vd-raw": "c3vd", "endogslam": "c3vd-endogslam", "pr-endo": "c3vd-endogslam"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import tests.layouts  # noqa: F401  (registers them)
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 

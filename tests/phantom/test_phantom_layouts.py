@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.config.registry import datamanagers, phantom_layouts
-from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.phantom.generate import resolve
 from coliags_plugin.phantom.layouts.base import Layout
 from coliags_plugin.phantom.settings import PhantomSettings

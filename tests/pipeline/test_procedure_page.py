@@ -12,7 +12,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.datamanagers.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.datamanagers.colmap import ATLAS_FILE, read_atlas
 from coliags_plugin.pipeline import page
 from coliags_plugin.pipeline.contents import common_frames, read_contents
 from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table, write_page

@@ -17,7 +17,7 @@ from coliags_plugin.core.arrays import eroded
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.datamanagers.recognition import find_format
+from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.frame_sources import opened_recording

@@ -14,7 +14,7 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.atlas import ATLAS_FILE, read_atlas
+from coliags_plugin.datamanagers.colmap import ATLAS_FILE, read_atlas
 from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points

@@ -1,16 +1,13 @@
-"""Reading and resizing images and depth files; truncated files are errors."""
+"""Reading and resizing images and masks; truncated files are errors."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
-from coliags_plugin.core.arrays import read_array
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image, kind_of
 
@@ -70,8 +67,8 @@ def read_mask(path: Path, colored: bool = False) -> Bool[np.ndarray, "H W"]:
 
 def all_of(*masks: Bool[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | None:
     """Pixels that all of several masks of one size have; None without any mask."""
-    given = [mask for mask in masks if mask is not None]
-    return reduce(np.logical_and, given) if given else None
+    present = [mask for mask in masks if mask is not None]
+    return reduce(np.logical_and, present) if present else None
 
 
 def resize_rgb(image: UInt8[np.ndarray, "H W *C"], width: int, height: int) -> UInt8[np.ndarray, "h w *C"]:
@@ -93,93 +90,3 @@ def resize_nearest(values: Shaped[np.ndarray, "H W"], width: int, height: int) -
     row = ((np.arange(height) + 0.5) * rows / height).astype(np.int64)
     column = ((np.arange(width) + 0.5) * columns / width).astype(np.int64)
     return np.ascontiguousarray(values[row[:, None], column[None, :]])
-
-
-class DepthFormat(ABC):
-    """Interface of depth file formats. The stored value 0 means unknown in all of them; undistortion fills it in."""
-
-    @abstractmethod
-    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """Read the stored values of a file."""
-
-    @abstractmethod
-    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """Convert stored values to z-depth, scene units; NaN where unknown."""
-
-    def clipped_at(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
-        """Lower bound of z-depth at pixels clipped to the format's range, NaN elsewhere; None if none is clipped."""
-        return None
-
-
-@dataclass(frozen=True)
-class DepthSteps(DepthFormat):
-    """Numbers proportional to z-depth, unknown where they are not positive: an image of whole steps."""
-
-    size: float  # scene units per step
-    bits: int = 16  # 8 or 16
-    far: int | None = None  # stored value of depths clipped to the range; None where there is none
-
-    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`; an image of one channel."""
-        return read_gray(path, self.bits, f"a one-channel {self.bits}-bit depth image")
-
-    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`."""
-        with np.errstate(over="ignore"):
-            depth = (stored * self.size).astype(np.float32)
-        depth[~(np.isfinite(stored) & (stored > 0))] = np.nan
-        if self.far is not None:
-            depth[stored == self.far] = np.nan
-        return depth
-
-    def clipped_at(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
-        """See :class:`DepthFormat`."""
-        if self.far is None or not (clipped := stored == self.far).any():
-            return None
-        return np.where(clipped, np.float32(self.far * self.size), np.float32(np.nan))
-
-
-#: C3VD's format: 16 bits for 100 mm, clipped beyond.
-C3VD_DEPTH = DepthSteps(100.0 / 65535.0, 16, 65535)
-
-
-@dataclass(frozen=True)
-class InverseDepth(DepthSteps):
-    """16-bit inverse depth of 3DGS: z-depth is size / (scale * value / 65536 + offset), unknown where not positive."""
-
-    scale: float = 1.0
-    offset: float = 0.0
-
-    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """Read z-depth in units of the model, float32, 0 where it is unknown. [H, W]"""
-        stored = super().read(path)
-        with np.errstate(over="ignore"):
-            inverse = self.scale * (stored / 65536.0) + self.offset
-            # The sky, thousands of times as far as the rest, is at no distance.
-            known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
-            return np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0).astype(np.float32)
-
-
-class DepthArray(DepthSteps):
-    """An ``.npy`` array [H, W] or [H, W, 1], or an image of real numbers; 0, negative and not finite mean unknown."""
-
-    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`."""
-        if path.suffix.lower() != ".npy":
-            kind = f"a one-channel {self.bits}-bit depth image, or one of real numbers"
-            return read_gray(path, self.bits, kind, floats=True)
-        expected = "an .npy array [H, W] of real numbers"
-        array = read_array(path, expected)
-        if array.ndim == 3 and array.shape[2] == 1:
-            array = array[..., 0]
-        real = np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
-        if array.ndim != 2 or not array.size or not real:
-            raise InputError(f"{path} is an array {list(array.shape)} of {array.dtype}", expected)
-        return np.asarray(array)
-
-
-def depth_format(path: Path, size: float) -> DepthFormat:
-    """Format of a depth file, PNG, TIFF or .npy, whose stored unit is ``size`` scene units."""
-    if path.suffix.lower() in (".npz", ".exr"):
-        raise InputError(f"{path}: depth in {path.suffix}", "16-bit PNG or TIFF, TIFF of floats, or .npy", "Convert it")
-    return DepthArray(size)

@@ -11,9 +11,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.reading.depth import read_exr_channel, scaled_depth
 from coliags_plugin.datamanagers.reading.files import files_in, first_few
-from coliags_plugin.datamanagers.reading.images import depth_format
-from coliags_plugin.datamanagers.rotatecolon import read_exr_channel
 from coliags_plugin.reconstruction.depth.views import Map, Mask
 from coliags_plugin.reconstruction.structure.matching import Pose
 
@@ -152,7 +151,7 @@ class FilePrior:
         if path.suffix.lower() == ".exr":
             stored = read_exr_channel(path, "V", "Rename it, or convert the maps to .npy")
         else:
-            form = depth_format(path, 1.0)
+            form = scaled_depth(path, 1.0)
             stored = form.z_depth(form.read(path))
         height, width = stored.shape
         camera = frame.camera

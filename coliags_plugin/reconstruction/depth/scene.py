@@ -17,8 +17,8 @@ from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
-from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import split_options, write_unit
+from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import read_8_bit, read_alpha
+from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha
 from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, MASK_SUFFIXES, files_in, inventory, sidecar_files
 from coliags_plugin.datamanagers.reading.images import all_of, read_mask
 from coliags_plugin.geometry.poses.trajectory import natural_order
@@ -90,7 +90,9 @@ def masks_for(path: Path, images: Sequence[Path]) -> Masks:
 
 def mask_of(image: Path, masks: Masks) -> Bool[np.ndarray, "H W"] | None:
     """The mask of an image, with that of its alpha channel."""
-    mask, shown = masks.get(image) if isinstance(masks, Mapping) else masks, read_alpha(image)
+    mask, shown = masks.get(image) if isinstance(masks, Mapping) else masks, None
+    if has_alpha(image):
+        shown = read_alpha(image)
     if mask is not None and shown is not None and mask.shape != shown.shape:
         return mask  # which is refused with the image
     return all_of(mask, shown)

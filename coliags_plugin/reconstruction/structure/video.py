@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import tell_of_alpha
+from coliags_plugin.core.images import has_alpha, tell_of_alpha
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
@@ -203,7 +203,7 @@ def _looked_at(
     """Images without those that repeat the one before, their widths and heights, and the lens's picture in them."""
     kept, sizes, repeated = list[Path](), list[tuple[int, int]](), list[str]()
     last, shown = None, None
-    tell_of_alpha(images[0].parent, images)
+    tell_of_alpha(images[0].parent, [has_alpha(path) for path in images])
     for path in images:
         image, mask = read_image(path), mask_of(path, masks)
         height, width = image.shape[:2]

@@ -22,7 +22,7 @@ from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.reading.images import all_of, read_mask
-from coliags_plugin.datamanagers.recording import StoredPixels
+from coliags_plugin.datamanagers.shots import StoredPixels
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
