@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-import math
 import posixpath
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,19 +18,19 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.core.json_files import read_number
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import scaled_depth
 from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.transforms import PixelCenters, Transforms
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import FACTORS, POINTS_FILE, SceneSettings, Unit, printed_unit
 from coliags_plugin.datamanagers.shots import Shot, rectifications
-from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
-from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 log = logging.getLogger(__name__)
@@ -43,35 +42,15 @@ ESTIMATED_FROM = "depth_estimated_from"
 _DEPTH_STEP = 1e-3
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
-PixelCenters = Literal["half", "integer"]
 
-#: nerfstudio's camera models and their distortion parameters; others must be 0 or absent.
-_MODELS: Mapping[str, tuple[str, ...]] = {
-    "OPENCV": ("k1", "k2", "k3", "p1", "p2"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-    "PINHOLE": (),
-    "SIMPLE_PINHOLE": (),
-}
-_BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-
-
-class Transforms:
-    """Contents of a ``transforms.json`` whose poses have been read before, so that its structure is valid.
-
-    ``names`` are those of its frames, in order; ``outside`` tells whether it may name files outside of its folder.
-    """
-
-    def __init__(self, path: Path, names: Sequence[str], outside: bool = False) -> None:
-        self.path, self.names, self._outside = path, names, outside
-        self.content: dict[str, Any] = read_json(path, "a transforms.json")
-        frames = {frame["file_path"]: frame for frame in self.content["frames"]}
-        self.frames: list[dict[str, Any]] = [frames[name] for name in names]
+class NerfstudioTransforms(Transforms):
+    """Content of a ``transforms.json`` by nerfstudio's keys, and instant-ngp's of depth."""
 
     def images(self) -> list[Path]:
         """The images of all frames."""
         found = {}
         for name in self.names:
-            candidates = (self._named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES))
+            candidates = (self.named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES))
             found[name] = next((path for path in candidates if path.is_file()), None)
         missing = [name for name, path in found.items() if path is None]
         if missing:
@@ -82,20 +61,6 @@ class Transforms:
                 "Restore them, or remove their frames",
             )
         return [path for path in found.values() if path is not None]
-
-    def lenses(self, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]) -> list[Lens]:
-        """The cameras of all frames; arguments as for :func:`camera_of`."""
-        where = f"{self.path}, frame"
-        pairs = zip(self.names, self.frames, strict=True)
-        return [camera_of({**self.content, **frame}, f"{where} {n}", pixel_centers, stored_size) for n, frame in pairs]
-
-    def files(self, key: str, for_every: bool) -> list[Path | None]:
-        """The files that frames name under a key; if one does, all must where they are ``for_every`` frame."""
-        found = {}
-        for name, frame in zip(self.names, self.frames, strict=True):
-            path = None if frame.get(key) is None else self._named(str(frame[key]))
-            found[name] = path and reading.required_file(path, f"the file of {key} of frame {name} in {self.path}")
-        return reading.for_all(found, self.path, f"a {key}") if for_every else list(found.values())
 
     def masks(self) -> list[Path | None]:
         """The masks of any of the frames; warns of other keys that may mean masks."""
@@ -109,7 +74,7 @@ class Transforms:
         name = self.content.get("ply_file_path")
         if name is None:
             return None
-        return reading.required_file(self._named(str(name)), f"the point cloud of ply_file_path in {self.path}")
+        return reading.required_file(self.named(str(name)), f"the point cloud of ply_file_path in {self.path}")
 
     def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
         """Transform points of the file into the world of its poses, :mod:`coliags_plugin.geometry.poses.nerfstudio`."""
@@ -170,64 +135,10 @@ class Transforms:
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
         return sorted({index_of[_normal(name)] for name in listed})
 
-    def _named(self, name: str) -> Path:
-        return reading.named_file(self.path.parent, name, str(self.path), self._outside)
-
 
 def _normal(name: str) -> str:
     """A path without repeated or relative parts, with slashes."""
     return posixpath.normpath(name.replace("\\", "/"))
-
-
-def camera_of(
-    values: Mapping[str, Any], where: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
-) -> Lens:
-    """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
-
-    ``values`` are the keys of the file, overlaid with those of the frame; ``where`` names the frame in messages.
-    ``stored_size`` returns width and height of the image; it is called only if the file has no size.
-    """
-    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
-    if not isinstance(model, str) or model not in _MODELS:
-        raise InputError(f"{where}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
-    width, height = image_size(values, where) if "w" in values or "h" in values else stored_size()
-    fx, fy = _focal_lengths(values, where, width, height)
-    # The default principal point is the image centre in either convention.
-    shift = 0.0 if pixel_centers == "half" else 0.5
-    cx = read_number(values, "cx", where) + shift if "cx" in values else 0.5 * width
-    cy = read_number(values, "cy", where) + shift if "cy" in values else 0.5 * height
-    if min(fx, fy, width, height) <= 0.0:
-        raise InputError(f"{where}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
-    bends = {key: read_number(values, key, where) for key in _BENDS if values.get(key)}
-    if wrong := sorted(set(bends) - set(_MODELS[model])):
-        meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
-        raise InputError(
-            f"{where}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
-            f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
-            "Undistort the images, or correct camera_model",
-        )
-    if model == "OPENCV_FISHEYE":
-        k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
-        return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
-    if not bends:
-        return PinholeLens(fx, fy, cx, cy, width, height)
-    k1, k2, k3, p1, p2 = (bends.get(key, 0.0) for key in _MODELS[model])
-    return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
-
-
-def _focal_lengths(values: Mapping[str, Any], where: str, width: int, height: int) -> tuple[float, float]:
-    """Horizontal and vertical focal length, pixels; equal if only one is given."""
-    lengths: dict[str, float] = {}
-    for axis, pixels in (("x", width), ("y", height)):
-        if f"fl_{axis}" in values:
-            lengths[axis] = read_number(values, f"fl_{axis}", where)
-        elif f"camera_angle_{axis}" in values:
-            expected = "radians, above 0 and below pi"
-            angle = read_number(values, f"camera_angle_{axis}", where, expected, above=0.0, below=math.pi)
-            lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
-    if not lengths:
-        raise InputError(f"{where}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
-    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
 
 
 #: Files that identify RotateColon instead, whose images are named by number and whose depth is scaled.
@@ -286,8 +197,8 @@ class NerfstudioDataManager(RecordedDataManager):
         """See :class:`RecordedDataManager`."""
         settings, file = self.settings, path / FILE
         reading.required_file(file, "a folder with a transforms.json", "Check the path")
-        trajectory = nerfstudio_poses.read(file)
-        transforms = Transforms(file, trajectory.names_or_numbers(), settings.outside_files)
+        transforms = NerfstudioTransforms(file, settings.outside_files)
+        trajectory = transforms.trajectory
         images, masks = transforms.images(), transforms.masks()
         depths, depth_step = transforms.depths(settings.depth_unit_scale_factor)
         confidences = transforms.files("confidence_file_path", for_every=True)
@@ -370,7 +281,9 @@ class NerfstudioDataManager(RecordedDataManager):
             )
         return (step or _DEPTH_STEP) * self.settings.scale
 
-    def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
+    def _own_points(
+        self, path: Path, transforms: NerfstudioTransforms
+    ) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""
         file = transforms.points_file()
         if file is None:

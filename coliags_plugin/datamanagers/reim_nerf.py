@@ -18,13 +18,13 @@ from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import DepthFormat
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
+from coliags_plugin.datamanagers.reading.transforms import Transforms
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import SceneSettings, Split
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
-from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
-from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order
+from coliags_plugin.geometry.poses.trajectory import natural_order
 
 MASK_FILE = "rgb_mask.png"
 #: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
@@ -122,26 +122,23 @@ class ReimNerfDataManager(RecordedDataManager):
                 "the test frames of split 'own'",
                 "Add it, or choose another split",
             )
-        contents: dict[str, Any] = {}
-        trajectories: dict[str, Trajectory | None] = {}
-        for part, file in files.items():
-            contents[part] = read_json(file, "a JSON object with frames")
-            # A short video may have no validation frames, but there must be training frames.
-            is_empty = part != "train" and isinstance(contents[part], dict) and contents[part].get("frames") == []
-            trajectories[part] = None if is_empty else read_transforms(file)
-        file, first = files["train"], contents["train"]
-        _refuse_different(files, contents)
+        # A short video may have no validation frames, but there must be training frames.
+        parts = {
+            part: Transforms(file, settings.outside_files)
+            for part, file in files.items()
+            if part == "train" or not _has_no_frames(file)
+        }
+        file, first = files["train"], parts["train"].content
+        _refuse_different(parts)
         lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
         distmap_scale = read_number(
             {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
         )
         frames: dict[str, _Frame] = {}
-        frames_of = {}
-        for part, trajectory in trajectories.items():
-            frames_of[part] = _frames(files[part], contents[part], trajectory, scale, shift, settings.outside_files)
-            for name, frame in frames_of[part].items():
-                known = frames.setdefault(name, frame)
-                if known[1] != frame[1] or not np.allclose(known[2], frame[2], atol=1e-4):
+        for part, transforms in parts.items():
+            for name, frame in _frames(transforms, scale, shift).items():
+                other = frames.setdefault(name, frame)
+                if other[1] != frame[1] or not np.allclose(other[2], frame[2], atol=1e-4):
                     raise InputError(
                         f"{files[part]}: pose or distance map of {name} differs from another file's",
                         "the same values for a frame in all files",
@@ -150,7 +147,10 @@ class ReimNerfDataManager(RecordedDataManager):
         unordered = [*frames]
         names = [unordered[index] for index in natural_order(unordered)]
         distances = reading.for_all({name: frames[name][1] for name in names}, path, "a distmap_path")
-        parts = {part: [index for index, name in enumerate(names) if name in own] for part, own in frames_of.items()}
+        indices = {
+            part: [index for index, name in enumerate(names) if part in parts and name in parts[part].names]
+            for part in files
+        }
         mask = path / MASK_FILE if settings.mask else None
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
         rectification = self.rectification_of(lens, file, shows)
@@ -165,7 +165,7 @@ class ReimNerfDataManager(RecordedDataManager):
             "focal_scale": settings.focal_scale,
             "mask": MASK_FILE if settings.mask else None,
             **rectification.facts(),
-            "parts": {part: len(indices) for part, indices in parts.items()},
+            "parts": {part: len(frames) for part, frames in indices.items()},
             "pose_convention": {
                 "order": "camera-to-world, OpenGL axes, normalised",
                 "scene_scale": scale,
@@ -177,7 +177,7 @@ class ReimNerfDataManager(RecordedDataManager):
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, large, (*files.values(), mask)),
-            own_split={"train": parts["train"], "test": parts.get("true_test", ())},
+            own_split={"train": indices["train"], "test": indices.get("true_test", ())},
             seen={"video": find_seen_masks(path / "truth", len(frames))},
         )
 
@@ -203,14 +203,19 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
 
 
-def _refuse_different(files: Mapping[str, Path], contents: Mapping[str, Mapping[str, Any]]) -> None:
+def _has_no_frames(file: Path) -> bool:
+    content = read_json(file, "a JSON object with frames")
+    return isinstance(content, dict) and content.get("frames") == []
+
+
+def _refuse_different(parts: Mapping[str, Transforms]) -> None:
     """Refuse files whose camera or scale differs from that of the training frames."""
-    first = contents["train"]
-    for part, content in contents.items():
-        key = next((key for key in _SHARED if content.get(key) != first.get(key)), None)
+    first = parts["train"]
+    for part in parts.values():
+        key = next((key for key in _SHARED if part.content.get(key) != first.content.get(key)), None)
         if key is not None:
             raise InputError(
-                f"{files[part]}: {key} differs from {files['train'].name}",
+                f"{part.path}: {key} differs from {first.path.name}",
                 "one camera and one scale for all files",
                 "Write all files in one run",
             )
@@ -241,29 +246,21 @@ def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float
     return scale, shift[:3, 3]
 
 
-def _frames(
-    file: Path,
-    content: Mapping[str, Any],
-    trajectory: Trajectory | None,
-    scale: float,
-    shift: Float[np.ndarray, "3"],
-    outside: bool,
-) -> dict[str, _Frame]:
+def _frames(transforms: Transforms, scale: float, shift: Float[np.ndarray, "3"]) -> dict[str, _Frame]:
     """Frames of one file by the names of their images."""
     result: dict[str, _Frame] = {}
-    entries = {entry["file_path"]: entry for entry in content["frames"]}
-    poses = dict(zip(trajectory.names_or_numbers(), trajectory.camera_to_world, strict=True)) if trajectory else {}
-    for name, pose in poses.items():
+    poses = transforms.trajectory.camera_to_world
+    for name, frame, pose in zip(transforms.names, transforms.frames, poses, strict=True):
         camera_to_world = pose.copy()
         camera_to_world[:3, 3] = pose[:3, 3] / scale - shift
-        distances = entries[name].get("distmap_path")
-        stated = [name, *([distances] if isinstance(distances, str) else [])]
-        named = [reading.named_file(file.parent, text, str(file), outside) for text in stated]
-        paths = [_padded_otherwise(path) for path in named]
-        for path, existing in zip(named, paths, strict=True):
-            if not existing.is_file():
+        distances = frame.get("distmap_path")
+        paths = []
+        for text in [name, *([distances] if isinstance(distances, str) else [])]:
+            named = transforms.named(text)
+            paths.append(_padded_otherwise(named))
+            if not paths[-1].is_file():
                 raise InputError(
-                    f"{file} names {path}, which does not exist, nor with its number padded otherwise",
+                    f"{transforms.path} names {named}, which does not exist, nor with its number padded otherwise",
                     "every named file",
                     "Restore it",
                 )

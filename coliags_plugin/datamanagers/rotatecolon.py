@@ -12,18 +12,16 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
-from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio import camera_of
 from coliags_plugin.datamanagers.reading.depth import ExrDepth
 from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.transforms import Transforms, camera_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
 from coliags_plugin.datamanagers.shots import Shot, make_shots
-from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)
 
@@ -119,8 +117,8 @@ class RotateColonDataManager(RecordedDataManager):
 
         There must be an image for every pose; others are counted. Either all frames have a depth file, or none.
         """
-        settings, trajectory = self.settings, read_transforms(transforms)
-        stated = _numbers(transforms, trajectory.names_or_numbers())
+        settings, content = self.settings, Transforms(transforms)
+        stated = _numbers(transforms, content.names)
         order = sorted(range(len(stated)), key=stated.__getitem__)
         numbers = [stated[index] for index in order]
         files = numbered(folder, "", frozenset({".png"}))
@@ -137,11 +135,11 @@ class RotateColonDataManager(RecordedDataManager):
         deep = {} if depth_folder is None else numbered(depth_folder, "", frozenset({".exr"}))
         depths = for_all({f"frame {number}": deep.get(number) for number in numbers}, depth_folder, "a depth file")
         images = [files[number] for number in numbers]
-        angle = {"camera_angle_x": read_json(transforms, "a transforms.json").get("camera_angle_x")}
+        angle = {"camera_angle_x": content.content.get("camera_angle_x")}
         lens = camera_of(angle, str(transforms), "half", lambda: size_of(images[0]))
         rectification = self.rectification_of(lens, images[0])
         form = ExrDepth(settings.depth_channel, settings.depth_divisor)
-        shots = make_shots(images, rectification, trajectory.camera_to_world[order], depths, form, prefix)
+        shots = make_shots(images, rectification, content.trajectory.camera_to_world[order], depths, form, prefix)
         facts = {
             "layout": "rotatecolon",
             "transforms": transforms.name,

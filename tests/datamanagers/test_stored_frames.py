@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, PixelTensors
-from coliags_plugin.datamanagers import recording
+from coliags_plugin.datamanagers import shots
 from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.shots import StoredPixels
@@ -39,16 +38,16 @@ def reads(monkeypatch):
 
         return call
 
-    monkeypatch.setattr(recording, "read_rgb", counted(recording.read_rgb))
+    monkeypatch.setattr(shots, "read_rgb", counted(shots.read_rgb))
     monkeypatch.setattr(ScaledDepth, "read", counted(ScaledDepth.read))
     return read
 
 
 def frame_of(folder: Path, index: int, keep: bool = True) -> Frame:
     recording = manager("c3vd").open(folder)
-    shot = replace(recording.shots[index], seen=recording.seen["video"].get(index))
-    camera = shot.rectification.camera(shot.camera_to_world)
-    return Frame(shot.name, index, StoredPixels(shot, keep), camera)
+    shot = recording.shots[index]
+    source = StoredPixels(shot, keep, recording.seen["video"].get(index))
+    return Frame(shot.name, index, source, shot.rectification.camera(shot.camera_to_world))
 
 
 load = partial(load_scene, "c3vd")
