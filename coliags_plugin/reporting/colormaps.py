@@ -48,6 +48,12 @@ def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
     return table
 
 
+def colored(share: Float[np.ndarray, "*S"], color_map: ColorMap) -> UInt8[np.ndarray, "*S 3"]:
+    """Colours of shares of the full scale, clipped to 0 to 1."""
+    index = np.rint(np.clip(share, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return np.asarray(color_table(color_map)[index])
+
+
 def colorize_depth(
     depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float], hatched: bool = False
 ) -> UInt8[np.ndarray, "H W 3"]:
@@ -58,7 +64,7 @@ def colorize_depth(
     depth = as_array(depth_mm).astype(np.float64)
     low, high = limits
     known = np.isfinite(depth)
-    image = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
+    image = colored((np.where(known, depth, low) - low) / (high - low), "depth")
     image[~known] = hatch(*known.shape)[~known] if hatched else UNKNOWN_GREY
     return image
 
@@ -122,7 +128,7 @@ def colorize_error(
     error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped error of 0 to ``limit`` and more; pixels without ground truth are hatched in grey."""
-    image = _colored(np.where(known, error, 0.0) / limit, "error")
+    image = colored(np.where(known, error, 0.0) / limit, "error")
     image[~known] = hatch(*known.shape)[~known]
     return image
 
@@ -134,7 +140,7 @@ def color_bar(
     (low, high), size = limits, 18
     left, right, top = 24, width - text_width(unit) - 32, 8
     image = np.full((top + size + 26, width, 3), 255, np.uint8)
-    image[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
+    image[top : top + size, left:right] = colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
     for tick in linear_ticks(low, high):
         x = left + round((tick - low) / (high - low) * (right - left - 1))
         cv2.line(image, (x, top + size), (x, top + size + 4), INK, 1)
@@ -179,12 +185,6 @@ def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     stripe = (rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH
     grey = np.where(stripe, HATCH_GREYS[1], HATCH_GREYS[0]).astype(np.uint8)
     return np.repeat(grey[:, :, None], 3, axis=2)
-
-
-def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:
-    index = np.rint(np.clip(fraction, 0.0, 1.0) * 255.0).astype(np.uint8)
-    image: np.ndarray = color_table(color_map)[index]
-    return image
 
 
 def _unit_rgb(values: np.ndarray | Tensor) -> np.ndarray:

@@ -11,7 +11,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from coliags_plugin.core.jobs import Progress
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.centreline import (
     STEP,
@@ -110,20 +109,19 @@ def measure_coverage(
     mesh: TriangleMesh,
     views: Sequence[CoverageView],
     settings: CoverageSettings | None = None,
-    progress: Progress | None = None,
     metric: bool = True,
 ) -> WallCoverage | PartialCoverage:
     """Measure what a recording shows of the wall of a lumen, in the world frame and mm, and what it misses.
 
     Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
     can be called unseen; guessed wall always is. Without a lumen, or in a unit that is not mm (``metric``), what was
-    seen of the mesh is measured alone, then without the limits in mm. ``progress`` is called after every frame.
+    seen of the mesh is measured alone, then without the limits in mm.
     """
     settings = settings or CoverageSettings()
     if not metric:
         settings = settings.model_copy(update={"max_distance": np.inf, "far": np.inf})
     mesh = facing_cameras(mesh, views, settings)
-    face_views = see_faces(mesh, views, settings, progress)
+    face_views = see_faces(mesh, views, settings)
     try:
         if metric:
             return _along_lumen(mesh, face_views, views, settings)

@@ -6,7 +6,7 @@ Rays go through the lens of the stored images, which are not undistorted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -18,11 +18,11 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.reading.images import all_of, read_mask
 from coliags_plugin.datamanagers.shots import StoredPixels
+from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 
@@ -231,11 +231,8 @@ def _visible_centroids(
     return RayHits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
 
 
-def facing_cameras(
-    mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings | None = None
-) -> TriangleMesh:
+def facing_cameras(mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings) -> TriangleMesh:
     """The mesh, its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it."""
-    settings = settings or CoverageSettings()
     if not views:
         raise InputError("a recording without frames", "one frame or more")
     _check_not_empty(mesh)
@@ -256,24 +253,19 @@ def facing_cameras(
     return TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1], mesh.colors)
 
 
-def see_faces(
-    mesh: TriangleMesh,
-    views: Sequence[CoverageView],
-    settings: CoverageSettings | None = None,
-    progress: Progress | None = None,
-) -> FaceViews:
+def see_faces(mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings) -> FaceViews:
     """Find which triangles of a mesh, in the world frame and mm, the frames of a recording see.
 
     A frame sees a triangle if one of its viewing rays hits that first, from the front (counter-clockwise), within
     ``settings.max_distance``. Of triangles that no ray of any frame hits, because they lie between the rays, those
-    whose centroid is in view count as seen. ``progress`` is called after every frame.
+    whose centroid is in view count as seen.
     """
-    settings = settings or CoverageSettings()
     _check_not_empty(mesh)
     tally = _Tally(len(mesh))
-    shown = with_progress(views, "cast viewing rays", progress)
-    for number, (view, grid) in enumerate(_with_grids(shown, settings.rays)):
-        tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
+    with ProgressReport("cast viewing rays", len(views)) as progress:
+        for number, (view, grid) in enumerate(_with_grids(views, settings.rays)):
+            tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
+            progress.update(number + 1)
     between = np.flatnonzero(tally.counts[0] == 0)
     for number, (view, grid) in enumerate(_with_grids(views, settings.rays)):
         hits = _visible_centroids(mesh, view, grid, between, settings.max_distance)
@@ -286,7 +278,7 @@ def _check_not_empty(mesh: TriangleMesh) -> None:
         raise InputError("a mesh without triangles", "the surface that the camera filmed")
 
 
-def _with_grids(views: Iterable[CoverageView], most: int) -> Iterator[tuple[CoverageView, RayGrid]]:
+def _with_grids(views: Sequence[CoverageView], most: int) -> Iterator[tuple[CoverageView, RayGrid]]:
     """Views with the ray grids of their lenses and masks, made anew only where lens or mask change."""
     last: CoverageView | None = None
     for view in views:

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from coliags_plugin.core.files import atomic_folder, atomic_write, refuse_existing, write_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.html_page import write_html
@@ -67,8 +66,7 @@ def measure_scene(
     """
     refuse_existing(output, overwrite)
     views = recorded_views(scene)
-    with progress_callback() as progress:
-        coverage = measure_coverage(mesh, views, settings, progress, scene.is_metric)
+    coverage = measure_coverage(mesh, views, settings, scene.is_metric)
     picture = draw_partial(coverage, views) if isinstance(coverage, PartialCoverage) else draw_map(coverage)
     values, page = coverage_values(coverage), coverage_page(coverage, picture, views, scene.name)
     with atomic_folder(output, overwrite) as folder:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.libraries import import_open3d
@@ -29,7 +28,6 @@ _GUTTER, _STRETCH, _AT_ONCE = 2.0, 0.3, 8_000
 def best_colors(
     points: Float[np.ndarray, "N 3"],
     views: Sequence[DepthView],
-    image_of: Callable[[DepthView], UInt8[Tensor, "H W 3"]],
 ) -> UInt8[np.ndarray, "N 3"]:
     """Mean RGB of the images of the views that see each point, by their quality there.
 
@@ -42,7 +40,7 @@ def best_colors(
         chosen, at = inside[seen], pixels[seen]
         column, row = at.long().unbind(1)
         quality = view.quality[row, column] ** _POWER
-        total[chosen] += quality[:, None] * bilinear(image_of(view).float(), at[None])[0]
+        total[chosen] += quality[:, None] * bilinear(view.image().float(), at[None])[0]
         weight[chosen] += quality
     colors = (total / weight.clamp(min=torch.finfo().tiny)[:, None]).round().clamp(0, 255).to(torch.uint8).numpy()
     known = weight.numpy() > 0
@@ -55,7 +53,6 @@ def best_texture(
     mesh: TriangleMesh,
     texel: float,
     views: Sequence[DepthView],
-    image_of: Callable[[DepthView], UInt8[Tensor, "H W 3"]],
 ) -> Texture:
     """A texture of texels of about such an edge, scene units, each coloured as :func:`best_colors` does.
 
@@ -77,6 +74,6 @@ def best_texture(
     places = baked["positions"].numpy()
     known = np.isfinite(places).all(axis=-1)
     image = np.zeros((size, size, 3), np.uint8)
-    image[known] = best_colors(places[known], views, image_of)
+    image[known] = best_colors(places[known], views)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return Texture(image[tuple(nearest)], made.triangle.texture_uvs.numpy())

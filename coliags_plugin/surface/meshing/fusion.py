@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
-from torch import Tensor
+from jaxtyping import Bool
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.recording import portable_name
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
@@ -30,7 +28,7 @@ from coliags_plugin.geometry.meshes.truth import (
     find_true_surface,
     read_true_surface,
 )
-from coliags_plugin.reporting.image_files import eight_bit, write_png
+from coliags_plugin.reporting.image_files import write_png
 from coliags_plugin.reporting.model import Block, Paragraph, simple_table
 from coliags_plugin.surface.meshing.colors import best_colors, best_texture
 from coliags_plugin.surface.meshing.mending import close_holes, smoothed
@@ -74,23 +72,8 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Fused
         )
     mesh, holes = close_holes(mesh.without_small_parts(settings.min_part), settings.max_hole * size, views)
     mesh = smoothed(mesh, settings.smoothing)
-    image_of = images_of(trained, settings)
-    texture = best_texture(mesh, size / settings.texture, views, image_of) if settings.texture else None
-    return FusedRun(replace(mesh, colors=best_colors(mesh.vertices, views, image_of)), holes, texture)
-
-
-def images_of(trained: TrainedRun, settings: MeshSettings) -> Callable[[DepthView], UInt8[Tensor, "H W 3"]]:
-    """A function from a view to the image to colour by: the frame as recorded, or rendered in flattened light."""
-    if settings.color == "plain":
-        return lambda view: view.frame.image.cpu()
-    light = held_light("flattened", trained.model, [frame.camera for frame in trained.scene.train])
-
-    @torch.no_grad()
-    def flattened(view: DepthView) -> Tensor:
-        camera = view.camera.to(trained.device, torch.float32)
-        return eight_bit(render_held(trained.model, camera, light, ("rgb",)).rgb).cpu()
-
-    return flattened
+    texture = best_texture(mesh, size / settings.texture, views) if settings.texture else None
+    return FusedRun(replace(mesh, colors=best_colors(mesh.vertices, views)), holes, texture)
 
 
 #: Version of mesh.json.

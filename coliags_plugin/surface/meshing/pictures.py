@@ -15,7 +15,7 @@ from coliags_plugin.reporting.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     UNKNOWN_GREY,
     color_bar,
-    color_table,
+    colored,
     side_by_side,
     stacked,
 )
@@ -31,11 +31,10 @@ def distance_colors(
     distances: Float[np.ndarray, "N"], known: Bool[np.ndarray, "N"] | None = None
 ) -> UInt8[np.ndarray, "N 3"]:
     """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not known."""
-    share = np.clip(distances / DEPTH_ERROR_LIMIT_MM, 0.0, 1.0)
-    colors = color_table("error")[np.rint(share * 255.0).astype(np.uint8)]
+    colors = colored(distances / DEPTH_ERROR_LIMIT_MM, "error")
     if known is not None:
         colors[~known] = UNKNOWN_GREY
-    return np.asarray(colors)
+    return colors
 
 
 def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence[Camera]) -> UInt8[np.ndarray, "H W 3"]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field as Option
 from torch import Tensor
 
@@ -17,9 +18,11 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights, image_and_mask
+from coliags_plugin.reporting.image_files import eight_bit
 
 
 class MeshSettings(Settings):
@@ -80,17 +83,17 @@ class DepthView:
     """Depth to fuse, as a camera sees it.
 
     Attributes:
-        frame: That the view is of.
-        camera: That it was rendered from, on the CPU in float64; with corrected poses not the frame's own.
+        camera: Camera that it was rendered from, on the CPU in float64; with corrected poses not the frame's own.
         depth: z-depth, scene units; 0 where nothing is fused. [H, W]
         quality: Confidence times the cosine of the angle between ray and normal times nearness, which is 1 where a
             pixel is as large on the surface as it is in the median of the scene; 0 where nothing is fused. [H, W]
+        image: Function that gives the image to colour by. [H, W, 3]
     """
 
-    frame: Frame
     camera: Camera
     depth: Float[Tensor, "H W"]
     quality: Float[Tensor, "H W"]
+    image: Callable[[], UInt8[Tensor, "H W 3"]]
 
 
 def looked_at(
@@ -109,8 +112,19 @@ def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[Dept
 
     Left out is what is not opaque, ignored by the frame's mask, beyond the range of depth or of the sensor, or seen too
     obliquely. Of estimated depth, the confidence is the frame's; highlights count little, as what they show is not the
-    wall.
+    wall. Images are the frames as recorded, or rendered in flattened light.
     """
+    light = None
+    if settings.color == "flattened":
+        light = held_light("flattened", trained.model, [frame.camera for frame in trained.scene.train])
+
+    @torch.no_grad()
+    def image_of(frame: Frame, camera: Camera) -> UInt8[Tensor, "H W 3"]:
+        if light is None:
+            return frame.image.cpu()
+        camera = camera.to(trained.device, torch.float32)
+        return eight_bit(render_held(trained.model, camera, light, ("rgb",)).rgb).cpu()
+
     kind = f"depth_{settings.depth}"
     reach, footprint = max_depth_of(settings, trained.scene), trained.scene.pixel_footprint
     for frame in trained.scene.train:
@@ -124,7 +138,9 @@ def rendered_depth(trained: TrainedRun, settings: MeshSettings) -> Iterator[Dept
             good &= ~frame.depth_at_least.cpu().isfinite()
         nearness = footprint * (camera.fx * camera.fy) ** 0.5 / depth if np.isfinite(footprint) else 1.0
         quality = torch.where(good, cosines * nearness * trust(frame), 0.0)
-        yield DepthView(frame, camera, torch.where(good, depth, 0.0).float(), quality.float())
+        yield DepthView(
+            camera, torch.where(good, depth, 0.0).float(), quality.float(), partial(image_of, frame, camera)
+        )
 
 
 def trust(frame: Frame) -> Float[Tensor, "H W"]:

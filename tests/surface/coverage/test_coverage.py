@@ -36,6 +36,8 @@ from coliags_plugin.surface.coverage.visibility import (
 )
 from tests.surface.coverage.tubes import grid_mesh, joined, pinhole, plane, sphere, tube, view_at
 
+DEFAULTS = CoverageSettings()
+
 
 def solid_angle(lens) -> float:
     """Of the image of a centred pinhole camera."""
@@ -65,7 +67,7 @@ def test_rays_of_a_wide_lens_are_those_of_its_pixels_within_the_mask():
 def test_a_sphere_seen_from_its_centre():
     lens, radius = pinhole(), 30.0
     mesh = sphere(radius)
-    views = see_faces(mesh, [view_at((0, 0, 0), (1, 0.2, 0.3), lens)])
+    views = see_faces(mesh, [view_at((0, 0, 0), (1, 0.2, 0.3), lens)], DEFAULTS)
     area = mesh.areas[views.seen].sum()
     # Triangles that the edge of the image crosses count whole.
     assert area == pytest.approx(solid_angle(lens) * radius**2, rel=0.06)
@@ -91,7 +93,7 @@ def test_an_occluder_hides_its_shadow():
 def test_two_frames_are_counted_and_the_best_of_each_measure_is_kept():
     mesh = plane(40.0, 5.0, 2.0)
     near, far = view_at((0, 0, 20), grey=20), view_at((0, 0, 0), grey=200)
-    views = see_faces(mesh, [far, near])
+    views = see_faces(mesh, [far, near], DEFAULTS)
     middle = int(np.argmin(np.linalg.norm(mesh.centers[:, :2], axis=1)))
     assert views.frames[middle] == 2 and views.best_frame[middle] == 1
     assert views.distance[middle] == pytest.approx(20.0, abs=0.15)
@@ -119,9 +121,9 @@ def test_surface_beyond_the_range_is_not_seen():
 def test_only_the_front_is_seen_and_a_mesh_is_turned_to_the_cameras():
     mesh, camera = plane(40.0, 5.0), [view_at((0, 0, 0))]
     turned = TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1])
-    assert not see_faces(turned, camera).seen.any()
-    assert np.array_equal(facing_cameras(turned, camera).triangles, mesh.triangles)
-    assert facing_cameras(mesh, camera) is mesh
+    assert not see_faces(turned, camera, DEFAULTS).seen.any()
+    assert np.array_equal(facing_cameras(turned, camera, DEFAULTS).triangles, mesh.triangles)
+    assert facing_cameras(mesh, camera, DEFAULTS) is mesh
 
 
 def test_masked_pixels_see_nothing():
@@ -129,7 +131,7 @@ def test_masked_pixels_see_nothing():
     mask = np.zeros((lens.height, lens.width), bool)
     mask[:, : lens.width // 2] = True
     mesh = plane(40.0, 5.0, 1.0)
-    seen = see_faces(mesh, [view_at((0, 0, 0), lens=lens, mask=mask)]).seen
+    seen = see_faces(mesh, [view_at((0, 0, 0), lens=lens, mask=mask)], DEFAULTS).seen
     assert seen[mesh.centers[:, 0] < -1.0].all() and not seen[mesh.centers[:, 0] > 1.0].any()
 
 
@@ -155,11 +157,11 @@ def test_levels_tell_a_glance_darkness_and_distance_apart():
 def test_input_that_cannot_be_measured_is_refused():
     mesh = tube()
     with pytest.raises(InputError, match="no viewing ray"):
-        facing_cameras(mesh, [view_at((0, 0, 500.0))])
+        facing_cameras(mesh, [view_at((0, 0, 500.0))], DEFAULTS)
     with pytest.raises(InputError, match="without frames"):
-        facing_cameras(mesh, [])
+        facing_cameras(mesh, [], DEFAULTS)
     with pytest.raises(InputError, match="without triangles"):
-        see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))])
+        see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))], DEFAULTS)
     with pytest.raises(InputError, match=r"coverage option far: .*got -3\.0"):
         validated(CoverageSettings, {"far": -3.0}, "coverage option")
 

@@ -17,7 +17,7 @@ from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.reporting.text_formats import terminal_text
-from coliags_plugin.surface.meshing import fusion
+from coliags_plugin.surface.meshing import views
 from coliags_plugin.surface.meshing.colors import best_texture
 from coliags_plugin.surface.meshing.fusion import comparison_blocks, first_hits, fuse_run, mesh_run
 from coliags_plugin.surface.meshing.views import (
@@ -59,7 +59,7 @@ def test_edges_of_three_triangles_cannot_be_textured():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
     fan = TriangleMesh(vertices, np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
     with pytest.raises(InputError, match="1 edges of the mesh have more than two triangles"):
-        best_texture(fan, 0.1, [], lambda view: view.frame.image)
+        best_texture(fan, 0.1, [])
 
 
 def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
@@ -119,8 +119,8 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
         size = (camera.height, camera.width)
         return RenderOutput(torch.full((*size, 3), 0.2), torch.ones(size), camera)
 
-    monkeypatch.setattr(fusion, "held_light", held)
-    monkeypatch.setattr(fusion, "render_held", dark)
+    monkeypatch.setattr(views, "held_light", held)
+    monkeypatch.setattr(views, "render_held", dark)
     mesh = fuse_run(run, MeshSettings(color="flattened")).mesh
     assert asked == [("flattened", len(run.scene.train))]
     assert set(np.unique(mesh.colors)) == {51}
@@ -185,7 +185,7 @@ def test_defaults_follow_the_scene():
     assert max_depth_of(settings, scene) == pytest.approx(WALL - 0.5, abs=1e-4)
     empty = replace(scene, points=PointCloud(torch.zeros(0, 3)))
     assert max_depth_of(settings, empty) == float("inf")
-    with pytest.raises(InputError, match="`voxel`"):
+    with pytest.raises(InputError, match="`voxel=SIZE`"):
         voxel_size_of(settings, empty)
 
 

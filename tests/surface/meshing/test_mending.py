@@ -26,7 +26,8 @@ def without(mesh: TriangleMesh, *centers: tuple[float, float], radius: float = 1
 
 def view(depth: float = 20.0) -> DepthView:
     """A view along z from the origin, of a wall at such a depth."""
-    return DepthView(None, camera_at(0.0, 0.0, 0.0, 60, 40), torch.full((40, 60), depth), torch.ones(40, 60))
+    camera = camera_at(0.0, 0.0, 0.0, 60, 40)
+    return DepthView(camera, torch.full((40, 60), depth), torch.ones(40, 60), lambda: None)
 
 
 def test_a_small_hole_is_closed_as_the_wall_about_it():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def turned(angle: float) -> Camera:
 
 
 def view_of(camera: Camera, depth: torch.Tensor, quality: float | torch.Tensor = 1.0) -> DepthView:
-    return DepthView(None, camera, depth.float(), torch.where(depth > 0, quality, 0.0).float())
+    return DepthView(camera, depth.float(), torch.where(depth > 0, quality, 0.0).float(), lambda: None)
 
 
 def test_a_sphere_is_where_it_is():
@@ -131,17 +131,13 @@ def looking(x: float, depth: torch.Tensor, quality: float, value: int) -> DepthV
     """A view along z of one colour."""
     image = torch.full((40, 60, 3), value, dtype=torch.uint8)
     camera = camera_at(x, 0.0, 0.0, 60, 40)
-    return DepthView(SimpleNamespace(image=image), camera, depth, torch.full((40, 60), quality))
-
-
-def image_of(view: DepthView) -> torch.Tensor:
-    return view.frame.image
+    return DepthView(camera, depth, torch.full((40, 60), quality), lambda: image)
 
 
 def test_the_better_view_counts_by_the_fourth_power_of_its_quality():
     depth = torch.full((40, 60), 20.0)
     views = [looking(0.0, depth, 1.0, 200), looking(0.5, depth, 0.5, 30)]
-    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), views, image_of) == round((200 + 30 / 16) / (1 + 1 / 16))).all()
+    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), views) == round((200 + 30 / 16) / (1 + 1 / 16))).all()
 
 
 def test_what_hides_a_point_does_not_colour_it():
@@ -149,14 +145,14 @@ def test_what_hides_a_point_does_not_colour_it():
         looking(0.0, torch.full((40, 60), 10.0), 1.0, 200),
         looking(0.0, torch.full((40, 60), 20.0), 0.1, 30),
     )
-    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), [hidden, open_], image_of) == 30).all()
+    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), [hidden, open_]) == 30).all()
 
 
 def test_points_that_no_view_sees_take_the_nearest_colour():
     view = looking(0.0, torch.full((40, 60), 20.0), 1.0, 90)
     points = np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 30.0]])
-    assert (best_colors(points, [view], image_of) == 90).all()
-    assert (best_colors(points[1:], [view], image_of) == 0).all()
+    assert (best_colors(points, [view]) == 90).all()
+    assert (best_colors(points[1:], [view]) == 0).all()
 
 
 def test_samples_are_bilinear_at_pixel_centres():
@@ -166,4 +162,4 @@ def test_samples_are_bilinear_at_pixel_centres():
     camera = view.camera
     rays = torch.stack([(at[:, 0] - camera.cx) / camera.fx, (at[:, 1] - camera.cy) / camera.fy, torch.ones(2)], dim=1)
     points = (camera.center + 20.0 * rays.double() @ camera.camera_to_world[:3, :3].T.double()).numpy()
-    assert best_colors(points, [view], lambda _: ramp)[:, 0].tolist() == [80, 82]
+    assert best_colors(points, [replace(view, image=lambda: ramp)])[:, 0].tolist() == [80, 82]
