@@ -83,12 +83,16 @@ def render_gaussians(
     wanted = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}
     if "expected" in wanted:
         wanted.add("depth")
-    stages = pipeline.SurfelPipeline if is_surfels(gaussians) else pipeline.GaussianPipeline
-    view = stages(_view_table(camera, pose, settings), camera.width, camera.height, wanted)
+    primitive = pipeline.SURFELS if is_surfels(gaussians) else pipeline.GAUSSIANS
+    view = _view_table(camera, pose, settings)
+    stages = pipeline.Pipeline(primitive, view, camera.width, camera.height, wanted)
     channels = [name for name in wants if name in gaussians.features]
     try:
         means2d, radii, images, features = autograd.render(
-            [getattr(gaussians, name) for name in _SHAPES], [gaussians.features[name] for name in channels], pose, view
+            [getattr(gaussians, name) for name in _SHAPES],
+            [gaussians.features[name] for name in channels],
+            pose,
+            stages,
         )
     except pipeline.UnusableGaussianError:
         raise _unusable(gaussians) from None

@@ -19,56 +19,34 @@ from numba import types
 
 from coliags_plugin.core.numba_kernels import compilation
 from coliags_plugin.renderers import cpu_renderer
-from coliags_plugin.renderers.numba_kernels import (
-    surfel_layout,
-    surfel_sweep_backward,
-    surfel_sweep_forward,
-    sweep_backward,
-    sweep_forward,
-)
+from coliags_plugin.renderers.numba_kernels import layout, sweep_backward, sweep_forward
 from tests.renderers.test_torch_renderer import cast, scene
 
 # --- registers --------------------------------------------------------------------------------------------------------
 
 FLOATS, INTS = types.float32[::1], types.int32[::1]
 CHANNELS = 4
-CHANNEL_TUPLE = types.UniTuple(types.int64, CHANNELS)
-NOTHING = types.UniTuple(types.int64, 0)
-COLORS = types.UniTuple(types.int64, 3)
-#: Depth, of all measures.
-MEASURES = types.NamedTuple((types.UniTuple(types.int64, 1), NOTHING, NOTHING, NOTHING), surfel_layout.Measures)
 
+
+def outputs(**counts):
+    """Numba's type of ``layout.Outputs`` with so many of each."""
+    kinds = [types.UniTuple(types.int64, counts.get(name, 0)) for name in layout.Outputs._fields]
+    return types.NamedTuple(kinds, layout.Outputs)
+
+
+#: The types that the inner loops of the sweeps are called with, but for the outputs.
+FORWARD = (types.int64, types.int32, INTS, FLOATS, None, FLOATS, FLOATS)
+BACKWARD = (types.int64, types.int64, types.int64, FLOATS, None, FLOATS, FLOATS, types.int64, types.int64, FLOATS)
+DEPTH, SURFEL_DEPTH = outputs(channels=CHANNELS), outputs(channels=3, depth=1)
 #: The inner loop of each sweep, the types it is called with, and how many multiply-adds it takes for a block of sixteen
 #: pixels: five for U d and its square, five for 2^x, and those of the channels; backward has these twice, and moments.
 #: For surfels six are for the intersection and the two squared distances, and the depth is one more; backward has eight
 #: moments, the depth once.
 INNER_LOOPS = {
-    "forward": (
-        sweep_forward._sweep_block,
-        (types.int64, types.int32, INTS, FLOATS, CHANNEL_TUPLE, NOTHING, FLOATS, FLOATS),
-        5 + 5 + CHANNELS,
-    ),
-    "backward": (
-        sweep_backward._sweep_entry,
-        (
-            *(types.int64, types.int64, types.int64, FLOATS, CHANNEL_TUPLE, NOTHING, FLOATS, FLOATS),
-            *(types.int64, types.int64, FLOATS),
-        ),
-        5 + 5 + 2 * CHANNELS + 3,
-    ),
-    "forward, surfels": (
-        surfel_sweep_forward._sweep_block,
-        (types.int64, types.int32, INTS, FLOATS, COLORS, MEASURES, FLOATS, FLOATS),
-        6 + 5 + 3 + 1,
-    ),
-    "backward, surfels": (
-        surfel_sweep_backward._sweep_entry,
-        (
-            *(types.int64, types.int64, types.int64, FLOATS, COLORS, MEASURES, FLOATS, FLOATS),
-            *(types.int64, types.int64, FLOATS),
-        ),
-        6 + 5 + 2 * 3 + 1 + 7,
-    ),
+    "forward": (sweep_forward._sweep_gaussians, FORWARD, DEPTH, 5 + 5 + CHANNELS),
+    "backward": (sweep_backward._sweep_gaussian, BACKWARD, DEPTH, 5 + 5 + 2 * CHANNELS + 3),
+    "forward, surfels": (sweep_forward._sweep_surfels, FORWARD, SURFEL_DEPTH, 6 + 5 + 3 + 1),
+    "backward, surfels": (sweep_backward._sweep_surfel, BACKWARD, SURFEL_DEPTH, 6 + 5 + 2 * 3 + 1 + 7),
 }
 
 
@@ -84,7 +62,8 @@ PROCESSORS = {
 @functools.cache
 def llvm_code(sweep):
     """The inner loop of a sweep in LLVM's language, without its target."""
-    loop, signature, _ = INNER_LOOPS[sweep]
+    loop, arguments, composited, _ = INNER_LOOPS[sweep]
+    signature = tuple(composited if kind is None else kind for kind in arguments)
     alone = numba.njit(loop.py_func, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
     alone.compile(signature)
     return re.sub("^target .*$", "", alone.inspect_llvm(signature), flags=re.MULTILINE)
@@ -107,7 +86,7 @@ def test_inner_loops_fill_the_widest_registers(sweep, processor):
     module.triple, module.data_layout = triple, str(machine.target_data)
     assembly = machine.emit_assembly(module)
     # Where a block takes several registers, forward's U_xx x is the same in some and computed once.
-    assert len(re.findall(rf"^\s*{fused}", assembly, re.MULTILINE)) > (INNER_LOOPS[sweep][2] - 1) * (16 // floats)
+    assert len(re.findall(rf"^\s*{fused}", assembly, re.MULTILINE)) > (INNER_LOOPS[sweep][-1] - 1) * (16 // floats)
     # One number at a time, or by a function of the C library.
     scalar = r"^\s*(?:v?(?:fn?m(?:add|sub)\w*|mul|add|sub)ss|fn?m(?:add|sub|ul)\s+s\d)"
     assert not re.findall(scalar, assembly, re.MULTILINE)
@@ -173,6 +152,33 @@ def test_a_cache_that_fails_costs_nothing_but_time(cache, caplog, monkeypatch, t
     assert re.search(told, caplog.text, re.DOTALL)
 
 
+def factory(step):
+    """A kernel that encloses a part."""
+
+    @compilation.kernel
+    def stepped(number):
+        return step(number)
+
+    return stepped
+
+
+@compilation.part
+def one_more(number):
+    return number + 1
+
+
+@compilation.inline
+def ten_more(number):
+    return number + 10
+
+
+def test_kernels_of_one_factory_are_kept_apart(cache):
+    for _ in range(2):
+        kernels = [factory(step) for step in (one_more, ten_more)]
+        assert [kernel(4) for kernel in kernels] == [5, 14]
+    assert [sum(kernel.stats.cache_hits.values()) for kernel in kernels] == [1, 1]
+
+
 def run_python(code, **environment):
     """Run code in a fresh interpreter that finds the tests' scenes."""
     places = os.pathsep.join([str(Path(__file__).parent), *sys.path])
@@ -194,6 +200,29 @@ from coliags_plugin.renderers.numba_kernels import pipeline
     done = run_python(code, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("nowhere to keep them") == 1
+
+
+def with_another_release(expression):
+    """The value of an expression of this module's names, by a process with a release of numba that is not tested."""
+    code = f"""
+import sys, numba
+numba.__version__ = "9.9.0"
+sys.modules["coliags_plugin.core.numba_kernels.internals"] = None  # its imports may fail
+from tests.renderers.test_cpu_renderer_machine import *
+print({expression})
+"""
+    done = run_python(code)
+    assert done.stderr.count("none of the tested releases") == 1, done.stderr
+    return done.stdout.strip()
+
+
+def test_kernels_compile_with_other_releases_of_numba():
+    assert with_another_release("factory(ten_more)(factory(one_more)(4))") == "15"
+
+
+@pytest.mark.thorough
+def test_gradients_are_the_same_with_other_releases_of_numba():
+    assert with_another_release("gradient(*view()).sum().item().hex()") == gradient(*view()).sum().item().hex()
 
 
 # --- threads and forks ------------------------------------------------------------------------------------------------

@@ -1,50 +1,54 @@
-"""Compilation and on-disk caching of the kernels."""
+"""Compilation of the kernels, and of the functions they call."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import pickle
-from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeAlias, TypeVar
 
 import numba
 import numpy.typing as npt
-from numba.core import types
-from numba.core.caching import FunctionCache
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Flags, compile_extra
-from numba.core.registry import CPUDispatcher
-
-if TYPE_CHECKING:
-    from numba.core.base import BaseContext
-    from numba.core.codegen import Codegen
-    from numba.core.compiler import CompileResult
-    from numba.core.typing import Signature
 
 #: An array of a kernel; the kernel says of which type and shape.
 Array: TypeAlias = npt.NDArray[Any]
 
+#: Releases of numba whose private classes, in ``internals``, the tests ran with. Others compile by the public interface
+#: alone: that takes about twice as long, and nothing is kept on disk.
+TESTED = ("0.61", "0.62", "0.63", "0.64", "0.65", "0.66", "0.67", "0.68")
+
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
 _logger = logging.getLogger(__name__)
-#: What a cache may raise when its folder is full, unreadable or holds damaged files.
-_CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ValueError, AttributeError, ImportError, IndexError, TypeError)
 #: Announcements made: that kernels are kept (True), or cannot be (False).
 _announced: set[bool] = set()
 _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+_is_tested = ".".join(numba.__version__.split(".")[:2]) in TESTED
+if not _is_tested:
+    _logger.warning(
+        "numba %s is none of the tested releases, %s to %s: its kernels are compiled anew by every process, and that "
+        "takes longer",
+        numba.__version__,
+        TESTED[0],
+        TESTED[-1],
+    )
 
 
 def inline(function: _Function) -> _Function:
     """Compile a function that is inlined into its callers."""
-    return _Part(function, targetoptions={"nopython": True, "forceinline": True, **_OPTIONS})  # type: ignore[return-value]
+    return _compiled(function, forceinline=True)
 
 
 def part(function: _Function) -> _Function:
     """Compile a function that kernels call, on one thread."""
-    return _Part(function, targetoptions={"nopython": True, **_OPTIONS})  # type: ignore[return-value]
+    return _compiled(function)
+
+
+def _compiled(function: _Function, **options: bool) -> _Function:
+    if not _is_tested:
+        return numba.njit(function, **_OPTIONS, **options)  # type: ignore[no-any-return]
+    from coliags_plugin.core.numba_kernels.internals import Part
+
+    return Part(function, targetoptions={"nopython": True, **_OPTIONS, **options})  # type: ignore[return-value]
 
 
 def kernel(function: _Function) -> _Function:
@@ -56,75 +60,16 @@ def kernel(function: _Function) -> _Function:
     writes are out of its sight, in a function called.
     """
     dispatcher = numba.njit(function, no_cfunc_wrapper=True, **_OPTIONS)
-    try:
-        dispatcher._cache = _KernelCache(function)
-    except RuntimeError:  # numba: no folder to keep it in
-        _announce(False, "nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one")
+    if _is_tested:
+        from coliags_plugin.core.numba_kernels.internals import KernelCache
+
+        try:
+            dispatcher._cache = KernelCache(function, lambda folder: _announce(True, f"kept in {folder} and the like"))
+        except RuntimeError:  # numba: no folder to keep it in
+            _announce(
+                False, "nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one"
+            )
     return dispatcher  # type: ignore[no-any-return]
-
-
-class _Part(CPUDispatcher):  # type: ignore[misc]
-    """A function that only kernels call; its LLVM code is optimised and translated within each of them alone.
-
-    numba compiles each function completely, with wrappers for calls from Python and C and once for each constant among its
-    arguments, before it links it into its callers and optimises and translates it again there. That doubles the time.
-    """
-
-    def compile(self, sig: Sequence[types.Type]) -> None:
-        arguments = tuple(types.unliteral(kind) for kind in sig)
-        if arguments in self.overloads:
-            return
-        flags = Flags()
-        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
-        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
-        library = _PartLibrary(self.targetctx.codegen(), self.py_func.__qualname__)
-        compiled = compile_extra(self.typingctx, self.targetctx, self.py_func, arguments, None, flags, {}, library)
-        self.targetctx.insert_user_function(compiled.fndesc, compiled.fndesc, [library])
-        self.overloads[arguments] = compiled
-
-    def get_overload(self, sig: Sequence[types.Type]) -> object:
-        return self.overloads[tuple(sig)].fndesc
-
-    def _compile_for_args(self, *arguments: object, **named: object) -> None:
-        raise TypeError(f"{self.py_func.__qualname__} is a part of kernels and cannot be called from Python")
-
-
-class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM code of a part and of all that it calls, not optimised."""
-
-    def finalize(self) -> None:
-        for library in dict.fromkeys(self._linking_libraries):
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
-        self._finalized = True
-
-
-class _KernelCache(FunctionCache):
-    """numba's on-disk cache with three changes.
-
-    - A kernel is invalidated when any file of its folder, of the one above or of this one changes, as it may have
-      constants from there (numba checks its own file only).
-    - A cache that cannot be read or written causes a compilation, never an error.
-    - A message is logged before compilation.
-    """
-
-    def load_overload(self, sig: Signature, target_context: BaseContext) -> CompileResult | None:
-        try:
-            found = super().load_overload(sig, target_context)
-        except _CACHE_ERRORS as error:
-            _logger.warning("kernel cache in %s cannot be read (%s)", self.cache_path, error)
-            found = None
-        if found is None:
-            _announce(True, f"kept in {self.cache_path} and the like")
-        return found
-
-    def save_overload(self, sig: Signature, data: CompileResult) -> None:
-        try:
-            super().save_overload(sig, data)
-        except _CACHE_ERRORS as error:
-            _logger.warning("kernel cache in %s cannot be written (%s)", self.cache_path, error)
-
-    def _index_key(self, sig: Signature, codegen: Codegen) -> tuple[object, ...]:
-        return (*super()._index_key(sig, codegen), _fingerprint(Path(self._py_func.__code__.co_filename).parent))
 
 
 def _announce(kept: bool, where: str) -> None:
@@ -132,14 +77,3 @@ def _announce(kept: bool, where: str) -> None:
     if kept not in _announced:
         _announced.add(kept)
         _logger.info("compiling kernels for this machine, about ten seconds, once (%s)", where)
-
-
-@cache
-def _fingerprint(folder: Path) -> str:
-    """Hash of the sources in a folder of kernels, in the one above and in this one."""
-    digest = hashlib.sha256()
-    for path in sorted(
-        {path for place in (Path(__file__).parent, folder, folder.parent) for path in place.glob("*.py")}
-    ):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()

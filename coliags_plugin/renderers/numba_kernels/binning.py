@@ -1,4 +1,4 @@
-"""Binning of Gaussians into tiles and their blocks, by tile and front to back.
+"""Sorting of the drawn Gaussians by depth, and their binning into tiles and blocks, front to back.
 
 Tiles and blocks only save work: what is listed here is a superset of the pairs of pixel and Gaussian with
 alpha >= alpha_min, and the sweeps test each of those again. The list of Gaussians is cut into stretches that
@@ -10,14 +10,18 @@ from __future__ import annotations
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.threads import pieces, take
-from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
-from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
-from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show
+from coliags_plugin.renderers.numba_kernels import layout
+from coliags_plugin.renderers.numba_kernels.geometry import may_show, squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
 #: Prefetch distance, Gaussians.
 _AHEAD = 8
+#: Largest number of bits of a digit.
+DIGIT_BITS = 11
+#: Number of counters of one stretch.
+DIGITS = 1 << DIGIT_BITS
+#: Mask of the Gaussian's index in a key.
+NUMBER = (1 << 32) - 1
 
 
 @kernel
@@ -120,7 +124,7 @@ def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
     half_x, half_y = vec.mul(0.5, vec.sub(right, left)), vec.mul(0.5, vec.sub(bottom, top))
     x, y = vec.sub(vec.add(left, half_x), shift_x), vec.sub(vec.add(top, half_y), shift_y)
     x, y, half_x, half_y = vec.mul(scale, (x, y, half_x, half_y))
-    slopes = vec.broadcast_all(records, row + surfel_layout.SLOPES, (0,) * 6)
+    slopes = vec.broadcast_all(records, row + layout.OUTLINE_SLOPES, (0,) * 6)
     seen = may_show(slopes, vec.sqrt(reach), vec.broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
     return vec.select(seen, reach, vec.add(reach, 1.0))
 
@@ -128,8 +132,8 @@ def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
 @inline
 def _circle(records, row):
     """The centre of the circle that a surfel reaches, from that of its ellipse."""
-    x = vec.number(records, row + surfel_layout.CIRCLE_X) - vec.number(records, row + layout.MEAN_X)
-    return x, vec.number(records, row + surfel_layout.CIRCLE_Y) - vec.number(records, row + layout.MEAN_Y)
+    x = vec.number(records, row + layout.CIRCLE_X) - vec.number(records, row + layout.MEAN_X)
+    return x, vec.number(records, row + layout.CIRCLE_Y) - vec.number(records, row + layout.MEAN_Y)
 
 
 @kernel
@@ -165,3 +169,62 @@ def sort_pairs(counters, grid, pairs, bins):
             cells[cell + 1] = pairs.blocks[pair]
             cells[cell + 2] = entry
             entry += 1
+
+
+# --- stable radix sort by depth, least significant digit first --------------------------------------------------------
+
+
+@kernel
+def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
+    """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
+
+    The bits of positive floats order as the numbers do. ``places`` is the offset of the first key of each parcel; ``lowest``
+    and ``highest`` are written: the range of depth bits in each parcel.
+    """
+    per_parcel = layout.PARCEL // layout.GROUP
+    for parcel in pieces(counters, 0, len(places)):
+        low, high = NUMBER, 0
+        place = places[parcel]
+        for group in range(parcel * per_parcel, min((parcel + 1) * per_parcel, len(drawn))):
+            flags = drawn[group]
+            while flags:
+                index = layout.GROUP * group + vec.lowest_bit(flags)
+                flags &= flags - 1
+                depth = int(depth_bits[index])
+                keys[place] = depth << 32 | index
+                place += 1
+                low, high = min(low, depth), max(high, depth)
+        lowest[parcel], highest[parcel] = low, high
+
+
+@kernel
+def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
+    """Histogram of the digits, ``mask`` after ``shift`` of depth bits less ``lowest``. [DIGITS for each stretch]"""
+    for stretch in pieces(counters, 0, stretches):
+        start = stretch * DIGITS
+        for digit in range(mask + 1):
+            digits[start + digit] = 0
+        for place in range(len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches):
+            digits[start + (((keys[place] >> 32) - lowest) >> shift & mask)] += 1
+
+
+@kernel
+def place_digits(stretches, mask, digits):
+    """Turn the histograms into offsets of the first key of each digit and stretch."""
+    total = 0
+    for digit in range(mask + 1):
+        for stretch in range(stretches):
+            at = stretch * DIGITS + digit
+            total, digits[at] = total + digits[at], total
+
+
+@kernel
+def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved):
+    """Scatter the keys into ``moved`` by digit; the offsets in ``digits`` are incremented."""
+    for stretch in pieces(counters, 1, stretches):
+        start = stretch * DIGITS
+        for place in range(len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches):
+            key = keys[place]
+            at = start + (((key >> 32) - lowest) >> shift & mask)
+            moved[digits[at]] = key
+            digits[at] += 1

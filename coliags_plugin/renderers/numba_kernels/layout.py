@@ -7,7 +7,7 @@ group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from coliags_plugin.core.numba_kernels.compilation import Array
 
@@ -24,20 +24,47 @@ PARCEL = 1024
 #: Numbers in a row of ``records`` and of sums.
 ROW = 16
 
-# Columns of ``records``. U is scaled so that log2(alpha) = log2(opacity) - |U d|^2 without further factors: it is
-# sqrt(log2(e) / 2) times the U of docs/rendering.md.
+# Columns of ``records`` of 3D Gaussians. U is scaled so that log2(alpha) = log2(opacity) - |U d|^2 without further
+# factors: it is sqrt(log2(e) / 2) times the U of docs/rendering.md.
 U_XX = 0
 U_YX = 1
 U_YY = 2
 MEAN_X = 3
 MEAN_Y = 4
 LOG2_OPACITY = 5
-#: Colour, then as many of depth, inverse depth and the three components of the normal as are composited.
+#: Colour (3), depth, inverse depth, normal (3); composited are the first 3, 4, 5 or 8.
 CHANNELS = 6
 MAX_CHANNELS = 8
 #: cov_xy / cov_xx and cov_xy / cov_yy: how the nearest point moves along an edge that is upright, or level.
 SLOPE_UPRIGHT = 14
 SLOPE_LEVEL = 15
+
+# Columns of ``records`` of surfels. With d the offset of a pixel from the projected centre, in units of
+# 1 / ``VIEW_PIXEL_SCALE`` pixels, the ray through it meets the disc's plane at z-depth ``SURFEL_DEPTH`` / q and at
+# (e, f) = (U d, V d) / q with q = 1 + Q d. (e, f) are standard deviations times ``U_FACTOR``, and so is d for those of
+# the low-pass filter, so that log2(alpha) = log2(opacity) - min(e^2 + f^2, |d|^2).
+SURFEL_U_X = 0
+SURFEL_U_Y = 1
+SURFEL_V_X = 2
+SURFEL_V_Y = 3
+SURFEL_Q_X = 4
+SURFEL_Q_Y = 5
+SURFEL_MEAN_X = 6  # pixels
+SURFEL_MEAN_Y = 7
+SURFEL_LOG2_OPACITY = 8
+SURFEL_DEPTH = 9
+#: Colour (3), normal (3).
+SURFEL_CHANNELS = 10
+
+# Columns of ``outlines`` of surfels: as ``records`` of 3D Gaussians, of the ellipse where the disc's image ends; then
+# the centre of the low-pass filter's circle, and the columns of the surfel's record from ``SURFEL_U_X`` to
+# ``SURFEL_Q_Y``. Where the disc crosses the near plane its image may be no ellipse: ``U_XX`` is 0, and ``U_YY`` is the
+# largest q.
+CIRCLE_X = 6
+CIRCLE_Y = 7
+OUTLINE_SLOPES = 8
+#: Stands for infinity as largest q: nothing that passes is infinite.
+LARGE = 1e30
 
 #: The square of the factor in U, and the factor.
 U_FACTOR_SQUARED = 0.5 / math.log(2.0)
@@ -45,15 +72,22 @@ U_FACTOR = math.sqrt(U_FACTOR_SQUARED)
 #: Slack on |U d|^2 in binning, so that rounding never drops a pixel that a sweep would draw.
 REACH_SLACK = 1e-2
 
-# Columns of sums. With v the derivative of the loss with respect to ln(alpha) and (e, f) = U d they are, over pixels,
-# the sums of v, v e, v f, v e e, v e f, v f f, and of weight times the derivative with respect to each channel.
-SUM_V = 0
-SUM_E = 1
-SUM_F = 2
-SUM_EE = 3
-SUM_EF = 4
-SUM_FF = 5
-SUM_CHANNELS = 6
+# Columns of sums over pixels, with v = dL / d ln(alpha); of surfels v counts in columns 1 to 5 where the disc, not the
+# filter, decides alpha, and c is the derivative with respect to a factor on the intersection (u, v, z), by its logarithm.
+SUM_V = 0  # v
+SUM_E = 1  # v e, with (e, f) = U d
+SUM_F = 2  # v f
+SUM_EE = 3  # v e e
+SUM_EF = 4  # v e f
+SUM_FF = 5  # v f f
+SUM_CHANNELS = 6  # 3D Gaussians: weight times the derivative with respect to each channel
+SUM_C = 6  # surfels: c
+SUM_CE = 7  # c e
+SUM_CF = 8  # c f
+SUM_DX = 9  # v d_x where the filter decides alpha
+SUM_DY = 10  # v d_y there
+#: Surfels: as SUM_CHANNELS. The sixteen of all entries, or surfels, come first, and the seventeenth of all behind.
+SURFEL_SUM_CHANNELS = 11
 
 #: Integers for each entry of ``cells``: the index of the Gaussian; which of the tile's blocks it touches, one bit each;
 #: and the number of the entry when they are counted by Gaussian, nearest first.
@@ -80,6 +114,29 @@ VIEW_BACKGROUND = 27
 VIEW_PIXEL_SCALE = 30  # U_FACTOR over the standard deviation of the surfels' filter, per pixel
 VIEW_DISTORTION = 31  # factor of squared differences of reciprocal depths in the distortion
 
+#: A number that numba compiles a kernel for: the length of a tuple, whose elements do not matter.
+Count: TypeAlias = tuple[int, ...]
+
+
+def count(number: int) -> Count:
+    """A number as its tuple."""
+    return (0,) * number
+
+
+class Outputs(NamedTuple):
+    """Channels and per-pixel measures that a sweep composites; kernels are compiled for each combination.
+
+    ``channels`` are numbers of the record from the colour on. The rest is 1 where wanted, and the normals 3: of surfels,
+    whose depth differs from pixel to pixel, and of 3D Gaussians the median alone.
+    """
+
+    channels: Count
+    normals: Count = ()
+    depth: Count = ()
+    inverse_depth: Count = ()
+    median: Count = ()
+    distortion: Count = ()
+
 
 class Parameters(NamedTuple):
     """The Gaussians, or the derivatives with respect to them: 3, 4 (w first), 3 (surfels: 2), 1 and 3 numbers for each."""
@@ -89,19 +146,6 @@ class Parameters(NamedTuple):
     scales: Array
     opacities: Array
     colors: Array
-
-
-class Extras(NamedTuple):
-    """Channels composited besides colour, in this order; ``median`` has one element where its depth is wanted, else none."""
-
-    depth: bool
-    inverse_depth: bool
-    normals: bool
-    median: tuple[int, ...]
-
-
-#: Channels of a sweep over features, where all outputs are in the first one, whose kernels serve.
-FEATURES = Extras(depth=True, inverse_depth=True, normals=True, median=(0,))
 
 
 class Grid(NamedTuple):
@@ -117,7 +161,7 @@ class Projections(NamedTuple):
     """Output of the projection, padded to whole groups."""
 
     records: Array  # one row for each Gaussian; anything where it is not drawn
-    outlines: Array  # the same for binning: of surfels see surfel_layout, of 3D Gaussians the records
+    outlines: Array  # the same for binning: of surfels their outlines, of 3D Gaussians the records
     remainders: Array  # what float32 leaves of the projected centres, pixels; 2 for each surfel, none for 3D Gaussians
     depths: Array  # z-depths; 1 where not in front of the camera
     bounds: Array  # first and last column, first and last row of the tiles within reach; 4 for each Gaussian
@@ -141,7 +185,7 @@ class Pairs(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Pairs of a Gaussian and a tile by tile and front to back; they are called entries here."""
+    """Tile intersections, (Gaussian, tile) pairs sorted by tile, then by depth; one pair is an "entry"."""
 
     keys: Array  # Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits
     entry_counts: Array  # entries of each of them

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection
-from types import ModuleType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,18 +12,13 @@ from coliags_plugin.core.numba_kernels.threads import Runner, workers
 from coliags_plugin.renderers.numba_kernels import (
     binning,
     layout,
-    sorting,
-    surfel_layout,
-    surfel_sweep_backward,
-    surfel_sweep_forward,
+    projection,
+    projection_backward,
     sweep_backward,
     sweep_forward,
+    tiles,
 )
 from coliags_plugin.renderers.numba_kernels.buffers import ArenaPool, Results
-from coliags_plugin.renderers.numba_kernels.projection import project
-from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
-from coliags_plugin.renderers.numba_kernels.surfel_projection import project_surfels
-from coliags_plugin.renderers.numba_kernels.surfel_projection_backward import gather_surfels, project_surfels_backward
 
 #: Pieces of work per thread where their costs differ.
 _PIECES = 8
@@ -46,56 +39,102 @@ class TooManyPairsError(Exception):
     """The Gaussians cover more tiles than the lists can hold; the argument is the number of tiles."""
 
 
-class Layer(NamedTuple):
-    """Channels and tables that one pair of sweeps composites.
+class Primitive(NamedTuple):
+    """What differs between 3D Gaussians and surfels: kernels, columns of the tables, and outputs.
 
-    ``channels`` is any tuple as long as there are channels in the records of ``projections``, and ``own`` is what is
-    composited besides, ``layout.Extras`` or ``surfel_layout.Measures``.
+    Attributes:
+        project, sweep_forward, sweep_backward, gather, project_backward: The kernels, in their order.
+        outputs: What is composited, from the images wanted, fields of ``layout.Images``.
+        scales: Scales of a Gaussian.
+        circle: Whether Gaussians also reach a circle, the low-pass filter's: outlines differ from records then.
+        constant_images: Images without derivatives.
+        first_channel: First of the channels' columns of records.
+        first_sum: First of the channels' columns of sums.
+        feature_channels: How many feature channels one sweep composites.
+        feature_images: The images that hold them.
     """
+
+    project: Callable[..., None]
+    sweep_forward: Callable[..., None]
+    sweep_backward: Callable[..., None]
+    gather: Callable[..., None]
+    project_backward: Callable[..., None]
+    outputs: Callable[[Collection[str]], layout.Outputs]
+    scales: int
+    circle: bool
+    constant_images: tuple[str, ...]
+    first_channel: int
+    first_sum: int
+    feature_channels: int
+    feature_images: tuple[str, ...]
+
+
+def _gaussian_outputs(wanted: Collection[str]) -> layout.Outputs:
+    """The channels up to the last one wanted, and the median."""
+    channels = 8 if "normals" in wanted else 5 if "inverse_depth" in wanted else 4 if "depth" in wanted else 3
+    return layout.Outputs(layout.count(channels), median=layout.count("median" in wanted))
+
+
+def _surfel_outputs(wanted: Collection[str]) -> layout.Outputs:
+    """Colour, normals where wanted, and the measures wanted."""
+    measures = {name: layout.count(name in wanted) for name in ("depth", "inverse_depth", "median", "distortion")}
+    return layout.Outputs(layout.count(3), layout.count(3 * ("normals" in wanted)), **measures)
+
+
+GAUSSIANS = Primitive(
+    projection.project,
+    sweep_forward.sweep,
+    sweep_backward.sweep,
+    projection_backward.gather,
+    projection_backward.project_backward,
+    outputs=_gaussian_outputs,
+    scales=3,
+    circle=False,
+    constant_images=("median",),
+    first_channel=layout.CHANNELS,
+    first_sum=layout.SUM_CHANNELS,
+    feature_channels=layout.MAX_CHANNELS,
+    feature_images=("rgb", "depth", "inverse_depth", "normals"),
+)
+SURFELS = Primitive(
+    projection.project_surfels,
+    sweep_forward.sweep_surfels,
+    sweep_backward.sweep_surfels,
+    projection_backward.gather_surfels,
+    projection_backward.project_surfels_backward,
+    outputs=_surfel_outputs,
+    scales=2,
+    circle=True,
+    constant_images=(),
+    first_channel=layout.SURFEL_CHANNELS,
+    first_sum=layout.SURFEL_SUM_CHANNELS,
+    feature_channels=3,  # as colours alone, whose kernels serve
+    feature_images=("rgb",),
+)
+
+
+class Layer(NamedTuple):
+    """Inputs of one forward and backward sweep: projected Gaussians, the view, and what is composited."""
 
     projections: layout.Projections
     view: Array
-    channels: tuple[int, ...]
-    own: Any
+    outputs: layout.Outputs
 
 
-class Kernels(NamedTuple):
-    """The kernels of one primitive; of the sweeps, the modules, which also say how much memory a thread needs."""
-
-    project: Callable[..., None]
-    sweep_forward: ModuleType
-    sweep_backward: ModuleType
-    gather: Callable[..., None]
-    project_backward: Callable[..., None]
-
-
-class Pipeline(ABC):
-    """Rendering of N Gaussians from one camera, stage by stage, with the intermediate tables.
+class Pipeline:
+    """Rendering of N Gaussians, or surfels, from one camera, stage by stage, with the intermediate tables.
 
     ``view`` is that of ``layout``; ``wanted`` are the images to draw, fields of ``layout.Images``; depth is among them if
     expected is.
     """
 
-    kernels: ClassVar[Kernels]
-    #: Scales of a Gaussian.
-    scales: ClassVar[int]
-    #: Whether Gaussians also reach a circle, the low-pass filter's: outlines differ from records then.
-    circles: ClassVar[bool]
-    #: Images without derivatives.
-    constant_images: ClassVar[tuple[str, ...]]
-    #: First of the channels' columns of records, and of sums.
-    first_channel: ClassVar[int]
-    first_channel_sum: ClassVar[int]
-    #: How many feature channels one sweep composites, the images that hold them, and what is composited besides.
-    feature_channels: ClassVar[int]
-    feature_images: ClassVar[tuple[str, ...]]
-    feature_own: ClassVar[Any]
-
-    def __init__(self, view: Array, width: int, height: int, wanted: Collection[str]) -> None:
+    def __init__(self, primitive: Primitive, view: Array, width: int, height: int, wanted: Collection[str]) -> None:
         columns = -(-width // layout.TILE)
+        self._primitive = primitive
         self._view = view
         self._grid = layout.Grid(width, height, columns, columns * -(-height // layout.TILE))
         self._wanted = wanted
+        self._outputs = primitive.outputs(wanted)
         self._arena = _arenas.lend(self)
         self._count = 0
         self._tail: layout.Parameters
@@ -104,42 +143,40 @@ class Pipeline(ABC):
         self._composited: Array
         self._feature_composited: Array
 
-    @abstractmethod
+    @property
+    def constant_images(self) -> tuple[str, ...]:
+        """Images without derivatives."""
+        return self._primitive.constant_images
+
+    @property
     def _main_layer(self) -> Layer:
         """Colours and all that is wanted besides."""
+        return Layer(self._projections, self._view, self._outputs)
 
-    def _composited_vectors(self, layer: Layer) -> int:
-        """Vectors that a forward sweep leaves of each block."""
-        return 1 + len(layer.channels)
+    def _sums(self, outputs: layout.Outputs) -> int:
+        """Sums of each Gaussian and entry."""
+        return self._primitive.first_sum + len(outputs.channels) + len(outputs.normals)
 
-    def _sums_size(self, layer: Layer, rows: int) -> int:
-        """Numbers in the sums of so many Gaussians or entries: sixteen, or with one more behind those of all."""
-        return (layout.ROW + (self.first_channel_sum + len(layer.channels) > layout.ROW)) * rows
+    def _sums_size(self, outputs: layout.Outputs, rows: int) -> int:
+        """Length of the table of sums of ``rows`` Gaussians or entries: 16 floats each, 17 if there are too many sums."""
+        return (layout.ROW + (self._sums(outputs) > layout.ROW)) * rows
 
-    def _sweep(self, run: Runner, stage: ModuleType, layer: Layer, *tables: Any) -> None:
+    def _sweep(self, run: Runner, kernel: Callable[..., None], layer: Layer, *tables: Any) -> None:
         """Run a sweep, which takes or writes the tables."""
-        numbers = self._arena.take("numbers", run.workers * stage.NUMBERS)
-        scratch = layout.Scratch(numbers, self._arena.take("integers", run.workers * stage.INTEGERS, np.int32))
-        run(
-            stage.sweep,
-            layer.projections,
-            self._bins,
-            layer.view,
-            self._grid,
-            layer.channels,
-            layer.own,
-            scratch,
-            *tables,
-        )
+        numbers = self._arena.take("numbers", run.workers * tiles.NUMBERS)
+        scratch = layout.Scratch(numbers, self._arena.take("integers", run.workers * tiles.INTEGERS, np.int32))
+        run(kernel, layer.projections, self._bins, layer.view, self._grid, layer.outputs, scratch, *tables)
 
     def _sweep_backward(
         self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, sums: Array, of_means2d: Array
     ) -> None:
         """Find the sums of Gaussians, and the derivative with respect to the projected centres."""
-        entry_sums = self._arena.take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
-        self._sweep(run, self.kernels.sweep_backward, layer, composited, _flat_images(of_images), entry_sums)
+        entry_sums = self._arena.take("entry_sums", self._sums_size(layer.outputs, int(self._bins.starts[-1])))
+        seventeen = self._sums(layer.outputs) > layout.ROW
+        tables = (composited, _flat_images(of_images), seventeen, entry_sums)
+        self._sweep(run, self._primitive.sweep_backward, layer, *tables)
         gathered = (entry_sums, sums, of_means2d.reshape(-1))
-        run(self.kernels.gather, layer.projections, self._bins, layer.view, layer.channels, *gathered)
+        run(self._primitive.gather, layer.projections, self._bins, layer.view, seventeen, *gathered)
 
     # --- stages -------------------------------------------------------------------------------------------------------
 
@@ -151,12 +188,12 @@ class Pipeline(ABC):
         """
         self._count = count = len(gaussians.opacities)
         groups, filled, take = -(-count // layout.GROUP), self._filled, self._arena.take
-        self._tail = _tail(gaussians, count, self.scales)
+        self._tail = _tail(gaussians, count, self._primitive.scales)
         records = take("records", layout.ROW * filled)
         self._projections = layout.Projections(
             records=records,
-            outlines=take("outlines", len(records)) if self.circles else records,
-            remainders=take("remainders", 2 * filled * self.circles),
+            outlines=take("outlines", len(records)) if self._primitive.circle else records,
+            remainders=take("remainders", 2 * filled * self._primitive.circle),
             depths=take("depths", filled),
             bounds=take("bounds", 4 * filled),
             drawn=take("drawn", groups, np.int64),
@@ -165,19 +202,20 @@ class Pipeline(ABC):
         means2d, radii = _results.take(filled, 2), _results.take(filled)
         written = (self._projections, means2d.reshape(-1), radii)
         with workers() as run:
-            run(self.kernels.project, count, gaussians, self._tail, self._view, self._main_layer().own, *written)
+            normals = "normals" in self._wanted
+            run(self._primitive.project, count, gaussians, self._tail, self._view, normals, *written)
         if count and self._projections.parcels[::2].min() < 0:
             raise UnusableGaussianError
-        return means2d[:count], radii[:count], take("links", self._sums_size(self._main_layer(), filled))
+        return means2d[:count], radii[:count], take("links", self._sums_size(self._outputs, filled))
 
     def composite(self) -> layout.Images:
         """Draw the Gaussians projected: [H, W, 3] or [H, W], None where not wanted. May raise TooManyPairsError."""
-        layer = self._main_layer()
+        layer = self._main_layer
         images = self._images(self._wanted, _results.take)
         with workers() as run:
             self._bin(run)
-            self._composited = self._arena.take("composited", self._composited_size(layer))
-            self._sweep(run, self.kernels.sweep_forward, layer, self._composited, _flat_images(images))
+            self._composited = self._arena.take("composited", self._composited_size(layer.outputs))
+            self._sweep(run, self._primitive.sweep_forward, layer, self._composited, _flat_images(images))
         return images
 
     def composite_features(self, features: Array) -> Array:
@@ -185,16 +223,16 @@ class Pipeline(ABC):
 
         Some channels at a time take the place of the others in the records.
         """
-        grid, width, count = self._grid, self.feature_channels, features.shape[1]
+        grid, width, count = self._grid, self._primitive.feature_channels, features.shape[1]
         sweeps = -(-count // width)
-        size = self._composited_size(self._features_layer(features, 0))
+        size = self._composited_size(self._feature_outputs)
         result = np.empty((grid.height, grid.width, width * sweeps), np.float32)
         self._feature_composited = self._arena.take("feature_composited", sweeps * size)
         with workers() as run:
             for sweep in range(sweeps):
                 layer, images = self._features_layer(features, sweep), self._feature_images()
                 composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._sweep(run, self.kernels.sweep_forward, layer, composited, _flat_images(images))
+                self._sweep(run, self._primitive.sweep_forward, layer, composited, _flat_images(images))
                 result[..., width * sweep : width * (sweep + 1)] = self._joined(images)
         return result[..., :count]
 
@@ -204,8 +242,8 @@ class Pipeline(ABC):
         Returns the derivative with respect to the projected centres [N, 2], the sums of each Gaussian without those of the
         channels, and the derivative with respect to the features [N, C].
         """
-        width, filled, first_sum = self.feature_channels, self._filled, self.first_channel_sum
-        size = self._composited_size(self._features_layer(features, 0))
+        width, filled, first_sum = self._primitive.feature_channels, self._filled, self._primitive.first_sum
+        size = self._composited_size(self._feature_outputs)
         part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
         total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
         result = np.empty_like(features)
@@ -222,7 +260,7 @@ class Pipeline(ABC):
                 of_means2d += of_part
                 columns = min(width, features.shape[1] - first)
                 result[:, first : first + columns] = rows[: self._count, first_sum : first_sum + columns]
-        sums = np.zeros(self._sums_size(self._main_layer(), filled), np.float32)
+        sums = np.zeros(self._sums_size(self._outputs, filled), np.float32)
         sums[: layout.ROW * filled] = total.reshape(-1)
         return of_means2d[: self._count], sums, result
 
@@ -232,8 +270,8 @@ class Pipeline(ABC):
         Returns the derivative with respect to the projected centres [N, 2], and the sums of each Gaussian, which are good until
         the next call.
         """
-        layer, filled = self._main_layer(), self._filled
-        gaussian_sums = self._arena.take("gaussian_sums", self._sums_size(layer, filled))
+        layer, filled = self._main_layer, self._filled
+        gaussian_sums = self._arena.take("gaussian_sums", self._sums_size(layer.outputs, filled))
         of_means2d = _results.take(filled, 2)
         with workers() as run:
             self._sweep_backward(run, layer, self._composited, of_images, gaussian_sums, of_means2d)
@@ -246,39 +284,44 @@ class Pipeline(ABC):
 
         Returns those with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
-        filled, layer = self._filled, self._main_layer()
+        filled, outputs = self._filled, self._outputs
         given = self._arena.take("given_means2d", 2 * filled)
         given[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
         given[2 * self._count :] = 0.0
         if gaussian_sums is None:
-            gaussian_sums = np.zeros(self._sums_size(layer, filled), np.float32)
+            gaussian_sums = np.zeros(self._sums_size(outputs, filled), np.float32)
         of_pose = self._arena.take("of_pose", layout.ROW * -(-self._count // layout.PARCEL))
-        results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self.scales, 1, 3)))
+        results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self._primitive.scales, 1, 3)))
         flat = layout.Parameters(*(result.reshape(-1) for result in results))
-        tables = (layer.channels, layer.own, self._projections, gaussian_sums, given, flat, of_pose)
+        channels = len(outputs.channels) + len(outputs.normals)
+        tables = (channels, self._projections, gaussian_sums, given, flat, of_pose)
         with workers() as run:
-            run(self.kernels.project_backward, self._count, gaussians, self._tail, self._view, *tables)
+            run(self._primitive.project_backward, self._count, gaussians, self._tail, self._view, *tables)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
         return layout.Parameters(*(result[: self._count] for result in results)), columns.T
 
     # --- features -----------------------------------------------------------------------------------------------------
 
+    @property
+    def _feature_outputs(self) -> layout.Outputs:
+        return layout.Outputs(layout.count(self._primitive.feature_channels))
+
     def _features_layer(self, features: Array, sweep: int) -> Layer:
         """A part of the features as channels, over black."""
-        width = self.feature_channels
+        width = self._primitive.feature_channels
         part = features[:, width * sweep : width * (sweep + 1)]
         records = self._arena.take("feature_records", len(self._projections.records))
         records[:] = self._projections.records
-        rows = records.reshape(-1, layout.ROW)[: self._count, self.first_channel :]
+        rows = records.reshape(-1, layout.ROW)[: self._count, self._primitive.first_channel :]
         rows[:, :width] = 0.0
         rows[:, : part.shape[1]] = part
         view = self._view.copy()
         view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
-        return Layer(self._projections._replace(records=records), view, (0,) * width, self.feature_own)
+        return Layer(self._projections._replace(records=records), view, self._feature_outputs)
 
     def _feature_images(self) -> layout.Images:
         """Images for the channels of a sweep."""
-        return self._images(self.feature_images, lambda *shape: np.zeros(shape, np.float32))
+        return self._images(self._primitive.feature_images, lambda *shape: np.zeros(shape, np.float32))
 
     def _images(self, names: Collection[str], make: Callable[..., Array]) -> layout.Images:
         """Images of these names made from their shapes, None for the others."""
@@ -289,13 +332,13 @@ class Pipeline(ABC):
     def _joined(self, images: layout.Images) -> Array:
         """The channels of a sweep from the images that hold them. [H, W, feature_channels]"""
         size = (self._grid.height, self._grid.width, -1)
-        parts = [getattr(images, name).reshape(size) for name in self.feature_images]
-        return np.concatenate(parts, axis=-1)[..., : self.feature_channels]
+        parts = [getattr(images, name).reshape(size) for name in self._primitive.feature_images]
+        return np.concatenate(parts, axis=-1)[..., : self._primitive.feature_channels]
 
     def _part_into(self, channels: Array, images: layout.Images) -> None:
         """Split at most as many channels into images; the inverse of :meth:`_joined`. [H, W, C]"""
         size, taken = (self._grid.height, self._grid.width, -1), 0
-        for name in self.feature_images:
+        for name in self._primitive.feature_images:
             image = getattr(images, name).reshape(size)
             part = channels[..., taken : taken + image.shape[2]]
             image[..., : part.shape[2]] = part
@@ -327,7 +370,7 @@ class Pipeline(ABC):
             ends=take("pair_ends", stretches, np.int64),
             tile_counts=take("tile_counts", stretches * grid.tiles, np.int32),
         )
-        circle = (0,) * self.circles
+        circle = layout.count(self._primitive.circle)
         run(binning.find_pairs, self._projections, self._view, grid, circle, bins.keys, pairs, bins.entry_counts)
         binning.place_entries(grid, pairs, bins)
         run(binning.sort_pairs, grid, pairs, bins)
@@ -343,17 +386,17 @@ class Pipeline(ABC):
         counts = self._projections.parcels[::2]
         lowest, highest = np.empty_like(counts), np.empty_like(counts)
         depth_bits = self._projections.depths.view(np.int32)
-        run(sorting.collect, depth_bits, self._projections.drawn, np.cumsum(counts) - counts, keys, lowest, highest)
+        run(binning.collect, depth_bits, self._projections.drawn, np.cumsum(counts) - counts, keys, lowest, highest)
         least = int(lowest.min())
         significant = (int(highest.max()) - least).bit_length()
-        passes = -(-significant // sorting.DIGIT_BITS)
-        digits = take("digits", run.workers * sorting.DIGITS, np.int32)
+        passes = -(-significant // binning.DIGIT_BITS)
+        digits = take("digits", run.workers * binning.DIGITS, np.int32)
         for turn in range(passes):
             width = -(-significant // passes)
             arguments = (run.workers, keys, least, turn * width, (1 << width) - 1, digits)
-            run(sorting.count_digits, *arguments)
-            sorting.place_digits(run.workers, (1 << width) - 1, digits)
-            run(sorting.move_by_digit, *arguments, moved)
+            run(binning.count_digits, *arguments)
+            binning.place_digits(run.workers, (1 << width) - 1, digits)
+            run(binning.move_by_digit, *arguments, moved)
             keys, moved = moved, keys
         return keys
 
@@ -362,55 +405,9 @@ class Pipeline(ABC):
         """Gaussians with the last group filled up."""
         return self._count + -self._count % layout.GROUP
 
-    def _composited_size(self, layer: Layer) -> int:
+    def _composited_size(self, outputs: layout.Outputs) -> int:
         """Numbers that a forward sweep leaves."""
-        return 16 * layout.BLOCKS * self._grid.tiles * self._composited_vectors(layer)
-
-
-class GaussianPipeline(Pipeline):
-    """Rendering of 3D Gaussians."""
-
-    kernels: ClassVar[Kernels] = Kernels(project, sweep_forward, sweep_backward, gather, project_backward)
-    scales: ClassVar[int] = 3
-    circles: ClassVar[bool] = False
-    constant_images: ClassVar[tuple[str, ...]] = ("median",)
-    first_channel: ClassVar[int] = layout.CHANNELS
-    first_channel_sum: ClassVar[int] = layout.SUM_CHANNELS
-    feature_channels: ClassVar[int] = layout.MAX_CHANNELS
-    feature_images: ClassVar[tuple[str, ...]] = ("rgb", "depth", "inverse_depth", "normals")
-    feature_own: ClassVar[layout.Extras] = layout.FEATURES
-
-    def _main_layer(self) -> Layer:
-        depth, inverse_depth, normals = (name in self._wanted for name in ("depth", "inverse_depth", "normals"))
-        extras = layout.Extras(depth, inverse_depth, normals, (0,) * ("median" in self._wanted))
-        channels = (0,) * (3 + depth + inverse_depth + 3 * normals)
-        return Layer(self._projections, self._view, channels, extras)
-
-
-class SurfelPipeline(Pipeline):
-    """Rendering of surfels, whose measures differ from pixel to pixel."""
-
-    kernels: ClassVar[Kernels] = Kernels(
-        project_surfels, surfel_sweep_forward, surfel_sweep_backward, gather_surfels, project_surfels_backward
-    )
-    scales: ClassVar[int] = 2
-    circles: ClassVar[bool] = True
-    constant_images: ClassVar[tuple[str, ...]] = ()
-    first_channel: ClassVar[int] = surfel_layout.CHANNELS
-    first_channel_sum: ClassVar[int] = surfel_layout.SUM_CHANNELS
-    feature_channels: ClassVar[int] = 3  # as colours alone, whose kernels serve
-    feature_images: ClassVar[tuple[str, ...]] = ("rgb",)
-    feature_own: ClassVar[surfel_layout.Measures] = surfel_layout.NOTHING
-
-    def _main_layer(self) -> Layer:
-        measures = surfel_layout.Measures(*((0,) * (name in self._wanted) for name in surfel_layout.Measures._fields))
-        channels = (0,) * (3 + 3 * ("normals" in self._wanted))
-        return Layer(self._projections, self._view, channels, measures)
-
-    def _composited_vectors(self, layer: Layer) -> int:
-        measures = layer.own
-        of_measures = len(measures.depth) + len(measures.inverse_depth) + 2 * len(measures.distortion)
-        return super()._composited_vectors(layer) + of_measures
+        return 16 * layout.BLOCKS * self._grid.tiles * tiles.composited_vectors(outputs)
 
 
 def _flat_images(images: layout.Images) -> layout.Images:

@@ -2,6 +2,13 @@
 
 ``gather`` adds up the entries of each Gaussian, tile by tile, and finds the derivative with respect to means2d;
 ``project_backward`` takes it from there through the formulas of ``docs/rendering.md``, section "Projection".
+
+Of surfels, with P = p + u a + v b the intersection of a ray with the disc's plane, (A, B, N) the functions of a ray in
+``geometry.Placed`` and (g_u, g_v, g_z) the derivatives with respect to u, v and z,
+
+    dL/dP = -(g_u A / s_u + g_v B / s_v - (g_u u + g_v v + g_z z) N)
+
+so the sums of ``layout``, of these three factors times 1, u and v, suffice for p, a and b.
 """
 
 from __future__ import annotations
@@ -14,25 +21,33 @@ from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.core.numba_kernels.threads import pieces
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, project_axes, shortest_axes, shortest_column
-from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
+from coliags_plugin.renderers.numba_kernels.binning import NUMBER
+from coliags_plugin.renderers.numba_kernels.geometry import (
+    camera_axes,
+    place_surfels,
+    project_axes,
+    shortest_axes,
+    shortest_column,
+)
 
-#: Turn products of two (or four) factors of the scaled U into those of the plain one.
+#: Turn products of one, two (or four) factors of the scaled U into those of the plain one.
+_PLAIN = 1.0 / layout.U_FACTOR
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
 _PLAIN_FOURTH = _PLAIN_SQUARE * _PLAIN_SQUARE
 #: Prefetch distance, Gaussians.
 _AHEAD = 16
 
 
-def gathering(of_center: Callable[..., tuple[float, float]], row_channels: int) -> Callable[..., None]:
-    """Compile the summing of the gradient sums of each Gaussian's entries, 0 where it is not drawn.
+def gathering(of_center: Callable[..., tuple[float, float]]) -> Callable[..., None]:
+    """Compile the kernel that adds up the sums of each Gaussian's entries, 0 where it is not drawn.
 
-    ``of_center`` gives the derivative with respect to the projected centre from the sums; with more than ``row_channels``
-    channels there is a seventeenth sum, of the last one.
+    It writes ``gaussian_sums`` and the derivative with respect to the projected centres.
+    ``of_center`` gives the derivative with respect to the projected centre from the sums; ``seventeen`` says whether there
+    is a seventeenth sum.
     """
 
-    @part
-    def gather_all(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d):
+    @kernel
+    def gather(counters, projections, bins, view, seventeen, entry_sums, gaussian_sums, of_means2d):
         groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
         records, entries_further, further = (
             projections.records,
@@ -47,7 +62,7 @@ def gathering(of_center: Callable[..., tuple[float, float]], row_channels: int) 
                 vec.store(gaussian_sums, layout.ROW * index, 0.0)
                 of_means2d[2 * index] = 0.0
                 of_means2d[2 * index + 1] = 0.0
-                if len(channels) > row_channels:
+                if seventeen:
                     gaussian_sums[further + index] = 0.0
         for stretch in pieces(counters, 1, stretches):
             first, last = count * stretch // stretches, count * (stretch + 1) // stretches
@@ -61,65 +76,66 @@ def gathering(of_center: Callable[..., tuple[float, float]], row_channels: int) 
                 total, last_total = vec.splat(0.0), np.float32(0.0)
                 for _ in range(bins.entry_counts[place]):
                     total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
-                    if len(channels) > row_channels:
+                    if seventeen:
                         last_total += vec.number(entry_sums, entries_further + entry)
                     entry += 1
                 vec.store(gaussian_sums, layout.ROW * index, total)
-                if len(channels) > row_channels:
+                if seventeen:
                     gaussian_sums[further + index] = last_total
                 of_means2d[2 * index], of_means2d[2 * index + 1] = of_center(total, records, layout.ROW * index, view)
 
-    return gather_all
+    return gather
+
+
+def projecting_backward(project_groups: Callable[..., tuple]) -> Callable[..., None]:
+    """Compile the kernel of the derivatives of the loss with respect to Gaussians and pose, from each Gaussian's sums.
+
+    ``channels`` is the number of channels composited; ``of_pose`` gets the derivatives with respect to the camera's three
+    axes and its centre in the world, one row for each parcel.
+
+    ``project_groups`` is the backward pass of a range of groups, and returns ``pose``, the derivatives with respect to the
+    camera's axes and centre, with those of these groups added.
+    """
+
+    @kernel
+    def project_backward(
+        counters, count, gaussians, tail, view, channels, projections, gaussian_sums, of_means2d, of_gaussians, of_pose
+    ):
+        whole_groups = count // layout.GROUP
+        per_parcel = layout.PARCEL // layout.GROUP
+        for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
+            first = parcel * per_parcel
+            last = min(first + per_parcel, whole_groups)
+            pose = project_groups(
+                first, last, first, vec.repeat(0.0, (0,) * 12), gaussians, view, channels, projections, gaussian_sums,
+                of_means2d, of_gaussians,
+            )  # fmt: skip
+            if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
+                pose = project_groups(
+                    last, last + 1, 0, pose, tail, view, channels, projections, gaussian_sums, of_means2d, of_gaussians
+                )
+            vec.store(of_pose, layout.ROW * parcel, vec.lane_sums(pose))
+
+    return project_backward
+
+
+# --- 3D Gaussians -----------------------------------------------------------------------------------------------------
 
 
 @inline
-def _of_center(total, records, row, view):
-    """Derivative with respect to a projected centre."""
+def _of_gaussian_center(total, records, row, view):
+    """Derivative with respect to the projected centre of a 3D Gaussian."""
     square = np.float32(_PLAIN_SQUARE)
     e, f = vec.lane(total, layout.SUM_E), vec.lane(total, layout.SUM_F)
     of_x = vec.number(records, row + layout.U_XX) * e + vec.number(records, row + layout.U_YX) * f
     return square * of_x, square * (vec.number(records, row + layout.U_YY) * f)
 
 
-_gather = gathering(_of_center, layout.ROW - layout.SUM_CHANNELS)
-
-
-@kernel
-def gather(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d):
-    """Write ``gaussian_sums`` and the derivative with respect to the projected centres."""
-    _gather(counters, projections, bins, view, channels, entry_sums, gaussian_sums, of_means2d)
-
-
-@kernel
-def project_backward(
-    counters, count, gaussians, tail, view, channels, extras, projections, gaussian_sums, given_means2d, of_gaussians,
-    of_pose,
-):  # fmt: skip
-    """Derivatives of the loss with respect to Gaussians and pose, from the sums of each Gaussian.
-
-    ``of_pose`` gets those with respect to the camera's three axes and its centre in the world, one row for each parcel.
-    """
-    whole_groups = count // layout.GROUP
-    per_parcel = layout.PARCEL // layout.GROUP
-    for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
-        first = parcel * per_parcel
-        last = min(first + per_parcel, whole_groups)
-        pose = _project_groups_backward(
-            first, last, first, vec.repeat(0.0, (0,) * 12), gaussians, view, extras, projections, gaussian_sums,
-            given_means2d, of_gaussians,
-        )  # fmt: skip
-        if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-            pose = _project_groups_backward(
-                last, last + 1, 0, pose, tail, view, extras, projections, gaussian_sums, given_means2d, of_gaussians
-            )
-        vec.store(of_pose, layout.ROW * parcel, vec.lane_sums(pose))
-
-
 @part
-def _project_groups_backward(
-    first, last, source, pose, gaussians, view, extras, projections, gaussian_sums, given_means2d, of_gaussians
+def _project_gaussians_backward(
+    first, last, source, pose, gaussians, view, channels, projections, gaussian_sums, given_means2d, of_gaussians
 ):
-    """Groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on. Returns ``pose``, added to."""
+    """Groups of 3D Gaussians: see :func:`projecting_backward`."""
     three = (0, 0, 0)
     right, down, forward = camera_axes(view)
     fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
@@ -162,14 +178,16 @@ def _project_groups_backward(
         of_y = vec.mul(vec.fma(fy, by_y, of_slope_y), at.inverse_z)
         lost = vec.fma(of_x, at.x, vec.mul(of_y, at.y))
         lost = vec.dot(at.image_x, of_image_x, vec.dot(at.image_y, of_image_y, lost))
-        of_depth, of_inverse_depth, of_normal = _extra_sums(sums, extras)
+        of_depth = sums[layout.SUM_CHANNELS + 3] if channels > 3 else vec.splat(0.0)
+        of_inverse_depth = sums[layout.SUM_CHANNELS + 4] if channels > 4 else vec.splat(0.0)
         lost = vec.fma(of_inverse_depth, at.inverse_z, lost)
         of_z = vec.sub(of_depth, vec.mul(lost, at.inverse_z))
 
-        if extras.normals:
+        if channels > 5:
             # The normal is a column of R, turned by its sign, in camera axes.
             second, third = shortest_axes(scale)
             axis = shortest_column(at.rotation, second, third)
+            of_normal = (sums[layout.SUM_CHANNELS + 5], sums[layout.SUM_CHANNELS + 6], sums[layout.SUM_CHANNELS + 7])
             of_normal = vec.mul(vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), -1.0, 1.0), of_normal)
             of_axis = vec.fma(of_normal[0], right, vec.fma(of_normal[1], down, vec.mul(of_normal[2], forward)))
             chosen = vec.select(third, (0.0, 0.0, 1.0), vec.select(second, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
@@ -184,7 +202,7 @@ def _project_groups_backward(
         of_down = vec.add(of_down, vec.select(shown, vec.fma(of_y, at.offset, to_down), nothing))
         of_forward = vec.add(of_forward, vec.select(shown, vec.fma(of_z, at.offset, to_forward), nothing))
 
-        of_quat = quaternion_derivative(at, of_a, of_b, of_c)
+        of_quat = _quaternion_derivative(at, of_a, of_b, of_c)
         of_color = (sums[layout.SUM_CHANNELS], sums[layout.SUM_CHANNELS + 1], sums[layout.SUM_CHANNELS + 2])
         vec.store_columns(of_gaussians.means, 3 * row, of_mean)
         vec.store_columns(of_gaussians.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
@@ -208,20 +226,7 @@ def _covariance_derivative(record, sums):
 
 
 @inline
-def _extra_sums(sums, extras):
-    """The sums of depth, inverse depth and normal, stored consecutively after those of colour."""
-    zero = vec.splat(0.0)
-    if extras.depth:
-        if extras.inverse_depth:
-            return sums[9], sums[10], (sums[11], sums[12], sums[13])
-        return sums[9], zero, (sums[10], sums[11], sums[12])
-    if extras.inverse_depth:
-        return zero, sums[9], (sums[10], sums[11], sums[12])
-    return zero, zero, (sums[9], sums[10], sums[11])
-
-
-@inline
-def quaternion_derivative(at, a, b, c):
+def _quaternion_derivative(at, a, b, c):
     """Derivative with respect to the quaternion given, w first, from that with respect to the rows of its rotation."""
     w, x, y, z = at.quaternion
     turn_x, turn_y, turn_z = vec.sub(c[1], b[2]), vec.sub(a[2], c[0]), vec.sub(b[0], a[1])
@@ -239,3 +244,106 @@ def quaternion_derivative(at, a, b, c):
     # The length does not matter.
     along = vec.dot(of_unit, at.quaternion, 0.0)
     return vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_unit))
+
+
+# --- surfels ----------------------------------------------------------------------------------------------------------
+
+
+@inline
+def _of_surfel_center(total, records, row, view):
+    """Derivative with respect to the projected centre of a surfel."""
+    scale, square = vec.number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
+    e, f = square * vec.lane(total, layout.SUM_E), square * vec.lane(total, layout.SUM_F)
+    c = vec.lane(total, layout.SUM_C)
+    of_x = vec.number(records, row + layout.SURFEL_U_X) * e + vec.number(records, row + layout.SURFEL_V_X) * f
+    of_y = vec.number(records, row + layout.SURFEL_U_Y) * e + vec.number(records, row + layout.SURFEL_V_Y) * f
+    of_x, of_y = (
+        of_x + vec.number(records, row + layout.SURFEL_Q_X) * c,
+        of_y + vec.number(records, row + layout.SURFEL_Q_Y) * c,
+    )
+    return scale * of_x, scale * of_y
+
+
+@part
+def _project_surfels_backward(
+    first, last, source, pose, surfels, view, channels, projections, surfel_sums, given_means2d, of_surfels
+):
+    """Groups of surfels: see :func:`projecting_backward`."""
+    drawn = projections.drawn
+    three = (0, 0, 0)
+    right, down, forward = camera_axes(view)
+    fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
+    filtered = vec.mul(_PLAIN_SQUARE, vec.broadcast(view, layout.VIEW_PIXEL_SCALE))
+    of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
+    nothing, channel = vec.repeat(0.0, three), layout.SURFEL_SUM_CHANNELS
+    for group in range(first, last):
+        shown = vec.from_bits(drawn[group])
+        row = layout.GROUP * (group - first + source)
+        mean, scale = vec.load_columns(surfels.means, 3 * row, three), vec.load_columns(surfels.scales, 2 * row, (0, 0))
+        quat, opacity = vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), vec.load(surfels.opacities, row)
+        at = place_surfels(mean, quat, view)
+        row = layout.GROUP * group
+        sums = vec.load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
+        by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
+
+        # The filter's centre moves with the surfel, and is no part of the derivative with respect to means2d.
+        by_x = vec.fma(filtered, sums[layout.SUM_DX], by_x)
+        by_y = vec.fma(filtered, sums[layout.SUM_DY], by_y)
+        of_x, of_y = vec.mul(vec.mul(fx, by_x), at.inverse_z), vec.mul(vec.mul(fy, by_y), at.inverse_z)
+        lost = vec.fma(of_x, at.x, vec.mul(of_y, at.y))
+        of_z = vec.mul(vec.sub(sums[layout.SUM_C], lost), at.inverse_z)
+
+        ee, ef, ff = vec.mul(
+            _PLAIN_SQUARE,
+            vec.widen((sums[layout.SUM_EE], sums[layout.SUM_EF], sums[layout.SUM_FF])),
+        )
+        ce, cf = vec.mul(vec.mul(_PLAIN, vec.widen((sums[layout.SUM_CE], sums[layout.SUM_CF]))), scale)
+        ratio = vec.div(vec.widen(scale[0]), scale[1])
+        of_scale = vec.narrow((vec.div(ee, scale[0]), vec.div(ff, scale[1])))
+        of_first = vec.fma(ee, at.of_first, vec.fma(vec.mul(ef, ratio), at.of_second, vec.mul(ce, at.of_z)))
+        of_second = vec.fma(vec.div(ef, ratio), at.of_first, vec.fma(ff, at.of_second, vec.mul(cf, at.of_z)))
+        of_normal = vec.mul(0.0, at.normal)
+        if channels > 3:
+            # In camera axes, turned by its sign.
+            further = layout.ROW * layout.GROUP * len(drawn) + row  # the last sum is behind the rows of sixteen
+            given = (sums[channel + 3], sums[channel + 4], vec.load(surfel_sums, further))
+            given = vec.mul(vec.select(vec.greater(at.height, 0.0), -1.0, 1.0), given)
+            of_normal = vec.fma(given[0], right, vec.fma(given[1], down, vec.mul(vec.widen(given[2]), forward)))
+
+        of_right = _turned(of_right, right, at, of_x, of_first, of_second, of_normal, shown)
+        of_down = _turned(of_down, down, at, of_y, of_first, of_second, of_normal, shown)
+        of_forward = _turned(of_forward, forward, at, of_z, of_first, of_second, of_normal, shown)
+        of_mean = vec.narrow(vec.fma(of_x, right, vec.fma(of_y, down, vec.mul(of_z, forward))))
+        of_mean = vec.select(shown, of_mean, nothing)
+        of_center = vec.sub(of_center, of_mean)
+
+        a = (of_first[0], of_second[0], of_normal[0])
+        b = (of_first[1], of_second[1], of_normal[1])
+        c = (of_first[2], of_second[2], of_normal[2])
+        of_quat = vec.narrow(_quaternion_derivative(at, a, b, c))
+        of_color = (sums[channel], sums[channel + 1], sums[channel + 2])
+        vec.store_columns(of_surfels.means, 3 * row, of_mean)
+        vec.store_columns(of_surfels.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
+        vec.store_columns(of_surfels.scales, 2 * row, vec.select(shown, of_scale, vec.repeat(0.0, (0, 0))))
+        vec.store(of_surfels.opacities, row, vec.select(shown, vec.div(sums[layout.SUM_V], opacity), 0.0))
+        vec.store_columns(of_surfels.colors, 3 * row, vec.select(shown, of_color, nothing))
+    return of_right + of_down + of_forward + of_center
+
+
+@inline
+def _turned(total, axis, at, of_offset, of_first, of_second, of_normal, shown):
+    """Derivative with respect to one of the camera's axes, added to ``total``.
+
+    All depend on this axis by the products with it of offset and local axes, whose derivatives are ``of_offset`` and the
+    products of the axis with those of the local axes.
+    """
+    change = vec.mul(of_offset, at.offset)
+    change = vec.fma(vec.dot(axis, of_first, 0.0), at.first, change)
+    change = vec.fma(vec.dot(axis, of_second, 0.0), at.second, change)
+    change = vec.narrow(vec.fma(vec.dot(axis, of_normal, 0.0), at.normal, change))
+    return vec.add(total, vec.select(shown, change, (0.0, 0.0, 0.0)))
+
+
+gather, gather_surfels = gathering(_of_gaussian_center), gathering(_of_surfel_center)
+project_backward = projecting_backward(_project_gaussians_backward)
+project_surfels_backward = projecting_backward(_project_surfels_backward)

@@ -1,13 +1,12 @@
-"""Tile handling of both sweeps: position, processing order, and fetching of its Gaussians."""
+"""Tile handling of both sweeps: position, processing order, fetching of its Gaussians or surfels, and copies of pixels."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import inline, part
+from coliags_plugin.core.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels import layout
 
 #: Entries of a tile fetched at a time: their rows fit into the first-level cache beside the blocks' state.
@@ -15,21 +14,55 @@ CHUNK = 128
 #: Prefetch distance of records, entries.
 _AHEAD = 32
 #: Prefetch distance of the memory of the sums, entries.
-_SUMS_AHEAD = 12
+SUMS_AHEAD = 12
 
-# The first vectors of a block in the forward sweeps.
-TRANSMITTANCE = 0
-ALPHA = 16
-
-# A fetched row is one of ``records`` with other columns where that holds the centre and a slope: with (x, y) counted
-# from the middle of the tile e = U_XX x + OFFSET_E and f = U_YX x + U_YY y + OFFSET_F.
+# A fetched row of a 3D Gaussian is one of ``records`` with other columns where that holds the centre and a slope: with
+# (x, y) counted from the middle of the tile e = U_XX x + OFFSET_E and f = U_YX x + U_YY y + OFFSET_F.
 OFFSET_E = layout.MEAN_X
 OFFSET_F = layout.MEAN_Y
 MEDIAN_DEPTH = layout.SLOPE_UPRIGHT
 
+# A fetched row of a surfel is one of ``records`` with the centre from the middle of the tile, in scaled pixels, and two
+# more columns: 1 / SURFEL_DEPTH, and the largest q, where the disc is at the near plane.
+INVERSE_DEPTH = layout.ROW
+LARGEST_Q = layout.ROW + 1
+FETCHED_SURFEL = layout.ROW + 4
+
+# The vectors of a block: its state in a sweep, and the pixels of images, or the derivatives with respect to them.
+TRANSMITTANCE = 0
+ALPHA = 16
+CHANNELS = 32  # colour; of 3D Gaussians with what follows
+DEPTH = 80
+INVERSE = 96
+NORMALS = 112
+MEDIAN = 160
+EXPECTED = 176
+DISTORTION = 192
+FURTHER = 208  # what only one of the sweeps needs
+STATE = 272
+
+#: Scratch of one thread: rows of a chunk, states of a tile's blocks.
+NUMBERS = CHUNK * FETCHED_SURFEL + layout.BLOCKS * STATE
+#: Scratch of one thread: blocks of a chunk's entries, entries of a tile's blocks, and how many.
+INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
+
+
+@inline
+def of_thread(counters, scratch):
+    """The thread's rows, states and integers, which are taken by the second counter."""
+    thread = take(counters, 1, 1)
+    rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
+    return rows, rows[CHUNK * FETCHED_SURFEL :], scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
+
+
+def composited_vectors(outputs: layout.Outputs) -> int:
+    """Vectors that a forward sweep leaves of each block: alpha, sums over what is composited, and the distortion's."""
+    measures = len(outputs.normals) + len(outputs.depth) + len(outputs.inverse_depth) + 2 * len(outputs.distortion)
+    return 1 + len(outputs.channels) + measures
+
 
 @part
-def fetch_chunk(first, last, alive, corner_x, corner_y, projections, cells, rows, blocks):
+def fetch_gaussians(first, last, alive, corner_x, corner_y, projections, view, cells, rows, blocks):
     """Fetch the rows of entries ``first`` to ``last`` of a tile, and the alive blocks that each touches.
 
     ``alive`` has one bit for each block with transmittance left; the corner is the first pixel of the tile.
@@ -50,6 +83,53 @@ def fetch_chunk(first, last, alive, corner_x, corner_y, projections, cells, rows
             rows[target + OFFSET_E] = -vec.number(records, source + layout.U_XX) * x
             rows[target + OFFSET_F] = -turned
             rows[target + MEDIAN_DEPTH] = vec.number(projections.depths, index)
+
+
+@part
+def fetch_surfels(first, last, alive, corner_x, corner_y, projections, view, cells, rows, blocks):
+    """As :func:`fetch_gaussians`."""
+    records, remainders = projections.records, projections.remainders
+    scale, near = vec.number(view, layout.VIEW_PIXEL_SCALE), vec.number(view, layout.VIEW_NEAR)
+    middle_x, middle_y = np.float32(corner_x + layout.TILE // 2), np.float32(corner_y + layout.TILE // 2)
+    for entry in range(first, last):
+        ahead = cells[layout.CELL * min(entry + _AHEAD, last - 1)]
+        vec.prefetch(records, layout.ROW * ahead)
+        vec.prefetch(remainders, 2 * ahead)
+        index = cells[layout.CELL * entry]
+        mine = cells[layout.CELL * entry + 1] & alive
+        blocks[entry - first] = mine
+        if mine:
+            source, target = layout.ROW * index, FETCHED_SURFEL * (entry - first)
+            vec.store(rows, target, vec.load(records, source))
+            x = vec.number(records, source + layout.SURFEL_MEAN_X) - middle_x + vec.number(remainders, 2 * index)
+            y = vec.number(records, source + layout.SURFEL_MEAN_Y) - middle_y + vec.number(remainders, 2 * index + 1)
+            rows[target + layout.SURFEL_MEAN_X], rows[target + layout.SURFEL_MEAN_Y] = scale * x, scale * y
+            depth = vec.number(records, source + layout.SURFEL_DEPTH)
+            rows[target + INVERSE_DEPTH] = np.float32(1.0) / depth
+            rows[target + LARGEST_Q] = min(depth / near, np.float32(layout.LARGE))
+
+
+@inline
+def scaled_pixels(block, view):
+    """Columns and rows of a block's pixel centres from the middle of its tile, in scaled pixels."""
+    return vec.mul(vec.broadcast(view, layout.VIEW_PIXEL_SCALE), block_pixels(block))
+
+
+@inline
+def intersect(rows, row, x, y):
+    """Intersect the rays of pixels with the disc of a fetched row.
+
+    Returns the offset from the projected centre, scaled pixels; q, 1 / q, e and f of ``surfel_layout``; and where the ray
+    hits the disc's plane beyond the near plane: elsewhere all but the offset are 0.
+    """
+    u_x, u_y, v_x, v_y, q_x, q_y = vec.broadcast_all(rows, row + layout.SURFEL_U_X, (0,) * 6)
+    d_x = vec.sub(x, vec.broadcast(rows, row + layout.SURFEL_MEAN_X))
+    d_y = vec.sub(y, vec.broadcast(rows, row + layout.SURFEL_MEAN_Y))
+    q = vec.fma(q_x, d_x, vec.fma(q_y, d_y, 1.0))
+    hit = vec.both(vec.greater(q, 0.0), vec.at_most(q, vec.broadcast(rows, row + LARGEST_Q)))
+    inverse_q = vec.select(hit, vec.quick_div(1.0, q), 0.0)
+    e, f = vec.fma(u_x, d_x, vec.mul(u_y, d_y)), vec.fma(v_x, d_x, vec.mul(v_y, d_y))
+    return d_x, d_y, vec.select(hit, q, 0.0), inverse_q, vec.mul(e, inverse_q), vec.mul(f, inverse_q), hit
 
 
 @inline
@@ -81,9 +161,9 @@ def inside(block, across, down):
 
 
 @inline
-def place_in_blocks(x, y, stride):
-    """Index of pixel (x, y) of a tile in vectors of its blocks that are ``stride`` apart."""
-    return stride * (4 * (y >> 2) + (x >> 2)) + 4 * (y & 3) + (x & 3)
+def place_in_blocks(x, y):
+    """Index of pixel (x, y) of a tile in vectors of its blocks."""
+    return STATE * (4 * (y >> 2) + (x >> 2)) + 4 * (y & 3) + (x & 3)
 
 
 @part
@@ -106,97 +186,60 @@ def list_by_block(count, stride, blocks, listed, counts):
         counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
-def tile_sweep(fetch: Callable[..., None], sweep_block: Callable[..., int], row: int, size: int) -> Callable[..., int]:
-    """Compile a forward sweep through one tile's entries; it leaves the pixels in ``state``, and returns where it stopped.
+@part
+def copy_to_images(tile, grid, state, images):
+    """Copy the pixels of a tile from its blocks to the images that are not empty."""
+    for channel in range(3):
+        _copy_to_image(CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
+        _copy_to_image(NORMALS + 16 * channel, state, tile, grid, 3, channel, images.normals)
+    for vector, image in (
+        (ALPHA, images.alpha),
+        (DEPTH, images.depth),
+        (INVERSE, images.inverse_depth),
+        (MEDIAN, images.median),
+        (EXPECTED, images.expected),
+        (DISTORTION, images.distortion),
+    ):
+        _copy_to_image(vector, state, tile, grid, 1, 0, image)
 
-    ``fetch`` is as :func:`fetch_chunk`; ``sweep_block`` composites the rows listed into one block and returns whether any
-    pixel has transmittance left. A fetched row has ``row`` numbers, a block's vectors ``size``.
-    """
 
-    @part
-    def sweep_tile(tile, source, bins, view, grid, channels, own, rows, state, blocks):
+@part
+def _copy_to_image(vector, state, tile, grid, depth, channel, image):
+    """Copy a vector of a tile's blocks to one of the ``depth`` channels of an image."""
+    if len(image):
         corner_x, corner_y, across, down = tile_corner(tile, grid)
-        listed = blocks[CHUNK:]
-        counts = listed[layout.BLOCKS * CHUNK :]
-        alive = 0
-        for block in range(layout.BLOCKS):
-            at, pixels = size * block, inside(block, across, down)
-            vec.store(state, at + TRANSMITTANCE, vec.select(pixels, 1.0, 0.0))
-            for vector in range(ALPHA, size, 16):
-                vec.store(state, at + vector, 0.0)
-            if vec.bits(pixels):
-                alive |= 1 << block
-        first, last = bins.starts[tile], bins.starts[tile + 1]
-        while first < last and alive:
-            end = min(first + CHUNK, last)
-            fetch(first, end, alive, corner_x, corner_y, source, bins.cells, rows, blocks)
-            list_by_block(end - first, row, blocks, listed, counts)
-            for block in range(layout.BLOCKS):
-                count = counts[block]
-                if count and not sweep_block(block, count, listed[CHUNK * block :], rows, channels, own, view, state):
-                    alive &= ~(1 << block)
-            first = end
-        return first
-
-    return sweep_tile
+        for y in range(down):
+            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+            for x in range(across):
+                image[first + x * depth] = vec.number(state, vector + place_in_blocks(x, y))
 
 
-def tile_sweep_backward(fetch: Callable[..., None], sweep_entry: Callable[..., int], row: int) -> Callable[..., None]:
-    """Compile a backward sweep through those of one tile's entries that were reached; arguments as of :func:`tile_sweep`.
+@part
+def copy_from_images(tile, grid, images, state):
+    """Copy the pixels of a tile from the images that are not empty to its blocks."""
+    for channel in range(3):
+        _copy_from_image(images.rgb, 3, channel, tile, grid, CHANNELS + 16 * channel, state)
+        _copy_from_image(images.normals, 3, channel, tile, grid, NORMALS + 16 * channel, state)
+    for image, vector in (
+        (images.alpha, ALPHA),
+        (images.depth, DEPTH),
+        (images.inverse_depth, INVERSE),
+        (images.median, MEDIAN),
+        (images.expected, EXPECTED),
+        (images.distortion, DISTORTION),
+    ):
+        _copy_from_image(image, 1, 0, tile, grid, vector, state)
 
-    ``sweep_entry`` accumulates one entry's sums over its blocks and returns the blocks with transmittance left.
-    """
 
-    @part
-    def sweep_tile(tile, source, bins, view, grid, channels, own, rows, state, blocks, entry_sums):
+@part
+def _copy_from_image(image, depth, channel, tile, grid, vector, state):
+    """Copy one of the ``depth`` channels of an image to a vector of a tile's blocks."""
+    if len(image):
         corner_x, corner_y, across, down = tile_corner(tile, grid)
-        cells, further = bins.cells, layout.ROW * bins.starts[grid.tiles]
-        alive = 0
-        for block in range(layout.BLOCKS):
-            if vec.bits(inside(block, across, down)):
-                alive |= 1 << block
-        first, last = bins.starts[tile], bins.reached[tile]
-        while first < last:
-            end = min(first + CHUNK, last)
-            fetch(first, end, alive, corner_x, corner_y, source, cells, rows, blocks)
-            for entry in range(first, end):
-                ahead = cells[layout.CELL * min(entry + _SUMS_AHEAD, last - 1) + 2]
-                vec.prefetch_to_write(entry_sums, layout.ROW * ahead)
-                fetched, mine = row * (entry - first), blocks[entry - first] & alive
-                number = cells[layout.CELL * entry + 2]
-                target, beyond = layout.ROW * number, further + number
-                alive = sweep_entry(fetched, mine, alive, rows, channels, own, view, state, target, beyond, entry_sums)
-            first = end
-
-    return sweep_tile
-
-
-def image_copies(stride: int) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Compile what copies a vector of a tile's blocks to one of the ``depth`` channels of an image, and the opposite.
-
-    The vectors of the blocks are ``stride`` numbers apart: a constant, for speed. Nothing is copied to or from an empty
-    image.
-    """
-
-    @part
-    def to_image(vector, state, tile, grid, depth, channel, image):
-        if len(image):
-            corner_x, corner_y, across, down = tile_corner(tile, grid)
-            for y in range(down):
-                first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-                for x in range(across):
-                    image[first + x * depth] = vec.number(state, vector + place_in_blocks(x, y, stride))
-
-    @part
-    def from_image(image, depth, channel, tile, grid, vector, state):
-        if len(image):
-            corner_x, corner_y, across, down = tile_corner(tile, grid)
-            for y in range(down):
-                first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-                for x in range(across):
-                    state[vector + place_in_blocks(x, y, stride)] = vec.number(image, first + x * depth)
-
-    return to_image, from_image
+        for y in range(down):
+            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+            for x in range(across):
+                state[vector + place_in_blocks(x, y)] = vec.number(image, first + x * depth)
 
 
 @part
