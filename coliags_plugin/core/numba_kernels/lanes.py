@@ -13,9 +13,10 @@ so what is compiled has no loop over them. Tables are flat, contiguous float32 a
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 from llvmlite import ir
 from numba.core import types
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
 
 #: Signature of an intrinsic and what builds its instructions; None where it does not take such operands.
 Intrinsic: TypeAlias = "tuple[Signature, Callable[..., ir.Value]] | None"
-
-#: What an intrinsic is called with.
-Values: TypeAlias = Sequence[ir.Value]
 
 #: Numbers in a vector; pixels of a block.
 WIDTH = 16
@@ -117,61 +115,6 @@ def _repeat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
     return _shuffle(builder, first, first, [0] * WIDTH)
 
 
-def _is_scalar(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, (types.Integer, types.Float))
-
-
-def _is_numeric(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, (Lanes, DoubleLanes)) or _is_scalar(numba_type)
-
-
-def _elements(operands: Sequence[types.Type]) -> list[types.Type]:
-    """The types of all operands, of the elements where they are tuples."""
-    return [kind for given in operands for kind in (given if isinstance(given, types.BaseTuple) else [given])]
-
-
-def _result_type(operands: Sequence[types.Type]) -> types.Type:
-    """Double lanes where any operand is of them."""
-    return double_lanes if any(isinstance(kind, DoubleLanes) for kind in _elements(operands)) else lanes
-
-
-def _as_lanes(builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, kind: types.Type = lanes) -> ir.Value:
-    """A number or lanes, as lanes or double lanes."""
-    wide = isinstance(kind, DoubleLanes)
-    if isinstance(numba_type, Lanes):
-        return builder.fpext(value, _DOUBLES) if wide else value
-    if isinstance(numba_type, DoubleLanes):
-        return value
-    scalar = ir.DoubleType() if wide else _FLOAT
-    if isinstance(numba_type, types.Integer):
-        value = builder.sitofp(value, scalar)
-    elif wide and numba_type.bitwidth < 64:
-        value = builder.fpext(value, scalar)
-    elif not wide and numba_type.bitwidth > 32:
-        value = builder.fptrunc(value, scalar)
-    return _repeat(builder, value)
-
-
-def _is_table(numba_type: types.Type) -> bool:
-    kind = (types.float32, 1, "C")
-    return isinstance(numba_type, types.Array) and (numba_type.dtype, numba_type.ndim, numba_type.layout) == kind
-
-
-def _tuple_length(operands: Sequence[types.Type]) -> int | None:
-    """The common length of those operands that are tuples; None where none is, or they do not fit together."""
-    lengths = {len(operand) for operand in operands if isinstance(operand, types.BaseTuple)}
-    return lengths.pop() if len(lengths) == 1 else None
-
-
-def _element(
-    builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, index: int, kind: types.Type = lanes
-) -> ir.Value:
-    """One element of a tuple, or what stands for all of them, as lanes or double lanes."""
-    if isinstance(numba_type, types.BaseTuple):
-        return _as_lanes(builder, builder.extract_value(value, index), numba_type[index], kind)
-    return _as_lanes(builder, value, numba_type, kind)
-
-
 def _pack(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
     """LLVM's form of numba's tuple of lanes."""
     kind = vectors[0].type if vectors else _LANES
@@ -181,20 +124,14 @@ def _pack(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
     return packed
 
 
-def _tuple_of_lanes(length: int) -> types.Type:
-    return types.UniTuple(lanes, length)
+def _at(builder: ir.IRBuilder, table: ir.Value, index: ir.Value, form: ir.Type = _LANES) -> ir.Value:
+    """Address of what lies at ``table[index]``."""
+    return builder.bitcast(builder.gep(table, [index]), form.as_pointer())
 
 
-def _address(
-    context: BaseContext,
-    builder: ir.IRBuilder,
-    table_type: types.Type,
-    table: ir.Value,
-    index: ir.Value,
-    kind: ir.Type = _LANES,
-) -> ir.Value:
-    data = context.make_array(table_type)(context, builder, table).data
-    return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
+def _successive(builder: ir.IRBuilder, address: ir.Value, count: int) -> list[ir.Value]:
+    """An address and the next ones, as far apart as what it is of."""
+    return [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(count)]
 
 
 def _read(builder: ir.IRBuilder, address: ir.Value) -> ir.Value:
@@ -207,151 +144,263 @@ def _write(builder: ir.IRBuilder, value: ir.Value, address: ir.Value) -> None:
     builder.store(value, address).align = 4
 
 
-def _lanewise(
-    name: str, arity: int, emit: Callable[..., ir.Value], result: types.Type | None = None
-) -> Callable[..., Intrinsic]:
-    """An operation on numbers, lane by lane; ``name`` is for error messages.
+def _write_all(builder: ir.IRBuilder, values: Sequence[ir.Value], addresses: Sequence[ir.Value]) -> None:
+    for value, address in zip(values, addresses, strict=True):
+        _write(builder, value, address)
 
-    ``emit`` gets the builder and one vector for each operand, and gives that of the result, whose type (of one element where
-    operands are tuples) is ``result``, None for that of the operands.
+
+# --- operands ---------------------------------------------------------------------------------------------------------
+
+
+def _is_scalar(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, (types.Integer, types.Float))
+
+
+def _is_numeric(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, (Lanes, DoubleLanes)) or _is_scalar(numba_type)
+
+
+def _is_tuple(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, types.BaseTuple)
+
+
+def _is_table(numba_type: types.Type) -> bool:
+    kind = (types.float32, 1, "C")
+    return isinstance(numba_type, types.Array) and (numba_type.dtype, numba_type.ndim, numba_type.layout) == kind
+
+
+def _is_integers(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, types.Array) and numba_type.dtype == types.int64 and numba_type.ndim == 1
+
+
+def _elements(operands: Sequence[types.Type]) -> list[types.Type]:
+    """The types of all operands, of the elements where they are tuples."""
+    return [kind for operand in operands for kind in (operand if _is_tuple(operand) else [operand])]
+
+
+def _common_type(operands: Sequence[types.Type]) -> types.Type:
+    """Double lanes where any operand is of them."""
+    return double_lanes if any(isinstance(kind, DoubleLanes) for kind in _elements(operands)) else lanes
+
+
+def _tuple_length(operands: Sequence[types.Type]) -> int | None:
+    """The common length of those operands that are tuples; None where none is, or they do not fit together."""
+    lengths = {len(operand) for operand in operands if _is_tuple(operand)}
+    return lengths.pop() if len(lengths) == 1 else None
+
+
+def _as_lanes(builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, kind: types.Type = lanes) -> ir.Value:
+    """A number or lanes, as lanes or double lanes; a mask as it is."""
+    wide = isinstance(kind, DoubleLanes)
+    if isinstance(numba_type, Lanes):
+        return builder.fpext(value, _DOUBLES) if wide else value
+    if isinstance(numba_type, (DoubleLanes, LaneMask)):
+        return value
+    scalar = ir.DoubleType() if wide else _FLOAT
+    if isinstance(numba_type, types.Integer):
+        value = builder.sitofp(value, scalar)
+    elif wide and numba_type.bitwidth < 64:
+        value = builder.fpext(value, scalar)
+    elif not wide and numba_type.bitwidth > 32:
+        value = builder.fptrunc(value, scalar)
+    return _repeat(builder, value)
+
+
+def _element(
+    builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, index: int, kind: types.Type = lanes
+) -> ir.Value:
+    """One element of a tuple, or what stands for all of them, as lanes or double lanes."""
+    if _is_tuple(numba_type):
+        return _as_lanes(builder, builder.extract_value(value, index), numba_type[index], kind)
+    return _as_lanes(builder, value, numba_type, kind)
+
+
+class Operand(NamedTuple):
+    """A kind of operand.
+
+    Attributes:
+        accepts: Whether an operand may be of a type.
+        form: What ``emit`` gets of it, from context, builder, value and type.
+        passed: The type that it is converted to; None: as it is.
     """
 
-    def typed(*operands: types.Type) -> ir.Value:
-        length = _tuple_length(operands)
-        if any(isinstance(operand, types.BaseTuple) for operand in operands) != (length is not None):
-            return None
-        if not all(_is_numeric(kind) for kind in _elements(operands)):
-            return None
-        kind = _result_type(operands)
+    accepts: Callable[[types.Type], bool]
+    form: Callable[[BaseContext, ir.IRBuilder, ir.Value, types.Type], Any]
+    passed: types.Type | None = None
 
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            pairs = list(zip(arguments, signature.args, strict=True))
+
+def _data(context: BaseContext, builder: ir.IRBuilder, value: ir.Value, kind: types.Type) -> ir.Value:
+    return context.make_array(kind)(context, builder, value).data
+
+
+def _value(context: BaseContext, builder: ir.IRBuilder, value: ir.Value, kind: types.Type) -> ir.Value:
+    return value
+
+
+#: A table of float32, or of int64: the address of its first number.
+TABLE, INTEGERS = Operand(_is_table, _data), Operand(_is_integers, _data)
+#: A place in a table, and another integer.
+INDEX = Operand(lambda kind: isinstance(kind, types.Integer), _value, types.intp)
+INTEGER = INDEX._replace(passed=types.int64)
+#: One or sixteen numbers: lanes.
+NUMBERS = Operand(_is_numeric, lambda context, builder, value, kind: _as_lanes(builder, value, kind))
+#: Sixteen numbers, or truth values.
+VECTOR, MASK = (Operand(lambda kind, of=of: isinstance(kind, of), _value) for of in (Lanes, LaneMask))
+#: A tuple of vectors: a list of lanes.
+VECTORS = Operand(
+    _is_tuple,
+    lambda context, builder, value, kind: [_element(builder, value, kind, place) for place in range(len(kind))],
+)
+#: Result of an operation: a tuple of lanes, as long as the operand of kind :data:`LENGTH`.
+AS_LONG = object()
+#: A tuple of which the length counts.
+LENGTH = Operand(_is_tuple, lambda context, builder, value, kind: len(kind))
+
+
+def _intrinsic(emit: Callable[..., Any], name: str, typed: Callable[..., Intrinsic]) -> Any:
+    """Make an intrinsic, whose operands are those of ``emit`` behind the builder: numba reads them from its signature."""
+
+    def resolve(typingctx: Context, *operands: types.Type) -> Intrinsic:
+        return typed(*operands)
+
+    names = ["typingctx", *list(inspect.signature(emit).parameters)[1:]]
+    parameters = [inspect.Parameter(each, inspect.Parameter.POSITIONAL_OR_KEYWORD) for each in names]
+    resolve.__name__, resolve.__doc__ = name, emit.__doc__
+    resolve.__signature__ = inspect.Signature(parameters)
+    return intrinsic(resolve)
+
+
+def operation(result: Any, *operands: Operand, name: str | None = None) -> Callable[..., Any]:
+    """Decorate what builds an operation's instructions: ``emit(builder, *operands)``, in their forms.
+
+    ``emit`` gives a value of type ``result``; a list of lanes where that is a tuple, :data:`AS_LONG` for one as long as the
+    operand of kind :data:`LENGTH`; or nothing where it is None.
+    """
+
+    def decorate(emit: Callable[..., Any]) -> Any:
+        def typed(*kinds: types.Type) -> Intrinsic:
+            if len(kinds) != len(operands) or not all(map(lambda of, kind: of.accepts(kind), operands, kinds)):
+                return None
+            passed = [kind if of.passed is None else of.passed for of, kind in zip(operands, kinds, strict=True)]
+            gives = types.none if result is None else result
+            if gives is AS_LONG:
+                gives = types.UniTuple(lanes, len(kinds[operands.index(LENGTH)]))
+
+            def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, values: Any) -> ir.Value:
+                forms = [
+                    of.form(context, builder, value, kind)
+                    for of, value, kind in zip(operands, values, signature.args, strict=True)
+                ]
+                value = emit(builder, *forms)
+                if isinstance(value, list):
+                    return _pack(builder, value)
+                return context.get_dummy_value() if value is None else value
+
+            return gives(*passed), generate
+
+        return _intrinsic(emit, name or emit.__name__, typed)
+
+    return decorate
+
+
+def _lanewise(name: str, emit: Callable[..., ir.Value], result: types.Type | None = None) -> Any:
+    """An operation on numbers, lane by lane, and element by element where operands are tuples.
+
+    ``emit`` gets the builder and one vector for each operand; ``result`` is the type of one element, None for that of the
+    operands. Masks are operands as they are, of all elements.
+    """
+
+    def typed(*operands: types.Type) -> Intrinsic:
+        numbers = [operand for operand in operands if not isinstance(operand, LaneMask)]
+        length = _tuple_length(numbers)
+        if any(map(_is_tuple, numbers)) != (length is not None) or not all(map(_is_numeric, _elements(numbers))):
+            return None
+        kind = _common_type(numbers)
+
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, values: Any) -> ir.Value:
+            pairs = list(zip(values, signature.args, strict=True))
             if length is None:
                 return emit(builder, *(_as_lanes(builder, *pair, kind) for pair in pairs))
-            vectors = [
-                emit(builder, *(_element(builder, *pair, index, kind) for pair in pairs)) for index in range(length)
-            ]
-            return _pack(builder, vectors)
+            elements = [[_element(builder, *pair, index, kind) for pair in pairs] for index in range(length)]
+            return _pack(builder, [emit(builder, *vectors) for vectors in elements])
 
-        given = kind if result is None else result
-        return (given if length is None else types.UniTuple(given, length))(*operands), generate
+        gives = result or kind
+        return (gives if length is None else types.UniTuple(gives, length))(*operands), generate
 
-    # numba reads the number of operands from the signature.
-    by_arity: dict[int, Callable[..., Intrinsic]] = {
-        1: lambda typingctx, a: typed(a),
-        2: lambda typingctx, a, b: typed(a, b),
-        3: lambda typingctx, a, b, c: typed(a, b, c),
-    }
-    by_arity[arity].__name__ = name
-    return intrinsic(by_arity[arity])
-
-
-def _comparison(name: str, symbol: str) -> ir.Value:
-    return _lanewise(name, 2, lambda builder, a, b: builder.fcmp_ordered(symbol, a, b), lane_mask)
-
-
-def _of_masks(name: str, emit: Callable[..., ir.Value]) -> Callable[..., Intrinsic]:
-    def typed(typingctx: Context, a: types.Type, b: types.Type) -> Intrinsic:
-        if not (isinstance(a, LaneMask) and isinstance(b, LaneMask)):
-            return None
-        return lane_mask(a, b), lambda context, builder, signature, arguments: emit(builder, *arguments)
-
-    typed.__name__ = name
-    return intrinsic(typed)
-
-
-def _of_one(
-    name: str, operand: type[types.Type], result: types.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]
-) -> Callable[..., Intrinsic]:
-    def typed(typingctx: Context, a: types.Type) -> Intrinsic:
-        if not isinstance(a, operand):
-            return None
-        taken = types.int64 if isinstance(a, types.Integer) else a
-        return result(taken), lambda context, builder, signature, arguments: emit(builder, arguments[0])
-
-    typed.__name__ = name
-    return intrinsic(typed)
+    return _intrinsic(emit, name, typed)
 
 
 # --- arithmetic -------------------------------------------------------------------------------------------------------
 
 #: a + b
-add = _lanewise("add", 2, lambda builder, a, b: builder.fadd(a, b))
+add = _lanewise("add", lambda builder, a, b: builder.fadd(a, b))
 #: a - b
-sub = _lanewise("sub", 2, lambda builder, a, b: builder.fsub(a, b))
+sub = _lanewise("sub", lambda builder, a, b: builder.fsub(a, b))
 #: a b
-mul = _lanewise("mul", 2, lambda builder, a, b: builder.fmul(a, b))
+mul = _lanewise("mul", lambda builder, a, b: builder.fmul(a, b))
 #: a b + c
-fma = _lanewise("fma", 3, lambda builder, a, b, c: _call(builder, "llvm.fmuladd", a, b, c))
+fma = _lanewise("fma", lambda builder, a, b, c: _call(builder, "llvm.fmuladd", a, b, c))
 #: a / b, rounded correctly
-div = _lanewise("div", 2, lambda builder, a, b: builder.fdiv(a, b))
+div = _lanewise("div", lambda builder, a, b: builder.fdiv(a, b))
 #: a / b to a unit or two in the last place, for ordinary numbers
-quick_div = _lanewise("quick_div", 2, lambda builder, a, b: builder.fdiv(a, b, flags=("arcp", "afn", "contract")))
+quick_div = _lanewise("quick_div", lambda builder, a, b: builder.fdiv(a, b, flags=("arcp", "afn", "contract")))
 #: -a
-neg = _lanewise("neg", 1, lambda builder, a: builder.fneg(a))
+neg = _lanewise("neg", lambda builder, a: builder.fneg(a))
 #: Square root
-sqrt = _lanewise("sqrt", 1, lambda builder, a: _call(builder, "llvm.sqrt", a))
+sqrt = _lanewise("sqrt", lambda builder, a: _call(builder, "llvm.sqrt", a))
 #: The integer at or above
-ceil = _lanewise("ceil", 1, lambda builder, a: _call(builder, "llvm.ceil", a))
+ceil = _lanewise("ceil", lambda builder, a: _call(builder, "llvm.ceil", a))
 #: The integer at or below
-floor = _lanewise("floor", 1, lambda builder, a: _call(builder, "llvm.floor", a))
+floor = _lanewise("floor", lambda builder, a: _call(builder, "llvm.floor", a))
 #: A number in all lanes
-splat = _lanewise("splat", 1, lambda builder, a: a)
+splat = _lanewise("splat", lambda builder, a: a)
 #: The smaller; b where either is not a number
-smaller = _lanewise("smaller", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+smaller = _lanewise("smaller", lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 #: The larger; b where either is not a number
-larger = _lanewise("larger", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+larger = _lanewise("larger", lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+#: ``chosen`` where the mask holds, else ``other``
+select = _lanewise("select", lambda builder, mask, chosen, other: builder.select(mask, chosen, other))
 
 #: float64 of float32
-widen = _lanewise("widen", 1, lambda builder, a: builder.fpext(a, _DOUBLES), double_lanes)
+widen = _lanewise("widen", lambda builder, a: builder.fpext(a, _DOUBLES), double_lanes)
 #: The nearest float32 of float64
-narrow = _lanewise("narrow", 1, lambda builder, a: builder.fptrunc(a, _LANES), lanes)
+narrow = _lanewise("narrow", lambda builder, a: builder.fptrunc(a, _LANES), lanes)
 
 # Comparisons are False where either is not a number.
-less = _comparison("less", "<")
-at_most = _comparison("at_most", "<=")
-greater = _comparison("greater", ">")
-at_least = _comparison("at_least", ">=")
+less = _lanewise("less", lambda builder, a, b: builder.fcmp_ordered("<", a, b), lane_mask)
+at_most = _lanewise("at_most", lambda builder, a, b: builder.fcmp_ordered("<=", a, b), lane_mask)
+greater = _lanewise("greater", lambda builder, a, b: builder.fcmp_ordered(">", a, b), lane_mask)
+at_least = _lanewise("at_least", lambda builder, a, b: builder.fcmp_ordered(">=", a, b), lane_mask)
 
-both = _of_masks("both", lambda builder, a, b: builder.and_(a, b))
-either = _of_masks("either", lambda builder, a, b: builder.or_(a, b))
-
-
-@intrinsic
-def select(typingctx: Context, mask: types.Type, chosen: types.Type, other: types.Type) -> Intrinsic:
-    """``chosen`` where the mask holds, else ``other``."""
-    length = _tuple_length((chosen, other))
-    if not isinstance(mask, LaneMask):
-        return None
-    kind = _result_type((chosen, other))
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
-        if length is None:
-            return builder.select(arguments[0], *(_as_lanes(builder, *pair, kind) for pair in pairs))
-        elements = ([_element(builder, *pair, index, kind) for pair in pairs] for index in range(length))
-        return _pack(builder, [builder.select(arguments[0], *chosen) for chosen in elements])
-
-    return (kind if length is None else types.UniTuple(kind, length))(mask, chosen, other), generate
+both = operation(lane_mask, MASK, MASK, name="both")(lambda builder, a, b: builder.and_(a, b))
+either = operation(lane_mask, MASK, MASK, name="either")(lambda builder, a, b: builder.or_(a, b))
 
 
-#: The mask that :func:`bits` turns into this integer
-from_bits = _of_one(
-    "from_bits", types.Integer, lane_mask, lambda builder, flags: builder.bitcast(builder.trunc(flags, _FLAGS), _MASK)
-)
-#: The mask as an integer, lane 0 in the lowest bit
-bits = _of_one(
-    "bits", LaneMask, types.int64, lambda builder, mask: builder.zext(builder.bitcast(mask, _FLAGS), ir.IntType(64))
-)
-#: Place of the lowest bit set in an integer that is not 0
-lowest_bit = _of_one(
-    "lowest_bit", types.Integer, types.int64, lambda builder, flags: builder.cttz(flags, ir.Constant(ir.IntType(1), 1))
-)
-#: How many bits are set in an integer
-bit_count = _of_one("bit_count", types.Integer, types.int64, lambda builder, flags: builder.ctpop(flags))
+@operation(lane_mask, INTEGER)
+def from_bits(builder, flags):
+    """The mask that :func:`bits` turns into this integer."""
+    return builder.bitcast(builder.trunc(flags, _FLAGS), _MASK)
 
 
-# --- 2^x and its inverse --------------------------------------------------------------------------------------------------------------
+@operation(types.int64, MASK)
+def bits(builder, mask):
+    """The mask as an integer, lane 0 in the lowest bit."""
+    return builder.zext(builder.bitcast(mask, _FLAGS), ir.IntType(64))
+
+
+@operation(types.int64, INTEGER)
+def lowest_bit(builder, flags):
+    """Place of the lowest bit set in an integer that is not 0."""
+    return builder.cttz(flags, ir.Constant(ir.IntType(1), 1))
+
+
+@operation(types.int64, INTEGER)
+def bit_count(builder, flags):
+    """How many bits are set in an integer."""
+    return builder.ctpop(flags)
+
+
+# --- 2^x and its inverse ----------------------------------------------------------------------------------------------
 
 #: Adding it to a float32 rounds that to an integer, which is then found in the lowest bits.
 _ROUNDING_BIAS = 1.5 * 2.0**23
@@ -379,7 +428,7 @@ def _emit_exp2(builder: ir.IRBuilder, power: ir.Value) -> ir.Value:
 
 
 #: 2^a to a relative error of 2e-7 for a in [-126, 127]; any bits at all elsewhere
-exp2 = _lanewise("exp2", 1, _emit_exp2)
+exp2 = _lanewise("exp2", _emit_exp2)
 
 #: Bits of the float32 nearest to sqrt(1/2), at which mantissas begin.
 _ROOT_HALF_BITS = 0x3F3504F3
@@ -407,65 +456,58 @@ def _emit_log2(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
 
 
 #: Logarithm to base 2 to 1e-7 and a unit in the last place, of normal numbers; -inf of 0, not a number below it
-log2 = _lanewise("log2", 1, _emit_log2)
+log2 = _lanewise("log2", _emit_log2)
 
 
 # --- memory -----------------------------------------------------------------------------------------------------------
 
-
-def _reading(
-    name: str, result: types.Type, form: ir.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value] | None = None
-) -> Callable[..., Intrinsic]:
-    """An operation that reads ``form`` at ``table[index]``, without asking whether the index counts from the end."""
-
-    def typed(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
-        if not _is_table(table):
-            return None
-
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            value = _read(builder, _address(context, builder, signature.args[0], *arguments, form))
-            return emit(builder, value) if emit else value
-
-        return result(table, types.intp), generate
-
-    typed.__name__ = name
-    return intrinsic(typed)
+# Indices never count from the end of a table.
 
 
-#: Sixteen numbers from ``table[index]`` on
-load = _reading("load", lanes, _LANES)
-#: ``table[index]``
-number = _reading("number", types.float32, _FLOAT)
-#: ``table[index]`` in all lanes
-broadcast = _reading("broadcast", lanes, _FLOAT, _repeat)
+@operation(lanes, TABLE, INDEX)
+def load(builder, table, index):
+    """Sixteen numbers from ``table[index]`` on."""
+    return _read(builder, _at(builder, table, index))
 
 
-def _gathering(name: str, columns: int, result: types.Type) -> Callable[..., Intrinsic]:
-    """An operation that reads ``columns`` numbers from ``table[index + columns * place]`` on, for sixteen places."""
-    form = _FLOAT if columns == 1 else ir.VectorType(_FLOAT, columns)
+@operation(types.float32, TABLE, INDEX)
+def number(builder, table, index):
+    """``table[index]``."""
+    return _read(builder, _at(builder, table, index, _FLOAT))
 
-    def typed(typingctx: Context, table: types.Type, index: types.Type, places: types.Type) -> Intrinsic:
-        if not (_is_table(table) and isinstance(places, Lanes)):
-            return None
 
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            address = _address(context, builder, signature.args[0], *arguments[:2], form)
-            whole = builder.fptosi(arguments[2], _INTS)
-            rows = []
-            for number in range(WIDTH):
-                place = builder.extract_element(whole, ir.Constant(_INT, number))
-                rows.append(_read(builder, builder.gep(address, [place])))
-            if columns == 4:
-                return _pack(builder, _columns_of_four(builder, rows))
-            vector = ir.Constant(_LANES, ir.Undefined)
-            for number, value in enumerate(rows):
-                vector = builder.insert_element(vector, value, ir.Constant(_INT, number))
-            return vector
+@operation(lanes, TABLE, INDEX)
+def broadcast(builder, table, index):
+    """``table[index]`` in all lanes."""
+    return _repeat(builder, _read(builder, _at(builder, table, index, _FLOAT)))
 
-        return result(table, types.intp, places), generate
 
-    typed.__name__ = name
-    return intrinsic(typed)
+@operation(None, TABLE, INDEX, NUMBERS)
+def store(builder, table, index, value):
+    """Sixteen numbers to ``table[index]`` and on."""
+    _write(builder, value, _at(builder, table, index))
+
+
+@operation(lanes, TABLE, INDEX, VECTOR)
+def gather(builder, table, index, places):
+    """``table[index + place]`` for sixteen places, which are whole numbers from 0 to 2^24."""
+    vector = ir.Constant(_LANES, ir.Undefined)
+    for row, value in enumerate(_gathered(builder, _at(builder, table, index, _FLOAT), places)):
+        vector = builder.insert_element(vector, value, ir.Constant(_INT, row))
+    return vector
+
+
+@operation(types.UniTuple(lanes, 4), TABLE, INDEX, VECTOR)
+def gather_fours(builder, table, index, places):
+    """The four numbers from ``table[index + 4 place]`` on, of each place: four vectors."""
+    return _columns_of_four(builder, _gathered(builder, _at(builder, table, index, ir.VectorType(_FLOAT, 4)), places))
+
+
+def _gathered(builder: ir.IRBuilder, address: ir.Value, places: ir.Value) -> list[ir.Value]:
+    """What lies at sixteen places behind an address, counted in what it is of."""
+    whole = builder.fptosi(places, _INTS)
+    steps = [builder.extract_element(whole, ir.Constant(_INT, row)) for row in range(WIDTH)]
+    return [_read(builder, builder.gep(address, [step])) for step in steps]
 
 
 def _columns_of_four(builder: ir.IRBuilder, rows: list[ir.Value]) -> list[ir.Value]:
@@ -487,43 +529,15 @@ def _columns_of_four(builder: ir.IRBuilder, rows: list[ir.Value]) -> list[ir.Val
     return columns
 
 
-#: ``table[index + place]`` for sixteen places, which are whole numbers from 0 to 2^24
-gather = _gathering("gather", 1, lanes)
-#: The four numbers from ``table[index + 4 place]`` on, of each place: four vectors
-gather_fours = _gathering("gather_fours", 4, _tuple_of_lanes(4))
+def _prefetching(name: str, writes: int) -> Any:
+    def emit(builder: ir.IRBuilder, table: ir.Value, index: ir.Value) -> None:
+        address = _at(builder, table, index, ir.IntType(8))
+        kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
+        # Into all levels of the cache for data.
+        builder.call(function, [address, *(ir.Constant(_INT, value) for value in (writes, 3, 1))])
 
-
-@intrinsic
-def store(typingctx: Context, table: types.Type, index: types.Type, value: types.Type) -> Intrinsic:
-    """Sixteen numbers to ``table[index]`` and on."""
-    if not (_is_table(table) and _is_numeric(value)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        _write(builder, _as_lanes(builder, arguments[2], signature.args[2]), address)
-        return context.get_dummy_value()
-
-    return types.none(table, types.intp, value), generate
-
-
-def _prefetching(name: str, writes: int) -> ir.Value:
-    def typed(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
-        if not _is_table(table):
-            return None
-
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            address = _address(context, builder, signature.args[0], *arguments, ir.IntType(8))
-            kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
-            function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
-            # Into all levels of the cache for data.
-            builder.call(function, [address, *(ir.Constant(_INT, value) for value in (writes, 3, 1))])
-            return context.get_dummy_value()
-
-        return types.none(table, types.intp), generate
-
-    typed.__name__ = name
-    return intrinsic(typed)
+    return operation(None, TABLE, INDEX, name=name)(emit)
 
 
 #: Prefetch the cache line of ``table[index]``
@@ -532,64 +546,42 @@ prefetch = _prefetching("prefetch", 0)
 prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 
-def _places(builder: ir.IRBuilder, address: ir.Value, count: int) -> list[ir.Value]:
-    return [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(count)]
+@operation(AS_LONG, TABLE, INDEX, LENGTH)
+def load_all(builder, table, index, like):
+    """As many vectors, one behind the other from ``table[index]`` on, as a tuple is long."""
+    return [_read(builder, address) for address in _successive(builder, _at(builder, table, index), like)]
 
 
-def _reading_all(
-    name: str, form: ir.Type, emit: Callable[[ir.IRBuilder, list[ir.Value]], list[ir.Value]]
-) -> Callable[..., Intrinsic]:
-    """An operation that reads as many of ``form`` from ``table[index]`` on as a tuple is long; ``emit`` gets their places."""
-
-    def typed(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
-        if not (_is_table(table) and isinstance(like, types.BaseTuple)):
-            return None
-
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            address = _address(context, builder, signature.args[0], *arguments[:2], form)
-            return _pack(builder, emit(builder, _places(builder, address, len(like))))
-
-        return _tuple_of_lanes(len(like))(table, types.intp, like), generate
-
-    typed.__name__ = name
-    return intrinsic(typed)
+@operation(AS_LONG, TABLE, INDEX, LENGTH)
+def broadcast_all(builder, table, index, like):
+    """Consecutive numbers from ``table[index]`` on, as many as a tuple is long, each in all lanes of its vector."""
+    addresses = _successive(builder, _at(builder, table, index, _FLOAT), like)
+    return [_repeat(builder, _read(builder, address)) for address in addresses]
 
 
-def _writing_all(
-    name: str, emit: Callable[[ir.IRBuilder, list[ir.Value], list[ir.Value]], None]
-) -> Callable[..., Intrinsic]:
-    """An operation that writes a tuple of vectors from ``table[index]`` on; ``emit`` gets them and as many places."""
-
-    def typed(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
-        if not (_is_table(table) and isinstance(values, types.BaseTuple)):
-            return None
-
-        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-            address = _address(context, builder, signature.args[0], *arguments[:2])
-            vectors = [_element(builder, arguments[2], signature.args[2], place) for place in range(len(values))]
-            emit(builder, vectors, _places(builder, address, len(values)))
-            return context.get_dummy_value()
-
-        return types.none(table, types.intp, values), generate
-
-    typed.__name__ = name
-    return intrinsic(typed)
-
-
-def _emit_load_columns(builder: ir.IRBuilder, places: list[ir.Value]) -> list[ir.Value]:
-    columns = len(places)
-    if columns == WIDTH:
-        return _transposed(builder, [_read(builder, place) for place in places])
-    kind = ir.VectorType(_FLOAT, WIDTH * columns)
-    flat = _read(builder, builder.bitcast(places[0], kind.as_pointer()))
-    picks = [[row * columns + column for row in range(WIDTH)] for column in range(columns)]
+@operation(AS_LONG, TABLE, INDEX, LENGTH)
+def load_columns(builder, table, index, like):
+    """The columns of a matrix with sixteen rows from ``table[index]`` on, as many columns as a tuple is long."""
+    if like == WIDTH:
+        rows = _successive(builder, _at(builder, table, index), WIDTH)
+        return _transposed(builder, [_read(builder, row) for row in rows])
+    flat = _read(builder, _at(builder, table, index, ir.VectorType(_FLOAT, WIDTH * like)))
+    picks = [[row * like + column for row in range(WIDTH)] for column in range(like)]
     return [_shuffle(builder, flat, flat, picked) for picked in picks]
 
 
-def _emit_store_columns(builder: ir.IRBuilder, vectors: list[ir.Value], places: list[ir.Value]) -> None:
+@operation(None, TABLE, INDEX, VECTORS)
+def store_all(builder, table, index, values):
+    """A tuple of vectors, one behind the other, to ``table[index]`` and on."""
+    _write_all(builder, values, _successive(builder, _at(builder, table, index), len(values)))
+
+
+@operation(None, TABLE, INDEX, VECTORS)
+def store_columns(builder, table, index, vectors):
+    """The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on."""
     columns = len(vectors)
     if columns == WIDTH:
-        _emit_store_all(builder, _transposed(builder, vectors), places)
+        _write_all(builder, _transposed(builder, vectors), _successive(builder, _at(builder, table, index), WIDTH))
         return
     while len(vectors) & (len(vectors) - 1):
         vectors.append(ir.Constant(_LANES, ir.Undefined))
@@ -598,64 +590,25 @@ def _emit_store_columns(builder: ir.IRBuilder, vectors: list[ir.Value], places: 
         vectors = [_shuffle(builder, a, b, width) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
     picks = [column * WIDTH + row for row in range(WIDTH) for column in range(columns)]
     flat = _shuffle(builder, vectors[0], vectors[0], picks)
-    _write(builder, flat, builder.bitcast(places[0], flat.type.as_pointer()))
+    _write(builder, flat, _at(builder, table, index, flat.type))
 
 
-def _emit_store_all(builder: ir.IRBuilder, vectors: list[ir.Value], places: list[ir.Value]) -> None:
-    for vector, place in zip(vectors, places, strict=True):
-        _write(builder, vector, place)
-
-
-#: As many vectors, one behind the other from ``table[index]`` on, as a tuple is long
-load_all = _reading_all("load_all", _LANES, lambda builder, places: [_read(builder, place) for place in places])
-#: Consecutive numbers from ``table[index]`` on, as many as a tuple is long, each in all lanes of its vector
-broadcast_all = _reading_all(
-    "broadcast_all", _FLOAT, lambda builder, places: [_repeat(builder, _read(builder, place)) for place in places]
-)
-#: The columns of a matrix with sixteen rows from ``table[index]`` on, as many columns as a tuple is long
-load_columns = _reading_all("load_columns", _LANES, _emit_load_columns)
-#: A tuple of vectors, one behind the other, to ``table[index]`` and on
-store_all = _writing_all("store_all", _emit_store_all)
-#: The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on
-store_columns = _writing_all("store_columns", _emit_store_columns)
-
-
-@intrinsic
-def load_rows(typingctx: Context, table: types.Type, places: types.Type, column: types.Type) -> Intrinsic:
+@operation(types.UniTuple(lanes, WIDTH), TABLE, INTEGERS, INDEX)
+def load_rows(builder, table, places, column):
     """Sixteen consecutive numbers of each of sixteen rows: vector i from ``table[places[i] + column]`` on."""
-    if not (_is_table(table) and isinstance(places, types.Array)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        return _pack(builder, [_read(builder, row) for row in _rows(context, builder, signature, arguments)])
-
-    return _tuple_of_lanes(WIDTH)(table, places, types.intp), generate
+    return [_read(builder, address) for address in _rows(builder, table, places, column)]
 
 
-@intrinsic
-def store_rows(
-    typingctx: Context, table: types.Type, places: types.Type, column: types.Type, vectors: types.Type
-) -> Intrinsic:
+@operation(None, TABLE, INTEGERS, INDEX, VECTORS)
+def store_rows(builder, table, places, column, vectors):
     """Sixteen vectors, each to a row: vector i to ``table[places[i] + column]`` and on, in this order."""
-    if not (_is_table(table) and isinstance(places, types.Array)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        parts = [_element(builder, arguments[3], signature.args[3], row) for row in range(WIDTH)]
-        _emit_store_all(builder, parts, _rows(context, builder, signature, arguments))
-        return context.get_dummy_value()
-
-    return types.none(table, places, types.intp, vectors), generate
+    _write_all(builder, vectors, _rows(builder, table, places, column))
 
 
-def _rows(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> list[ir.Value]:
+def _rows(builder: ir.IRBuilder, table: ir.Value, places: ir.Value, column: ir.Value) -> list[ir.Value]:
     """Addresses of a column of sixteen rows of a table, which begin at places in it."""
-    table, places, column = arguments[:3]
-    begins = context.make_array(signature.args[1])(context, builder, places).data
-    return [
-        _address(context, builder, signature.args[0], table, builder.add(builder.load(begin), column))
-        for begin in _places(builder, begins, WIDTH)
-    ]
+    begins = (builder.load(begin) for begin in _successive(builder, places, WIDTH))
+    return [_at(builder, table, builder.add(begin, column)) for begin in begins]
 
 
 def _transposed(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
@@ -671,71 +624,53 @@ def _transposed(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Valu
     return vectors
 
 
-@intrinsic
-def repeat(typingctx: Context, value: types.Type, like: types.Type) -> Intrinsic:
+@operation(AS_LONG, NUMBERS, LENGTH)
+def repeat(builder, value, like):
     """A number, as many times as the tuple ``like`` is long, each time in all lanes."""
-    if not (_is_scalar(value) and isinstance(like, types.BaseTuple)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        return _pack(builder, [_as_lanes(builder, arguments[0], signature.args[0])] * len(like))
-
-    return _tuple_of_lanes(len(like))(value, like), generate
+    return [value] * like
 
 
 # --- across lanes -----------------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def dot(typingctx: Context, a: types.Type, b: types.Type, start: types.Type) -> Intrinsic:
-    """``start`` plus the sum of the products of two tuples of lanes of one length."""
+def _emit_dot(builder: ir.IRBuilder, a: Sequence[ir.Value], b: Sequence[ir.Value], start: ir.Value) -> ir.Value:
+    for first, second in zip(a, b, strict=True):
+        start = _call(builder, "llvm.fmuladd", first, second, start)
+    return start
+
+
+def _typed_dot(a: types.Type, b: types.Type, start: types.Type) -> Intrinsic:
     length = _tuple_length((a, b))
     if length is None or not _is_numeric(start):
         return None
-    kind = _result_type((a, b, start))
+    kind = _common_type((a, b, start))
 
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        total = _as_lanes(builder, arguments[2], signature.args[2], kind)
-        for index in range(length):
-            factors = (_element(builder, arguments[k], signature.args[k], index, kind) for k in range(2))
-            total = _call(builder, "llvm.fmuladd", *factors, total)
-        return total
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, values: Any) -> ir.Value:
+        factors = [
+            [_element(builder, value, operand, index, kind) for index in range(length)]
+            for value, operand in zip(values[:2], signature.args[:2], strict=True)
+        ]
+        return _emit_dot(builder, *factors, _as_lanes(builder, values[2], signature.args[2], kind))
 
     return kind(a, b, start), generate
 
 
-@intrinsic
-def lane_sums(typingctx: Context, vectors: types.Type) -> Intrinsic:
+#: ``start`` plus the sum of the products of two tuples of lanes of one length
+dot = _intrinsic(_emit_dot, "dot", _typed_dot)
+
+
+@operation(lanes, VECTORS)
+def lane_sums(builder, vectors):
     """Lane i of the result is the sum of all lanes of vector i of a tuple of at most sixteen; the rest is anything."""
-    if not (isinstance(vectors, types.BaseTuple) and len(vectors) <= WIDTH):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        parts = [_element(builder, arguments[0], signature.args[0], index) for index in range(len(vectors))]
-        return _summed(builder, parts)
-
-    return lanes(vectors), generate
+    return _summed(builder, vectors)
 
 
-@intrinsic
-def store_lane_sums(
-    typingctx: Context, table: types.Type, index: types.Type, further: types.Type, vectors: types.Type
-) -> Intrinsic:
-    """The sums of all lanes of each vector of a tuple: sixteen to ``table[index]`` and on, any others from ``further`` on."""
-    if not (_is_table(table) and isinstance(vectors, types.BaseTuple)):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        parts = [_element(builder, arguments[3], signature.args[3], place) for place in range(len(vectors))]
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        _write(builder, _summed(builder, parts[:WIDTH]), address)
-        address = _address(context, builder, signature.args[0], arguments[0], arguments[2], _FLOAT)
-        for place, part in enumerate(parts[WIDTH:]):
-            total = builder.extract_element(_summed(builder, [part]), ir.Constant(_INT, 0))
-            _write(builder, total, builder.gep(address, [ir.Constant(_INT, place)]))
-        return context.get_dummy_value()
-
-    return types.none(table, types.intp, types.intp, vectors), generate
+@operation(None, TABLE, INDEX, INDEX, VECTORS)
+def store_lane_sums(builder, table, index, further, vectors):
+    """The sums of all lanes of each vector of a tuple: sixteen to ``table[index]`` and on, others from ``further`` on."""
+    _write(builder, _summed(builder, vectors[:WIDTH]), _at(builder, table, index))
+    rest = [builder.extract_element(_summed(builder, [part]), ir.Constant(_INT, 0)) for part in vectors[WIDTH:]]
+    _write_all(builder, rest, _successive(builder, _at(builder, table, further, _FLOAT), len(rest)))
 
 
 def _summed(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
@@ -757,34 +692,24 @@ def _summed(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
     return parts[0]
 
 
-def _emit_least(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+@operation(types.float32, VECTOR)
+def least_lane(builder, vector):
+    """The least of the sixteen numbers."""
     for run in (8, 4, 2, 1):
         moved = _shuffle(builder, vector, vector, [lane ^ run for lane in range(WIDTH)])
         vector = builder.select(builder.fcmp_ordered("<", vector, moved), vector, moved)
     return builder.extract_element(vector, ir.Constant(_INT, 0))
 
 
-#: The least of the sixteen numbers
-least_lane = _of_one("least_lane", Lanes, types.float32, _emit_least)
-
-
-def _fixed(values: Sequence[float]) -> Callable[..., Intrinsic]:
-    return intrinsic(lambda typingctx: (lanes(), lambda context, builder, signature, arguments: _constant(values)))
-
-
 #: Column of a lane's pixel in a block of 4 x 4, or of a block in a tile: 0, 1, 2, 3 four times over
-lane_columns = _fixed([float(lane % 4) for lane in range(WIDTH)])
+lane_columns = operation(lanes, name="lane_columns")(lambda builder: _constant([float(i % 4) for i in range(WIDTH)]))
 #: Row of a lane's pixel in a block, or of a block in a tile: each of 0, 1, 2, 3 four times
-lane_rows = _fixed([float(lane // 4) for lane in range(WIDTH)])
+lane_rows = operation(lanes, name="lane_rows")(lambda builder: _constant([float(i // 4) for i in range(WIDTH)]))
 #: Number of a lane: 0 to 15
-lane_numbers = _fixed([float(lane) for lane in range(WIDTH)])
+lane_numbers = operation(lanes, name="lane_numbers")(lambda builder: _constant([float(i) for i in range(WIDTH)]))
 
 
-@intrinsic
-def lane(typingctx: Context, vector: types.Type, index: types.Type) -> Intrinsic:
+@operation(types.float32, VECTOR, INDEX)
+def lane(builder, vector, index):
     """One of the sixteen numbers."""
-    if not isinstance(vector, Lanes):
-        return None
-    return types.float32(vector, types.intp), lambda context, builder, signature, arguments: builder.extract_element(
-        *arguments
-    )
+    return builder.extract_element(vector, index)

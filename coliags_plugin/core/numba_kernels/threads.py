@@ -7,34 +7,20 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic
 
 from coliags_plugin.core.numba_kernels.compilation import part
-from coliags_plugin.core.numba_kernels.lanes import Intrinsic, Values
-
-if TYPE_CHECKING:
-    from numba.core.base import BaseContext
-    from numba.core.typing import Context, Signature
+from coliags_plugin.core.numba_kernels.lanes import INDEX, INTEGER, INTEGERS, operation
 
 
-@intrinsic
-def take(typingctx: Context, counters: types.Type, index: types.Type, amount: types.Type) -> Intrinsic:
+@operation(types.int64, INTEGERS, INDEX, INTEGER)
+def take(builder, counters, index, amount):
     """Atomically add to ``counters[index]`` and return the previous value."""
-    if not (isinstance(counters, types.Array) and counters.dtype == types.int64 and counters.ndim == 1):
-        return None
-
-    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
-        table, place, amount = arguments
-        data = context.make_array(signature.args[0])(context, builder, table).data
-        return builder.atomic_rmw("add", builder.gep(data, [place]), amount, "monotonic")
-
-    return types.int64(counters, types.intp, types.int64), generate
+    return builder.atomic_rmw("add", builder.gep(counters, [index]), amount, "monotonic")
 
 
 @part
