@@ -14,18 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.engine import queue
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.reporting.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import TINY, InlineExecutor
-from tests.engine.test_progress import Shown
 from tests.faults import content
 from tests.scenes import SMALL, wall_scene, write_frames, write_wall
 
@@ -227,17 +224,6 @@ def test_examples_of_the_pages_run(tmp_path, monkeypatch):
         shutil.rmtree("comparison")
 
 
-def test_importing_the_package_imports_no_torch():
-    code = (
-        "import sys, coliags_plugin as cp; heavy = {'torch', 'numpy', 'cv2', 'pydantic', 'rich'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-        "assert set(cp.__all__) <= set(dir(cp))\n"
-        "from coliags_plugin import *\n"
-        "assert not {'torch', 'cv2', 'numba'} & set(sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def test_a_handle_needs_no_torch(trained, result):
     code = (
         "import sys, coliags_plugin as cp\n"
@@ -341,11 +327,3 @@ def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
         assert "without depth" in file.read_text()
     with pytest.raises(InputError, match=r"no format 'latx'.*Did you mean 'latex'"):
         cp.report(compared, formats="latx")
-
-
-def test_a_notebook_shows_one_line(wall, tmp_path, inline, monkeypatch):
-    shown = Shown()
-    monkeypatch.setattr("IPython.display.display", shown)
-    monkeypatch.setattr(queue, "log_console", lambda: Console(force_jupyter=True))
-    cp.compare("coliags", wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
-    assert shown.text.startswith("compare 3/3, took") and shown.text.endswith("1 done")

@@ -132,18 +132,6 @@ def test_sections_are_numbered_in_order_and_references_lead_to_one(page):
     assert not sections(page) or set(referred) <= sections(page)
 
 
-def test_the_citation_pattern_sees_what_it_should():
-    text = (
-        "A (docs/methods.md 2.4, 4.1) b\n    #: docs/data.md\n    # 3 and 7). ``docs/rendering.md``, section; x.md 1a"
-    )
-    assert cited(text) == [
-        ("docs/methods.md", ["2.4", "4.1"]),
-        ("docs/data.md", ["3", "7"]),
-        ("docs/rendering.md", []),
-        ("x.md", []),
-    ]
-
-
 def test_the_project_speaks_of_itself_alone():
     elsewhere = re.compile(r"/work\b|\.\./shared|\bspec/|/tmp/", re.IGNORECASE)
     for page in PAGES:

@@ -146,10 +146,6 @@ def test_files_and_overrides_change_what_they_inherit(method_file, text, overrid
     assert hasattr(looked_up(config, f"{HEAD}.settings"), "frequencies") == ("plain" not in text)
 
 
-def test_null_removes_a_loss():
-    assert "depth" not in load_method("coliags", ["losses.depth=null"]).config.losses
-
-
 def test_origins_name_file_and_line_or_the_option():
     text = load_method("coliags", ["field.geometry_head.frequencies=8"]).with_origins()
     for part in ("# scaffold-gs.yaml:", "# coliags.yaml:", "# default", "# `field.geometry_head.frequencies=8`"):

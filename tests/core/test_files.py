@@ -294,11 +294,3 @@ def test_the_training_log_on_a_full_disk_is_a_message(tmp_path):
     run.log_file.symlink_to("/dev/full")
     with pytest.raises(InputError, match="No space left"):
         run.log({"step": 1})
-
-
-@pytest.mark.thorough
-def test_a_training_log_that_is_no_file_is_a_message(tmp_path):
-    run = RunFolder(tmp_path)
-    run.log_file.symlink_to("metrics.jsonl")
-    with pytest.raises(InputError, match="cannot write"):
-        run.log({"step": 1})

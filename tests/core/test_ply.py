@@ -93,18 +93,6 @@ def test_colours_of_every_type_and_name(tmp_path, kind, stored, colors, names):
     assert read_mesh(path).colors.tolist() == [colors] * 3
 
 
-def test_open3d_agrees(tmp_path):
-    import open3d
-
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.random.default_rng(1).normal(size=(40, 3))))
-    cloud.colors = open3d.utility.Vector3dVector(np.random.default_rng(2).random((40, 3)))
-    for ascii_ in (True, False):
-        open3d.io.write_point_cloud(str(tmp_path / "p.ply"), cloud, write_ascii=ascii_)
-        points, back = load_points(tmp_path / "p.ply"), open3d.io.read_point_cloud(str(tmp_path / "p.ply"))
-        np.testing.assert_allclose(points.positions, np.asarray(back.points), atol=1e-6)
-        np.testing.assert_array_equal(points.colors, np.rint(np.asarray(back.colors) * 255))
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import sys
 import sysconfig
-from importlib.util import find_spec
 from types import SimpleNamespace
 
 import pytest
@@ -69,18 +68,3 @@ def test_what_triton_lacks_is_said(lacks, monkeypatch, tmp_path):
     assert "triton 3.5.1 is older than 3.6" in lacks()
     monkeypatch.setattr(tensors, "find_spec", lambda name: None)
     assert "triton is not installed" in lacks()
-
-
-@pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
-def test_a_compiler_is_sought_where_triton_seeks_it(monkeypatch):
-    from triton.runtime import build
-
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr(shutil, "which", {"clang": "clang"}.get)
-    build._find_compiler.cache_clear()
-    assert build._find_compiler("c") == "clang"
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    build._find_compiler.cache_clear()
-    with pytest.raises(RuntimeError, match="C compiler"):
-        build._find_compiler("c")
-    build._find_compiler.cache_clear()

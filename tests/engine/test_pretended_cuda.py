@@ -173,16 +173,6 @@ def test_waits_of_the_host_are_counted(waits, act):
     assert device.waits.total() == waits
 
 
-def test_gradients_cross_devices_and_stay_on_theirs():
-    with PretendedCuda():
-        here = torch.ones(3, requires_grad=True)
-        there = torch.full((3,), 2.0, device="cuda", requires_grad=True)
-        (here.to("cuda") * there).sum().backward()
-        assert here.grad.device == torch.device("cpu") and there.grad.device == CUDA
-        with pytest.raises(MixedDevicesError):
-            here.grad + there.grad
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", ["coliags", *METHODS])
 def test_trains_evaluates_and_resumes_on_the_device(method, tmp_path):

@@ -7,11 +7,8 @@ import io
 import pytest
 from rich.console import Console
 
-from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
-from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.progress import ProgressReport, progress_callback
-from tests.scenes import write_wall
 
 
 @pytest.fixture
@@ -68,12 +65,6 @@ def test_a_terminal_shows_the_facts_and_the_end(clock):
     with ProgressReport("train", 4, 2, console=console) as report:
         report.update(4, "loss 0.1")
     assert all(text in console.file.getvalue() for text in ("train", "4/4", "loss 0.1"))
-
-
-def test_reading_a_small_scene_says_nothing(tmp_path, capsys):
-    config = load_method("coliags", ["datamanager.name=c3vd"]).config
-    assert load_scene(config, write_wall(tmp_path / "wall")).train
-    assert capsys.readouterr().err == ""
 
 
 class Shown:

@@ -156,16 +156,6 @@ def test_an_interrupted_run_resumes_to_the_bit(tmp_path, request, method, steps,
     assert changes["pruned"] > 0 or overrides in (MODULES, LIT)
 
 
-@pytest.mark.thorough
-def test_losses_of_surfels_begin_one_after_the_other(tmp_path):
-    rows = log_rows(train(tmp_path / "run", method="2dgs", steps=14, overrides=SURFELS))
-    for row in rows:
-        later = {"distortion": row["step"] > 3, "normals": row["step"] > 5}
-        assert set(row["terms"]) == {"l1", "d-ssim", *(name for name, begun in later.items() if begun)}
-    assert 0 < rows[-1]["terms"]["normals"] < 2 and rows[-1]["terms"]["distortion"] > 0
-    assert rows[8]["loss"] < rows[0]["loss"]  # the last before opacities are reset
-
-
 def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
     trainer = train(tmp_path / "run", steps=4)
     with trainer.run.log_file.open("a") as log:
@@ -247,11 +237,6 @@ def test_plain_heads_train_to_scaffolds_bits(tmp_path):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_training_without_depth_works_without_the_term(tmp_path):
-    trainer = train(tmp_path / "run", scene=wall_scene(depth=False), overrides=["losses.depth=null"], steps=2)
-    assert "depth" not in log_rows(trainer)[0]["terms"]
-
-
 def test_existing_run_is_not_overwritten(tmp_path):
     trainer = train(tmp_path / "run", steps=1)
     with pytest.raises(InputError, match="already exists"):
@@ -259,13 +244,6 @@ def test_existing_run_is_not_overwritten(tmp_path):
     again = make_trainer(tmp_path / "run", steps=1)
     again.start(overwrite=True)
     assert not trainer.run.checkpoints.exists()
-
-
-def test_overwrite_spares_folders_that_are_no_runs(tmp_path):
-    (tmp_path / "precious").mkdir()
-    (tmp_path / "precious" / "thesis.tex").write_text("x")
-    with pytest.raises(InputError, match="not a run folder"):
-        make_trainer(tmp_path / "precious").start(overwrite=True)
 
 
 @pytest.mark.parametrize(
