@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -222,21 +223,18 @@ class Run:
             InputError: See :meth:`load`; an option is unknown or invalid, the mesh cannot be read or is not where the
                 cameras look, or the folder exists or cannot be written.
         """
-        from coliags_plugin.api.scenes import coverage_settings
-        from coliags_plugin.geometry.meshes.files import read_mesh
-        from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
+        from coliags_plugin.api.scenes import coverage_settings, measure_scene_coverage
+        from coliags_plugin.surface.coverage.writing import measure_scene
+        from coliags_plugin.surface.meshing.fusion import fuse_run
 
-        chosen, folder = coverage_settings(options), options.output or self.path / "coverage"
-        refuse_existing(folder, options.overwrite)
-        file = options.mesh or self.path / "mesh" / "mesh.ply"
-        if options.mesh is not None or file.is_file():
-            wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)
-        else:
-            from coliags_plugin.surface.meshing.fusion import fuse_run
-
-            trained = self.load()
-            wall, scene = fuse_run(trained).mesh, trained.scene
-        return measure_scene(scene, wall, folder, chosen, options.overwrite)
+        output, mesh = options.output or self.path / "coverage", options.mesh or self.path / "mesh" / "mesh.ply"
+        if options.mesh is not None or mesh.is_file():
+            data = self.data or self.folder.identity().scene_path
+            return measure_scene_coverage(data, replace(options, mesh=mesh, output=output))
+        settings = coverage_settings(options)
+        refuse_existing(output, options.overwrite)
+        trained = self.load()
+        return measure_scene(trained.scene, fuse_run(trained).mesh, output, settings, options.overwrite)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the run to browsers (docs/viewer.md), until the viewer is closed.

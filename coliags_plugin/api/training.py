@@ -6,7 +6,6 @@ import logging
 from typing import TYPE_CHECKING
 
 from coliags_plugin.api.runs import Run
-from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.config.options import ImportOptions, TrainOptions, takes
 from coliags_plugin.core.errors import InputError
@@ -37,15 +36,11 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     """
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.loggers import find_loggers
-    from coliags_plugin.engine.training import IfExists, TrainingRequest, open_training
+    from coliags_plugin.engine.training import IfExists, open_training
 
     if options.resume and options.overwrite:
         raise InputError("`resume=True` and `overwrite=True` together", "one of them")
     on = choose_device(options.device)
-    named = {"schedule.steps": options.steps, "renderer.name": options.renderer}
-    chosen = {key: value for key, value in named.items() if value is not None}
-    overrides = (*options.settings, *assignments(chosen))
-    request = TrainingRequest(options.method, options.data, overrides, options.seed, options.data_format)
     chosen_loggers = find_loggers(options.loggers)
     if view_port is not None:
         from coliags_plugin.export.viewer.live import check_server
@@ -53,7 +48,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
         check_server("127.0.0.1", view_port)
     folder = _run_folder(options)
     if_exists: IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
-    with open_training(request, folder, on, if_exists) as trainer:
+    with open_training(options, folder, on, if_exists) as trainer:
         if not options.resume:
             _warn_of_suspect_data(trainer.scene)
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"

@@ -81,8 +81,9 @@ def _train(task: CellTask, run: RunFolder, device: torch.device) -> None:
     import cv2
     import torch
 
+    from coliags_plugin.config.options import TrainOptions
     from coliags_plugin.engine.checkpoints import keep_newest, take_newest
-    from coliags_plugin.engine.training import TrainingRequest, open_training
+    from coliags_plugin.engine.training import open_training
 
     threads = task.threads
     if run.config_file.is_file():
@@ -93,17 +94,11 @@ def _train(task: CellTask, run: RunFolder, device: torch.device) -> None:
         threads = int(run.provenance().get("threads", threads))
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    request = TrainingRequest(
-        task.method,
-        Path(task.data),
-        task.overrides,
-        task.seed,
-        task.data_format,
-        method_name=task.name,
-        scene_name=task.scene,
-        protocol=task.protocol,
+    options = TrainOptions(
+        task.method, Path(task.data), seed=task.seed, settings=tuple(task.overrides), data_format=task.data_format
     )
-    with open_training(request, run, device, "continue", owned=True) as trainer:
+    names = {"run_name": task.name, "scene_name": task.scene, "protocol": task.protocol}
+    with open_training(options, run, device, "continue", owned=True, **names) as trainer:
         log.info("training from step %d of %d on %d threads", trainer.step, trainer.steps, threads)
         trainer.train(task.save_seconds, _KEPT)
     keep_newest(run.checkpoints, 1)

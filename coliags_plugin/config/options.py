@@ -142,6 +142,12 @@ class TrainOptions(Options):
     overwrite: Overwrite = False
     device: Device = "auto"
 
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Changes of the method config as ``key.path=value``, those by options of their own last."""
+        named = {"schedule.steps": self.steps, "renderer.name": self.renderer}
+        return (*self.settings, *assignments({key: value for key, value in named.items() if value is not None}))
+
 
 @dataclass(frozen=True)
 class ImportOptions(Options):

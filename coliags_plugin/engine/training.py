@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Literal
 
 import torch
 
 from coliags_plugin.config.method_config import method_name
+from coliags_plugin.config.options import TrainOptions
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import at_scale, load_method_for, load_scene, training_scale
 from coliags_plugin.engine.evaluator import check_evaluable
@@ -25,27 +25,17 @@ log = logging.getLogger(__name__)
 IfExists = Literal["refuse", "overwrite", "resume", "continue"]
 
 
-@dataclass(frozen=True)
-class TrainingRequest:
-    """Method, scene and changes of a run to be trained."""
-
-    method: str  # name of a method, or path of a method config
-    data: Path  # the scene's folder
-    overrides: Sequence[str] = ()  # ``key.path=value`` assignments
-    seed: int | None = None  # None: 0, or that of the resumed run
-    data_format: str | None = None  # a data manager; None: the method's, or the one that recognises the folder
-    method_name: str | None = None  # in the run; None: the method's own
-    scene_name: str | None = None  # in the run; None: the scene's own
-    protocol: str | None = None  # of evaluations that has to fit the run; None: not checked
-
-
 @contextmanager
 def open_training(
-    request: TrainingRequest,
+    options: TrainOptions,
     folder: RunFolder,
     device: torch.device,
     if_exists: IfExists = "refuse",
+    *,
     owned: bool = False,
+    run_name: str | None = None,
+    scene_name: str | None = None,
+    protocol: str | None = None,
 ) -> Iterator[Trainer]:
     """Trainer of a run, from its newest whole checkpoint or from the start, after everything has been checked.
 
@@ -59,33 +49,43 @@ def open_training(
     ============  ====================  ============================================
 
     Any other folder is refused; after a refusal, nothing was written. No other process can train the run until the
-    block ends; ``owned``: the caller holds the run's lock.
+    block ends.
+
+    Args:
+        options: Method, scene, changes and seed.
+        folder: The run.
+        device: To train on.
+        if_exists: See above.
+        owned: The caller holds the run's lock.
+        run_name: The method's name in the run; None: its own.
+        scene_name: The scene's name in the run; None: its own.
+        protocol: Protocol of evaluations that has to fit the run; None: not checked.
     """
     resumes = if_exists == "resume" or (if_exists == "continue" and folder.config_file.is_file())
     if resumes:
         folder = RunFolder.existing(folder.path)
-        overrides, data_format = ((), None) if if_exists == "continue" else (request.overrides, request.data_format)
-        name = method_name(request.method_name or request.method)
+        overrides, data_format = ((), None) if if_exists == "continue" else (options.overrides, options.data_format)
+        name = method_name(run_name or options.method)
         folder.check_method(name)
         # The config stored in the run, even if that of this name has changed since.
-        method = load_method_for(request.data, str(folder.config_file.resolve()), overrides, data_format)
+        method = load_method_for(options.data, str(folder.config_file.resolve()), overrides, data_format)
         method = replace(method, name=name)
         identity = folder.identity()
         seed, scale = identity.seed, identity.scale
-        if request.seed not in (None, seed):
+        if options.seed not in (None, seed):
             begun = f"{folder.path}, which was started with seed {seed}"
-            raise InputError(f"`seed={request.seed}` for {begun}", "no `seed`, or that one")
+            raise InputError(f"`seed={options.seed}` for {begun}", "no `seed`, or that one")
     else:
         folder.check_free(if_exists == "overwrite")
-        method = load_method_for(request.data, request.method, request.overrides, request.data_format)
-        method, seed, scale = replace(method, name=request.method_name or method.name), request.seed or 0, None
-    scene, path = load_scene(method.config, request.data), str(request.data.resolve())
+        method = load_method_for(options.data, options.method, options.overrides, options.data_format)
+        method, seed, scale = replace(method, name=run_name or method.name), options.seed or 0, None
+    scene, path = load_scene(method.config, options.data), str(options.data.resolve())
     scene = at_scale(scene, training_scale(scene) if scale is None else scale, method.config.near_plane)
-    if request.scene_name is not None:
-        scene = replace(scene, name=request.scene_name)
+    if scene_name is not None:
+        scene = replace(scene, name=scene_name)
     trainer = Trainer(method, scene, path, folder, seed, device)
-    if request.protocol is not None:
-        check_evaluable(trainer.model, scene, Scorer(request.protocol))
+    if protocol is not None:
+        check_evaluable(trainer.model, scene, Scorer(protocol))
     log.info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
     with nullcontext() if owned else folder.owned():
         if resumes:

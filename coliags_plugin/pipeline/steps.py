@@ -184,18 +184,26 @@ def steps_for(context: StageContext) -> int:
 
 def train(context: StageContext) -> StageRecord:
     """Train, or go on from the newest checkpoint."""
+    from coliags_plugin.config.options import TrainOptions
     from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.engine.training import TrainingRequest, open_training
+    from coliags_plugin.engine.training import open_training
     from coliags_plugin.reconstruction.depth.scene import training_options
 
     settings = context.settings
-    options = [*training_options(context.open_posed()), f"schedule.steps={steps_for(context)}"]
+    options = training_options(context.open_posed())
     data_format = None if context.estimates_depth else context.data_format
     if not context.estimates_depth:
-        options += [f"datamanager.{option}" for option in context.model_options]
-    request = TrainingRequest(method_for(context), context.scene, options, settings.seed, data_format)
+        options = [*options, *(f"datamanager.{option}" for option in context.model_options)]
+    training = TrainOptions(
+        method_for(context),
+        context.scene,
+        steps=steps_for(context),
+        seed=settings.seed,
+        settings=tuple(options),
+        data_format=data_format,
+    )
     folder = RunFolder(context.run)
-    with open_training(request, folder, context.device, "continue") as trainer:
+    with open_training(training, folder, context.device, "continue") as trainer:
         try:
             trainer.train(_SAVE_SECONDS, _KEPT)
         except InterruptedRunError as error:
@@ -205,7 +213,7 @@ def train(context: StageContext) -> StageRecord:
             ) from error
     rows = folder.log_rows()
     last = f", {rows[-1]['psnr']:.2f} dB in the last view" if rows else ""
-    summary = f"{method_name(request.method)}, {trainer.steps} steps{last}"
+    summary = f"{method_name(training.method)}, {trainer.steps} steps{last}"
     return StageRecord(summary, {"run": "the trained run"}, figures={"steps": trainer.steps})
 
 

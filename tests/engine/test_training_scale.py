@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.config.options import ExportOptions
+from coliags_plugin.config.options import ExportOptions, TrainOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.scenes import PointCloud
@@ -21,7 +21,7 @@ from coliags_plugin.engine.held_light import flatten
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.engine.training import TrainingRequest, open_training
+from coliags_plugin.engine.training import open_training
 from coliags_plugin.export.baking import exporting
 from coliags_plugin.export.baking.exporting import export_run, import_run
 from coliags_plugin.export.splats.cloud import read_splats, write_splats
@@ -56,9 +56,9 @@ def trained_on(scene, path, resumed=False):
     for module in (training_module, trained_module):
         patch.setattr(module, "load_scene", lambda config, _: scene.with_near_plane(config.near_plane))
     try:
-        request = TrainingRequest("coliags-plus", path, (*TINY, "datamanager.name=c3vd", "schedule.steps=6"))
+        options = TrainOptions("coliags-plus", path, steps=6, settings=(*TINY, "datamanager.name=c3vd"))
         for if_exists in ("refuse", "continue") if resumed else ("refuse",):
-            with open_training(request, RunFolder(path / "run"), CPU, if_exists) as trainer:
+            with open_training(options, RunFolder(path / "run"), CPU, if_exists) as trainer:
                 trainer.train()
         return load_trained(path / "run", CPU)
     finally:
