@@ -62,6 +62,13 @@ class Model(nn.Module):
         scaled = camera if self.scale == 1.0 else camera.scaled(self.scale)
         return replace(scaled, near_plane=self.near_plane)
 
+    def adjusted(self, camera: Camera, view: View | None) -> Camera:
+        """A :meth:`placed` camera as the view modules adjust it for a view; None for a free camera."""
+        camera = self.placed(camera)
+        for module in self.view_modules.values():
+            camera = module.adjust_camera(camera, view)
+        return camera
+
     def in_scene_units(self, output: RenderOutput) -> RenderOutput:
         """An output rendered from a :meth:`placed` camera, with its camera and depths in scene units."""
         if self.scale == 1.0:
@@ -96,9 +103,7 @@ class Model(nn.Module):
         free camera; ``pixels`` are columns and rows of the only ones to render, [P, 2]; ``generator``, in training, is
         of the random samples of renderers and fields that have any, and None renders without chance.
         """
-        camera, modules = self.placed(camera), self.view_modules.values()
-        for module in modules:
-            camera = module.adjust_camera(camera, view)
+        camera, modules = self.adjusted(camera, view), self.view_modules.values()
         needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))]))
         if generator is None:
             stages = [self.renderer.render(self.field, camera, needed, pixels)]

@@ -1,1 +1,1 @@
-"""What leaves a run: files of Gaussians, baked appearance and the viewer."""
+"""Export of runs: files of Gaussians, baked appearance and the viewer."""

@@ -63,19 +63,19 @@ def colorize_depth(
     """
     depth = as_array(depth_mm).astype(np.float64)
     low, high = limits
-    known = np.isfinite(depth)
-    image = colored((np.where(known, depth, low) - low) / (high - low), "depth")
-    image[~known] = hatch(*known.shape)[~known] if hatched else UNKNOWN_GREY
+    finite = np.isfinite(depth)
+    image = colored((np.where(finite, depth, low) - low) / (high - low), "depth")
+    image[~finite] = hatch(*finite.shape)[~finite] if hatched else UNKNOWN_GREY
     return image
 
 
 def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, float]:
-    """From 0 to the largest 99th percentile of depths in any unit, rounded up to two significant digits.
+    """Range from 0 to the largest 99th percentile of depths in any unit, rounded up to two significant digits.
 
     For rendered depths, some of which may be far off; what is not finite is unknown.
     """
-    known = [depth[np.isfinite(depth)] for depth in depths]
-    largest = max((float(np.percentile(values, 99.0)) for values in known if values.size), default=0.0)
+    finite = [depth[np.isfinite(depth)] for depth in depths]
+    largest = max((float(np.percentile(values, 99.0)) for values in finite if values.size), default=0.0)
     if largest <= 0.0:
         return 0.0, 1.0
     step = 10.0 ** (math.floor(math.log10(largest)) - 1)
@@ -83,11 +83,11 @@ def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, fl
 
 
 def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor], unit: str = "mm") -> tuple[float, float]:
-    """From 0 to the largest known depth, rounded up to 10 mm; in another unit than mm, :func:`common_limits`."""
+    """Range from 0 to the largest finite depth, rounded up to 10 mm; :func:`common_limits` in another unit than mm."""
     if unit != "mm":
         return common_limits(map(as_array, depths))
-    known = [array[np.isfinite(array)] for array in map(as_array, depths)]
-    largest = max((float(values.max()) for values in known if values.size), default=0.0)
+    finite = [array[np.isfinite(array)] for array in map(as_array, depths)]
+    largest = max((float(values.max()) for values in finite if values.size), default=0.0)
     return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))
 
 
@@ -102,13 +102,13 @@ def depth_error(
     infinite where only the rendering is not finite, and 0 where the truth is unknown.
     """
     rendered, true = (as_array(depth).astype(np.float64) for depth in (rendered_mm, true_mm))
-    known = np.isfinite(true)
+    counts = np.isfinite(true)
     if valid is not None:
-        known = known & as_array(valid).astype(bool)
+        counts = counts & as_array(valid).astype(bool)
     error = np.zeros_like(true)
-    error[known] = np.abs(rendered[known] - true[known])
-    error[known & ~np.isfinite(rendered)] = np.inf
-    return error, known
+    error[counts] = np.abs(rendered[counts] - true[counts])
+    error[counts & ~np.isfinite(rendered)] = np.inf
+    return error, counts
 
 
 def rgb_error(
@@ -125,11 +125,11 @@ def rgb_error(
 
 
 def colorize_error(
-    error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
+    error: Float[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], limit: float
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped error of 0 to ``limit`` and more; pixels without ground truth are hatched in grey."""
-    image = colored(np.where(known, error, 0.0) / limit, "error")
-    image[~known] = hatch(*known.shape)[~known]
+    image = colored(np.where(valid, error, 0.0) / limit, "error")
+    image[~valid] = hatch(*valid.shape)[~valid]
     return image
 
 

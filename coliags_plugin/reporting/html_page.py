@@ -142,12 +142,12 @@ def columns_of(count: int) -> int:
     return math.ceil(count / math.ceil(count / 4)) if count else 1
 
 
-def _remove_former(folder: Path, kept: set[str]) -> None:
+def _remove_former(folder: Path, present: set[str]) -> None:
     """Remove the pictures of a former page of this name that this one has not."""
     if not folder.is_dir():
         return
     for file in folder.iterdir():
-        if _NAME.fullmatch(file.name) and file.name not in kept:
+        if _NAME.fullmatch(file.name) and file.name not in present:
             file.unlink()
     if not any(folder.iterdir()):
         shutil.rmtree(folder)

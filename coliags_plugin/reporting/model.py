@@ -125,7 +125,9 @@ class Table(Block):
                 for column, cell in zip(self.columns, row, strict=True):
                     if cell.note and column.shown is shown:
                         keys.setdefault(cell.note, {})[column.key] = None
-        return {text: Footnote(_mark(index), text, tuple(own)) for index, (text, own) in enumerate(keys.items())}
+        return {
+            text: Footnote(_mark(index), text, tuple(columns)) for index, (text, columns) in enumerate(keys.items())
+        }
 
 
 @dataclass(frozen=True)

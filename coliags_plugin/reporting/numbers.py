@@ -96,10 +96,10 @@ def ranks_of(keys: Sequence[float | None], direction: Direction | None) -> list[
     """
     sign = -1.0 if direction == "higher" else 1.0
     signed = [None if key is None else sign * key for key in keys]
-    known = [key for key in signed if key is not None]
-    if direction is None or len(known) < 2:
+    ranked = [key for key in signed if key is not None]
+    if direction is None or len(ranked) < 2:
         return [None] * len(signed)
-    return [None if key is None else 1 + sum(other < key for other in known) for key in signed]
+    return [None if key is None else 1 + sum(other < key for other in ranked) for key in signed]
 
 
 def sentence(text: str) -> str:

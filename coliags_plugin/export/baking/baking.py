@@ -165,12 +165,12 @@ def bake(
         facts = {"steps": distil(baked, trained, light, seconds, most_steps), "seconds": seconds} if needs else {}
         return cloud_of_field(baked).scaled(1.0 / scale), facts
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
-    averages, seen = _averaged(trained, views, light)
+    averages, colors = _averaged(trained, views, light)
     slots = averages.visible()
     visible, steps = len(slots), 0
 
     def field(slots: Int[Tensor, "N"]) -> ExplicitGaussians:
-        return averages.field(slots, fit_harmonics(seen, slots, averages.mean_colors(slots), degree), kind)
+        return averages.field(slots, fit_harmonics(colors, slots, averages.mean_colors(slots), degree), kind)
 
     if most is not None:
         slots = averages.heaviest(most)
@@ -190,7 +190,7 @@ def _averaged(
     averages = GaussianAverages(
         field.element_count, field.slots_per_element, 2 if field.primitive == "surfels" else 3, trained.device
     )
-    seen: list[SeenColors] = []
+    colors: list[SeenColors] = []
     every = -(-len(views) // _COLOR_VIEWS)
     with ProgressReport("bake: average over views", len(views)) as progress:
         for index, frame in enumerate(views):
@@ -200,9 +200,9 @@ def _averaged(
             weights = blending_weights(renderer, gaussians, camera)
             averages.add(gaussians, weights, camera)
             if index % every == 0:
-                seen.append(SeenColors.of(gaussians, weights, camera))
+                colors.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)
-    return averages, seen
+    return averages, colors
 
 
 #: Added to the normal equations of coefficients above degree 0, whose weights add up to 1: a Gaussian seen along one

@@ -94,7 +94,7 @@ def distil(
     order: list[int] = []
     start, step = time.monotonic(), 0
     with ProgressReport("fit to what the run renders", steps) as progress:
-        while (done := max(step / steps, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
+        while (share := max(step / steps, (time.monotonic() - start) / max(seconds, 1e-9))) < 1.0:
             step += 1
             order = order or torch.randperm(len(views), generator=chance).tolist()
             index = order.pop()
@@ -111,9 +111,9 @@ def distil(
             adam.zero_grad(set_to_none=True)
             torch.autograd.backward(loss)
             for group in adam.param_groups:
-                group["lr"] = log_linear(rates[group["name"]], _LAST * rates[group["name"]], done)
+                group["lr"] = log_linear(rates[group["name"]], _LAST * rates[group["name"]], share)
             adam.step()
-            progress.update(max(step, int(done * steps)), f"loss {float(loss.detach()):.4f}")
+            progress.update(max(step, int(share * steps)), f"loss {float(loss.detach()):.4f}")
     return step
 
 
@@ -121,13 +121,13 @@ def beside(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera
     """A random camera between each two neighbours of a path, moved and turned a little; one beside a single camera."""
     pairs = list(pairwise(cameras)) or [(cameras[0], cameras[0])]
     steps = sorted(float((a.center - b.center).norm()) for a, b in pairs)
-    made = []
+    cameras_beside = []
     for pair in pairs:
         share = float(torch.rand((), generator=generator))
         turn, shift = (size * torch.randn(3, generator=generator) for size in (_TURN, _SHIFT * steps[len(steps) // 2]))
         moved = mean_camera(pair, (1.0 - share, share)).moved(turn, shift, 0.0)
-        made.append(replace(moved, camera_to_world=moved.camera_to_world.to(pair[0].camera_to_world)))
-    return made
+        cameras_beside.append(replace(moved, camera_to_world=moved.camera_to_world.to(pair[0].camera_to_world)))
+    return cameras_beside
 
 
 def _some(views: list[_View]) -> list[_View]:
@@ -137,10 +137,10 @@ def _some(views: list[_View]) -> list[_View]:
 
 
 def needs_distillation(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> bool:
-    """Whether Gaussians miss training frames in a light by more than the run does."""
+    """Tell whether Gaussians miss training frames in a light by more than the run does."""
     compared = _compared(field, trained, light, trained.scene.train[:: -(-len(trained.scene.train) // _COMPARED)])
-    own, baked, _ = compared.mean(0).tolist()
-    return bool(baked > _MUCH * own)
+    run_error, error, _ = compared.mean(0).tolist()
+    return bool(error > _MUCH * run_error)
 
 
 def best_frame(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight | None) -> int:
@@ -150,8 +150,8 @@ def best_frame(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight |
     largest median depth: not of a wall close to the lens, but along the lumen.
     """
     every = -(-len(trained.scene.train) // (2 * _COMPARED))
-    own, baked, depths = _compared(field, trained, light, trained.scene.train[::every]).unbind(1)
-    losses = baked / own.clamp_min(1e-12)
+    run_errors, errors, depths = _compared(field, trained, light, trained.scene.train[::every]).unbind(1)
+    losses = errors / run_errors.clamp_min(1e-12)
     return every * int(depths.where(losses <= _NEARLY * losses.min(), -1.0).argmax())
 
 
@@ -191,8 +191,6 @@ def model_of_gaussians(field: ExplicitGaussians, trained: TrainedRun) -> Model:
 @torch.no_grad()
 def adjusted_camera(trained: TrainedRun, frame: Frame) -> Camera:
     """Camera of a frame, scene units, as the run's view modules adjust it, float32 on the run's device."""
-    camera = trained.model.placed(frame.camera.to(trained.device))
     view = frame.view(trained=frame.name in trained.training_frames)
-    for module in trained.model.view_modules.values():
-        camera = module.adjust_camera(camera, view)
+    camera = trained.model.adjusted(frame.camera.to(trained.device), view)
     return camera.scaled(1.0 / trained.model.scale).to(dtype=torch.float32)

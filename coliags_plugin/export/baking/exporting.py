@@ -81,12 +81,14 @@ def export_run(trained: TrainedRun, options: ExportOptions) -> list[Exported]:
         for target in (output, _record_file(output)):
             refuse_existing(target, options.overwrite, "a new file")
     field = _gaussian_field(trained)
-    baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-    held = baked_in if field.knows_lamp else None
-    cloud, facts = bake(trained, baked_in, options.seconds)
-    baking = {"light": light_facts(light, field, baked_in), **facts} if facts else None
-    cloud = _checked(cloud.with_thickness(), trained)
-    return [_written(trained, cloud, form, output, baking, held, options.measure) for form, output in outputs.items()]
+    held_lamp = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
+    cloud, facts = bake(trained, held_lamp, options.seconds)
+    baking = {"light": light_facts(light, field, held_lamp), **facts} if facts else None
+    cloud = cloud.with_thickness().checked(trained.run.path)
+    cost_light = held_lamp if field.knows_lamp else None
+    return [
+        _written(trained, cloud, form, output, baking, cost_light, options.measure) for form, output in outputs.items()
+    ]
 
 
 def light_facts(name: str, field: GaussianField, light: HeldLight | None) -> dict[str, Any] | None:
@@ -104,7 +106,7 @@ def _written(
     form: str,
     output: Path,
     baking: Mapping[str, Any] | None,
-    held: HeldLight | None,
+    light: HeldLight | None,
     measure: bool,
 ) -> Exported:
     unit = trained.scene.length_unit
@@ -134,7 +136,7 @@ def _written(
             "step": trained.step,
         },
         "baking": baking,
-        "cost": export_cost(trained, stored, held) if measure else None,
+        "cost": export_cost(trained, stored, light) if measure else None,
         "software": software(),
     }
     write_json(_record_file(output), record)
@@ -160,16 +162,6 @@ def _gaussian_field(trained: TrainedRun) -> GaussianField:
     return field
 
 
-def _checked(cloud: SplatCloud, trained: TrainedRun) -> SplatCloud:
-    """The Gaussians that are finite, at least one."""
-    usable = cloud.usable()
-    if not usable.any():
-        raise InputError(f"{trained.run.path} has no Gaussian to write", "a run whose field holds at least one")
-    if not usable.all():
-        log.warning("left out %d of %d Gaussians that are not finite", int((~usable).sum()), len(cloud))
-    return cloud.part(usable)
-
-
 def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None) -> dict[str, dict[str, Any]]:
     """Compare a cloud with its run on every held-out view, by the run's protocol; means per test set.
 
@@ -187,17 +179,17 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
     scorer = Scorer(trained.config.protocol, _METRICS)
     baked = model_of_gaussians(field_of_cloud(cloud), trained)
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
-    found, done = {}, 0
+    costs, count = {}, 0
     with ProgressReport("compare with the run", sum(map(len, sets.values()))) as progress:
         for name, frames in sets.items():
             rows = []
             for frame in frames:
                 rows.append(_scores(trained, scorer, baked, frame.to(trained.device), light))
-                progress.update(done := done + 1)
+                progress.update(count := count + 1)
             means = {part: _means([row[part] for row in rows]) for part in rows[0]}
             run, export = means["run"], means["export"]
             both = [metric for metric in run if metric in export]
-            found[name] = {
+            costs[name] = {
                 "frames": len(rows),
                 "run": run,
                 "export": export,
@@ -205,7 +197,7 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
                 "psnr_between": means["between"].get("psnr"),
                 "psnr_recorded": means["recorded"].get("psnr"),
             }
-    return found
+    return costs
 
 
 def cost_lines(cost: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -226,8 +218,8 @@ def _scores(
     run = scorer.protocol.compare(scorer.render(trained.model, frame), frame)
     frame = replace(frame, camera=adjusted_camera(trained, frame))
     export = scorer.protocol.compare(scorer.render(baked, frame), frame)
-    held = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
-    at_light = held.rgb + (run.true_rgb - run.rgb)
+    relit = scorer.protocol.compare(render_held(trained.model, frame.camera, light, scorer.wants), frame)
+    at_light = relit.rgb + (run.true_rgb - run.rgb)
 
     def values(comparison: Comparison, true_rgb: torch.Tensor) -> dict[str, float]:
         return scorer.score(replace(comparison, true_rgb=true_rgb)).values
@@ -235,7 +227,7 @@ def _scores(
     return {
         "run": values(run, run.true_rgb),
         "export": values(export, at_light),
-        "between": values(export, held.rgb),
+        "between": values(export, relit.rgb),
         "recorded": values(export, run.true_rgb),
     }
 
@@ -243,7 +235,7 @@ def _scores(
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means of the metrics that some frame has, over the frames that have them."""
     values = {name: [row[name] for row in rows if name in row] for name in _METRICS}
-    return {name: sum(found) / len(found) for name, found in values.items() if found}
+    return {name: sum(numbers) / len(numbers) for name, numbers in values.items() if numbers}
 
 
 def import_run(
@@ -285,12 +277,12 @@ def _warn_of_another_frame(trainer: Trainer, cloud: SplatCloud, file: Path) -> N
     """Say so where the training cameras have hardly any Gaussian in their images, or some views show nothing."""
     scene, model = trainer.scene, trainer.model
     means = torch.from_numpy(cloud.means).double()
-    seen = torch.zeros(len(means), dtype=torch.bool)
+    in_view = torch.zeros(len(means), dtype=torch.bool)
     for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
-        seen |= frame.camera.to(dtype=torch.float64).sees(means)[1]
-    share = float(seen.float().mean())
+        in_view |= frame.camera.to(dtype=torch.float64).sees(means)[1]
+    share = float(in_view.float().mean())
     if share < _FEW:
-        seen_of_it = f"{100.0 * share:.2g} % of the Gaussians lie in the view of a training camera"
+        finding = f"{100.0 * share:.2g} % of the Gaussians lie in the view of a training camera"
     else:
         views = [frame for frames in scene.test_sets.values() for frame in frames] or scene.train
         placed = [frame.to(trainer.device) for frame in views[:: max(1, len(views) // _CAMERAS)]]
@@ -299,6 +291,6 @@ def _warn_of_another_frame(trainer: Trainer, cloud: SplatCloud, file: Path) -> N
         )
         if not blank:
             return
-        seen_of_it = f"{blank} of {len(placed)} views of it show nothing, nothing nearer than near_plane is drawn"
+        finding = f"{blank} of {len(placed)} views of it show nothing, nothing nearer than near_plane is drawn"
     question = "is it in the world frame and unit (%s) of scene '%s'?"
-    log.warning(f"%s: %s; {question}", file, seen_of_it, scene.length_unit, scene.name)
+    log.warning(f"%s: %s; {question}", file, finding, scene.length_unit, scene.name)

@@ -79,9 +79,9 @@ class SplatCloud:
         inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
         return np.asarray(logit(inside), np.float32)
 
-    def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
+    def part(self, chosen: Bool[np.ndarray, "N"]) -> SplatCloud:
         """Some of the Gaussians."""
-        return SplatCloud(**{name: values[kept] for name, values in self._arrays().items()})
+        return SplatCloud(**{name: values[chosen] for name, values in self._arrays().items()})
 
     def scaled(self, factor: float) -> SplatCloud:
         """The Gaussians in a world whose lengths are ``factor`` times as large."""
@@ -93,13 +93,27 @@ class SplatCloud:
         """The arrays that it has, by the names of their fields."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
+    @property
     def usable(self) -> Bool[np.ndarray, "N"]:
-        """Which Gaussians are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
+        """Mask of Gaussians that are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
         parts = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in self._arrays().values()]
         with np.errstate(over="ignore", invalid="ignore"):
             parts.append(np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
             parts += [(np.abs(lengths) <= bounds.LENGTH).all(axis=1) for lengths in (self.means, self.scales)]
         return np.all(parts, axis=0)
+
+    def checked(self, source: object) -> SplatCloud:
+        """The usable Gaussians, of which there must be one; the number of others is a warning that names the source."""
+        usable = self.usable
+        count = int(usable.sum())
+        if not count:
+            raise InputError(
+                f"{source} has {len(self)} Gaussians, none of which is usable", "finite numbers, rotations not 0"
+            )
+        if count < len(self):
+            text = "%s: dropped %d of %d Gaussians that are not finite or have no rotation"
+            log.warning(text, source, len(self) - count, len(self))
+        return self if count == len(self) else self.part(usable)
 
     def with_thickness(self) -> SplatCloud:
         """Surfels as flat Gaussians, with a third scale; Gaussians unchanged."""
@@ -166,14 +180,4 @@ def read_splats(path: Path) -> SplatCloud:
     if read is None:
         formats = ", ".join(f".{name}" for name in SPLAT_FORMATS if reader_of(name))
         raise InputError(f"{path}: no reader for '{path.suffix}'", f"a file {formats}")
-    cloud = read(path)
-    usable = cloud.usable()
-    dropped = len(cloud) - int(usable.sum())
-    if dropped == len(cloud):
-        raise InputError(
-            f"{path} has {len(cloud)} Gaussians, none of which is usable", "finite numbers, rotations not 0"
-        )
-    if dropped:
-        log.warning("%s: dropped %d of %d Gaussians that are not finite or have no rotation", path, dropped, len(cloud))
-        cloud = cloud.part(usable)
-    return cloud
+    return read(path).checked(path)

@@ -67,8 +67,8 @@ def read(path: Path) -> SplatCloud:
     per_channel = len(rest) // 3
     counts = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
     if len(rest) % 3 or per_channel not in counts or set(rest) != {f"f_rest_{index}" for index in range(len(rest))}:
-        known = ", ".join(str(3 * count) for count in counts)
-        raise InputError(f"{path}: {len(rest)} properties f_rest_*", f"f_rest_0 and so on, {known} of them")
+        numbers = ", ".join(str(3 * count) for count in counts)
+        raise InputError(f"{path}: {len(rest)} properties f_rest_*", f"f_rest_0 and so on, {numbers} of them")
     higher = np.array([columns[f"f_rest_{index}"] for index in range(len(rest))], np.float32)
     higher = higher.reshape(3, per_channel, len(columns["x"])).transpose(2, 1, 0)
     scales = _SCALES if "scale_2" in columns else _SCALES[:2]

@@ -246,23 +246,23 @@ def _page_of_gaussians(
     most_steps: int | None,
 ) -> ScenePage:
     light, largest = options.light, options.largest
-    held = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
+    lamp = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
     empty = len(_html(trained, path, meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
-    kind = AttenuatedGaussians if held is None and field.knows_lamp else ExplicitGaussians
-    splats, baking = bake(trained, held, options.seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
-    first = best_frame(field_of_cloud(splats), trained, held)
+    kind = AttenuatedGaussians if lamp is None and field.knows_lamp else ExplicitGaussians
+    splats, baking = bake(trained, lamp, options.seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
+    first = best_frame(field_of_cloud(splats), trained, lamp)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
     while empty + (size := len(json.dumps(layer.packed))) > largest:
         splats = most_visible(splats, int(_CAUTION * len(splats) * (largest - empty) / size))
         layer, drawn = Layer.of_cloud("Gaussians", splats)
-    cost = export_cost(trained, drawn, held if field.knows_lamp else None)
-    told = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
+    cost = export_cost(trained, drawn, lamp if field.knows_lamp else None)
+    parts = [f"step {trained.step}", f"{len(splats):,} of {baking['visible']:,} Gaussians"]
     if field.knows_lamp:
-        told.append(f"{light} light")
-    text = "; ".join([*told, *cost_lines(cost)])
-    facts = {"gaussians": len(splats), "baking": {"light": light_facts(light, field, held), **baking}, "cost": cost}
+        parts.append(f"{light} light")
+    text = "; ".join([*parts, *cost_lines(cost)])
+    facts = {"gaussians": len(splats), "baking": {"light": light_facts(light, field, lamp), **baking}, "cost": cost}
     html = _html(trained, path, [replace(layer, about=text), *meshes], splats, first)
     return ScenePage(html, f"{trained.method} on {trained.scene.name}, {text}", facts)
 
@@ -281,16 +281,16 @@ def _html(
 
 def look_distance(scene: Scene, camera: Camera, points: Float[Tensor, "N 3"]) -> float:
     """Median depth, in a view, of points in the world; of none, the extent of the scene."""
-    depth, seen = camera.to("cpu", torch.float64).sees(points.detach().cpu().double())
-    return float(depth[seen].median()) if seen.any() else scene.extent or 1.0
+    depth, in_view = camera.to("cpu", torch.float64).sees(points.detach().cpu().double())
+    return float(depth[in_view].median()) if in_view.any() else scene.extent or 1.0
 
 
 def most_visible(splats: SplatCloud, count: int) -> SplatCloud:
     """At most so many splats: those that cover most, by opacity times area seen from the front, in their order."""
     covers = splats.opacities * np.sort(splats.scales, axis=1)[:, 1:].prod(axis=1)
-    kept = np.zeros(len(splats), bool)
-    kept[np.argsort(-covers, kind="stable")[:count]] = True
-    return splats.part(kept)
+    chosen = np.zeros(len(splats), bool)
+    chosen[np.argsort(-covers, kind="stable")[:count]] = True
+    return splats.part(chosen)
 
 
 def mesh_files(run: Path) -> dict[str, Path]:

@@ -101,19 +101,19 @@ class LumenSection:
     end: float
 
     def holds(self, arc: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-        """Which places are inside. [N]"""
+        """Mask of places that are inside. [N]"""
         return np.asarray((arc >= self.start) & (arc <= self.end))
 
     @property
     def length(self) -> float:
-        """From end to end, mm."""
+        """Length from end to end, mm."""
         return self.end - self.start
 
 
 def find_section(
     arc: Float[np.ndarray, "F"], areas: Float[np.ndarray, "F"], seen: Bool[np.ndarray, "F"]
 ) -> LumenSection:
-    """From the first to the last place at which half of the wall was seen, over windows of 10 mm; not shorter than one.
+    """Section from the first to the last place with half of the wall seen, over windows of 10 mm; no shorter than one.
 
     ``arc`` is the place of each triangle along the centreline, mm; wall that is missing has to be among them.
     """
@@ -259,7 +259,7 @@ class TubeGrid:
 
     @property
     def there(self) -> Bool[np.ndarray, "M C"]:
-        """Where there is wall. [M, C]"""
+        """Mask of cells with wall. [M, C]"""
         return np.asarray(self.triangle >= 0)
 
 

@@ -139,12 +139,12 @@ def _along_lumen(
     line = find_centreline(mesh, [view.camera_to_world for view in views])
     guess = guessed_wall(wall_around(mesh, line))
     whole, guessed = _joined(mesh, guess)
-    seen = _extended(face_views, len(guess))
-    level = classify(seen, settings)
+    whole_views = _extended(face_views, len(guess))
+    level = classify(whole_views, settings)
     arc, clock, _ = line.unroll(whole.centers)
     # Beyond the ends of the centreline nothing was guessed, so that the share of wall seen there says nothing.
     along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
-    section = find_section(arc[along], whole.areas[along], seen.seen[along])
+    section = find_section(arc[along], whole.areas[along], whole_views.seen[along])
     grid = wall_around(whole, line)
     missed = (level == Level.UNSEEN) & section.holds(arc)
     pairs = np.concatenate(
@@ -155,11 +155,13 @@ def _along_lumen(
         for triangles in large_regions(missed, pairs, whole.areas, settings.region_area)
     ]
     names = [view.name for view in views]
-    return WallCoverage(whole, guessed, seen, level, names, settings, True, line, arc, clock, section, grid, regions)
+    return WallCoverage(
+        whole, guessed, whole_views, level, names, settings, True, line, arc, clock, section, grid, regions
+    )
 
 
 def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:
-    """Both meshes as one without colours, and which triangles are the second's."""
+    """Join two meshes, without colours; returns which triangles are the second's too."""
     vertices = np.concatenate([mesh.vertices, guess.vertices.astype(mesh.vertices.dtype)])
     triangles = np.concatenate([mesh.triangles, guess.triangles + len(mesh.vertices)])
     return TriangleMesh(vertices, triangles), np.arange(len(triangles)) >= len(mesh)
@@ -223,15 +225,15 @@ def neighbours(mesh: TriangleMesh) -> Int[np.ndarray, "E 2"]:
 
 
 def near_pairs(
-    centers: Float[np.ndarray, "F 3"], one: Bool[np.ndarray, "F"], other: Bool[np.ndarray, "F"], within: float
+    centers: Float[np.ndarray, "F 3"], first: Bool[np.ndarray, "F"], second: Bool[np.ndarray, "F"], within: float
 ) -> Int[np.ndarray, "E 2"]:
-    """Each triangle of one set and the nearest of the other, where their centroids are within a distance, mm. [E, 2]"""
-    first, second = np.flatnonzero(one), np.flatnonzero(other)
-    if not len(first) or not len(second):
+    """Pairs of triangles of two sets: the nearest, if their centroids are within a distance, mm. [E, 2]"""
+    rows, columns = np.flatnonzero(first), np.flatnonzero(second)
+    if not len(rows) or not len(columns):
         return np.zeros((0, 2), np.int64)
-    distance, nearest = cKDTree(centers[second]).query(centers[first], distance_upper_bound=within)
+    distance, nearest = cKDTree(centers[columns]).query(centers[rows], distance_upper_bound=within)
     near = np.isfinite(distance)
-    return np.stack([first[near], second[np.asarray(nearest)[near]]], axis=1)
+    return np.stack([rows[near], columns[np.asarray(nearest)[near]]], axis=1)
 
 
 def large_regions(
@@ -245,6 +247,6 @@ def large_regions(
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(len(chosen), len(chosen)))
     _, labels = connected_components(graph, directed=False)
     area = np.bincount(labels[inside], areas[inside])
-    kept = np.flatnonzero(area > smallest)
-    kept = kept[np.argsort(-area[kept], kind="stable")]
-    return [inside[labels[inside] == number] for number in kept]
+    large = np.flatnonzero(area > smallest)
+    large = large[np.argsort(-area[large], kind="stable")]
+    return [inside[labels[inside] == number] for number in large]

@@ -219,13 +219,14 @@ def clock_text(degrees: float) -> str:
 
 def coverage_facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
     """Seen wall, section and missed regions, for the page and the terminal."""
-    total, seen = coverage.area(), coverage.area(coverage.level != Level.UNSEEN)
+    total, seen_area = coverage.area(), coverage.area(coverage.level != Level.UNSEEN)
     frames = Fact("frames", str(len(coverage.names)))
     if isinstance(coverage, PartialCoverage):
-        return [Fact("seen", area_text(seen, coverage.metric)), Fact("section", "none", note=coverage.reason), frames]
+        seen = Fact("seen", area_text(seen_area, coverage.metric))
+        return [seen, Fact("section", "none", note=coverage.reason), frames]
     missed = sum(region.area for region in coverage.regions)
     return [
-        Fact("seen", f"{100.0 * seen / total:.0f} % of the wall"),
+        Fact("seen", f"{100.0 * seen_area / total:.0f} % of the wall"),
         Fact("section", f"{coverage.section.length:.0f} mm of the lumen, {total / 100.0:.0f} cm²"),
         Fact("missed regions", f"{len(coverage.regions)}, {missed / 100.0:.1f} cm² together"),
         Fact("place guessed", f"{100.0 * coverage.area(coverage.guessed) / total:.0f} % of the wall"),

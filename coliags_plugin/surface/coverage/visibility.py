@@ -185,7 +185,7 @@ class FaceViews:
 
     @property
     def seen(self) -> Bool[np.ndarray, "F"]:
-        """Whether any frame saw it. [F]"""
+        """Mask of triangles that a frame saw. [F]"""
         return np.asarray(self.frames > 0)
 
 
@@ -208,27 +208,27 @@ def view_hits(
     hit = np.flatnonzero((triangle >= 0) & (z_depth <= max_depth))
     length = np.linalg.norm(grid.directions[hit], axis=1)
     cosine = -np.einsum("nc,nc->n", rays[hit], mesh.normals[triangle[hit]].astype(np.float32)) / length
-    kept = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
-    hit = hit[kept]
-    return RayHits(triangle[hit], hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
+    facing = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
+    hit = hit[facing]
+    return RayHits(triangle[hit], hit, (z_depth[hit] * length[facing]).astype(np.float32), cosine[facing])
 
 
 def _visible_centroids(
     mesh: TriangleMesh, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], max_depth: float
 ) -> RayHits:
-    """Which of some triangles a view sees by their centroids; the nearest ray of its grid stands for each."""
+    """Triangles, of some, whose centroids a view sees; the nearest ray of its grid stands for each."""
     offset = mesh.centers[triangles] - view.center
     local = offset @ view.camera_to_world[:3, :3]
     distance = np.linalg.norm(offset, axis=1)
     normals = mesh.normals[triangles].astype(np.float32)
     cosine = -np.einsum("nc,nc->n", offset, normals) / np.maximum(distance, 1e-9)
     ahead = (local[:, 2] > grid.narrowest_cosine * distance) & (local[:, 2] <= max_depth) & (cosine > 0.0)
-    kept = np.flatnonzero(ahead)
-    rays = grid.nearest(view.lens, view.lens.project(local[kept]))
-    kept, rays = kept[rays >= 0], rays[rays >= 0]
-    blocked = mesh.rays.blocked(view.center, offset[kept])
-    kept, rays = kept[~blocked], rays[~blocked]
-    return RayHits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
+    visible = np.flatnonzero(ahead)
+    rays = grid.nearest(view.lens, view.lens.project(local[visible]))
+    visible, rays = visible[rays >= 0], rays[rays >= 0]
+    blocked = mesh.rays.blocked(view.center, offset[visible])
+    visible, rays = visible[~blocked], rays[~blocked]
+    return RayHits(triangles[visible], rays, distance[visible].astype(np.float32), cosine[visible].astype(np.float32))
 
 
 def facing_cameras(mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings) -> TriangleMesh:

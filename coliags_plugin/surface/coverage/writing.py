@@ -94,7 +94,7 @@ def colored_mesh(coverage: SeenWall) -> TriangleMesh:
 
 def coverage_values(coverage: WallCoverage | PartialCoverage) -> dict[str, Any]:
     """Everything that is measured as JSON values: null is what only a section has, and limits that were not applied."""
-    views, seen, total = coverage.views, coverage.inside & coverage.views.seen, coverage.area()
+    views, shown, total = coverage.views, coverage.inside & coverage.views.seen, coverage.area()
     settings, seen_area = coverage.settings.model_dump(), coverage.area(coverage.level != Level.UNSEEN)
     values = {
         "note": RESEARCH_USE,
@@ -105,10 +105,10 @@ def coverage_values(coverage: WallCoverage | PartialCoverage) -> dict[str, Any]:
         "seen_area": seen_area,
         "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
         "seen_surface": {
-            "median_distance": _median(coverage, views.distance, seen),
-            "median_incidence_degrees": _median(coverage, views.incidence, seen),
-            "median_pixels_per_length": _median(coverage, views.pixels_per_length, seen),
-            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
+            "median_distance": _median(coverage, views.distance, shown),
+            "median_incidence_degrees": _median(coverage, views.incidence, shown),
+            "median_pixels_per_length": _median(coverage, views.pixels_per_length, shown),
+            "median_frames": _median(coverage, views.frames.astype(np.float32), shown),
         },
     }
     if isinstance(coverage, PartialCoverage):

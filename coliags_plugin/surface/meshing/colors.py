@@ -36,16 +36,16 @@ def best_colors(
     places = torch.from_numpy(points).double()
     total, weight = torch.zeros(len(places), 3), torch.zeros(len(places))
     for view in views:
-        inside, pixels, seen, _ = looked_at(view, places)
-        chosen, at = inside[seen], pixels[seen]
+        inside, pixels, shown, _ = looked_at(view, places)
+        chosen, at = inside[shown], pixels[shown]
         column, row = at.long().unbind(1)
         quality = view.quality[row, column] ** _POWER
         total[chosen] += quality[:, None] * bilinear(view.image().float(), at[None])[0]
         weight[chosen] += quality
     colors = (total / weight.clamp(min=torch.finfo().tiny)[:, None]).round().clamp(0, 255).to(torch.uint8).numpy()
-    known = weight.numpy() > 0
-    if known.any() and not known.all():
-        colors[~known] = colors[known][cKDTree(points[known]).query(points[~known])[1]]
+    colored = weight.numpy() > 0
+    if colored.any() and not colored.all():
+        colors[~colored] = colors[colored][cKDTree(points[colored]).query(points[~colored])[1]]
     return np.asarray(colors)
 
 
@@ -60,8 +60,8 @@ def best_texture(
     a triangle have the colour of the nearest one with.
     """
     size = min(math.ceil(math.sqrt(mesh.areas.sum() / _COVERED) / texel), _LARGEST)
-    open3d, made = import_open3d("lays out textures"), mesh.to_open3d()
-    if broken := len(made.get_non_manifold_edges()):  # at which UVAtlas ends the process
+    open3d, layout = import_open3d("lays out textures"), mesh.to_open3d()
+    if broken := len(layout.get_non_manifold_edges()):  # at which UVAtlas ends the process
         raise InputError(
             f"{broken} edges of the mesh have more than two triangles",
             "a surface",
@@ -69,11 +69,11 @@ def best_texture(
         )
     parts = 1 + len(mesh) // _AT_ONCE
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        made.compute_uvatlas(size=size, gutter=_GUTTER, max_stretch=_STRETCH, parallel_partitions=parts)
-    baked = made.bake_vertex_attr_textures(size, {"positions"}, fill=math.nan, update_material=False)
+        layout.compute_uvatlas(size=size, gutter=_GUTTER, max_stretch=_STRETCH, parallel_partitions=parts)
+    baked = layout.bake_vertex_attr_textures(size, {"positions"}, fill=math.nan, update_material=False)
     places = baked["positions"].numpy()
-    known = np.isfinite(places).all(axis=-1)
+    covered = np.isfinite(places).all(axis=-1)
     image = np.zeros((size, size, 3), np.uint8)
-    image[known] = best_colors(places[known], views)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return Texture(image[tuple(nearest)], made.triangle.texture_uvs.numpy())
+    image[covered] = best_colors(places[covered], views)
+    nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return Texture(image[tuple(nearest)], layout.triangle.texture_uvs.numpy())

@@ -118,32 +118,32 @@ def mesh_run(
     return MeshedRun(output, mesh, compared)
 
 
-def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
-    path = given or (None if scene.folder is None else find_true_surface(scene.folder))
-    if path is None or (given is None and not scene.is_metric):
+def _true_surface(scene: Scene, truth: Path | None) -> TrueSurface | None:
+    path = truth or (None if scene.folder is None else find_true_surface(scene.folder))
+    if path is None or (truth is None and not scene.is_metric):
         return None
     unit = "mm" if scene.is_metric else _same_world(scene, path).length_unit
     surface = replace(read_true_surface(path), unit=unit)
     if surface.seen_by:
         return surface
-    seen = first_hits(surface.mesh, scene.train)
-    if not seen.any():
+    hit = first_hits(surface.mesh, scene.train)
+    if not hit.any():
         raise InputError(
             f"no training view of scene '{scene.name}' sees any of {path}",
             "the true surface of this scene, in mm and in the world of its poses",
         )
-    return replace(surface, seen=seen, seen_by="first hit of a pixel of a training frame, cast at the mesh")
+    return replace(surface, seen=hit, seen_by="first hit of a pixel of a training frame, cast at the mesh")
 
 
 def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, "F"]:
     """Triangles that are the first hit of the ray through the centre of an unmasked pixel of any frame. [F]"""
-    seen = np.zeros(len(mesh), bool)
+    first = np.zeros(len(mesh), bool)
     for frame in frames:
         camera = frame.camera.to("cpu", torch.float64)
         directions = camera.rays()[frame.valid.cpu()]
-        hit, _ = mesh.rays.cast(camera.center.numpy(), directions.numpy())
-        seen[hit[hit >= 0]] = True
-    return seen
+        triangle, _ = mesh.rays.cast(camera.center.numpy(), directions.numpy())
+        first[triangle[triangle >= 0]] = True
+    return first
 
 
 def _same_world(scene: Scene, truth: Path) -> Scene:
@@ -163,9 +163,9 @@ def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scen
     write_png(folder / "comparison.png", comparison_picture(mesh, truth, cameras))
     errors = distance_colors(truth.mesh.rays.nearest(mesh.vertices)[0])
     write_mesh(folder / "mesh_error.ply", replace(mesh, colors=errors))
-    seen = np.zeros(len(truth.mesh.vertices), bool)
-    seen[truth.mesh.triangles[truth.seen]] = True
-    gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], seen)
+    shown = np.zeros(len(truth.mesh.vertices), bool)
+    shown[truth.mesh.triangles[truth.seen]] = True
+    gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], shown)
     write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
 
 

@@ -38,16 +38,16 @@ def smoothed(mesh: TriangleMesh, strength: float = 1.0) -> TriangleMesh:
     if not noise * strength > 0.0:
         return mesh
     weight = strength * _WEIGHT * (noise / np.median(np.linalg.norm(edges, axis=-1))) ** 2
-    weights, found = np.full(len(start), weight), start
+    weights, places = np.full(len(start), weight), start
     for _ in range(_PASSES):
         system = (eye_array(len(start)) + bends.T @ (diags_array(weights) @ bends)).tocsr()
         scale = diags_array(1.0 / system.diagonal())
         solved = [
             cg(system, axis, x0=last, rtol=_TOLERANCE, maxiter=_STEPS, M=scale)[0]
-            for axis, last in zip(start.T, found.T, strict=True)
+            for axis, last in zip(start.T, places.T, strict=True)
         ]
-        found = np.stack(solved, axis=1)
-        mesh = replace(mesh, vertices=found.astype(np.float32))
+        places = np.stack(solved, axis=1)
+        mesh = replace(mesh, vertices=places.astype(np.float32))
         weights = weight / (1.0 + (_along_normals(mesh, bends) / noise) ** 2)
     return mesh
 
@@ -136,14 +136,14 @@ def _disk(sides: int, rings: int) -> Int[np.ndarray, "F 3"]:
     return np.concatenate(faces)
 
 
-def _bent_least(mesh: TriangleMesh, known: int) -> TriangleMesh:
-    """Fair the vertices after the first ``known``: minimise their squared Laplacian (:func:`bending`)."""
-    new = np.arange(len(mesh.vertices)) >= known
+def _bent_least(mesh: TriangleMesh, fixed_count: int) -> TriangleMesh:
+    """Fair the vertices after the first ``fixed_count``: minimise their squared Laplacian (:func:`bending`)."""
+    new = np.arange(len(mesh.vertices)) >= fixed_count
     bent = np.zeros(len(new), bool)
     bent[mesh.triangles[new[mesh.triangles].any(axis=1)]] = True
     bends, places = bending(mesh, bent), mesh.vertices.astype(np.float64)
-    free, fixed = bends[:, known:], bends[:, :known] @ places[:known]
-    places[known:] = spsolve((free.T @ free).tocsc(), -(free.T @ fixed))
+    free, fixed = bends[:, fixed_count:], bends[:, :fixed_count] @ places[:fixed_count]
+    places[fixed_count:] = spsolve((free.T @ free).tocsc(), -(free.T @ fixed))
     return TriangleMesh(places.astype(np.float32), mesh.triangles)
 
 
@@ -153,7 +153,7 @@ def _sightings(mesh: TriangleMesh, views: Sequence[DepthView]) -> Float[np.ndarr
     normals = torch.from_numpy(mesh.to_open3d().compute_vertex_normals().vertex.normals.numpy()).double()
     total = torch.zeros(len(places))
     for view in views:
-        chosen, _, seen, through = looked_at(view, places)
+        chosen, _, shown, through = looked_at(view, places)
         front = ((view.camera.center - places[chosen]) * normals[chosen]).sum(dim=1) > 0.0
-        total[chosen] += (seen & front).float() - through.float()
+        total[chosen] += (shown & front).float() - through.float()
     return np.asarray(total)

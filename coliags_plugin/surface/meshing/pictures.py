@@ -28,12 +28,12 @@ _AMBIENT = 0.45
 
 
 def distance_colors(
-    distances: Float[np.ndarray, "N"], known: Bool[np.ndarray, "N"] | None = None
+    distances: Float[np.ndarray, "N"], valid: Bool[np.ndarray, "N"] | None = None
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not known."""
+    """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not valid."""
     colors = colored(distances / DEPTH_ERROR_LIMIT_MM, "error")
-    if known is not None:
-        colors[~known] = UNKNOWN_GREY
+    if valid is not None:
+        colors[~valid] = UNKNOWN_GREY
     return colors
 
 

@@ -164,7 +164,7 @@ def incidence_cosines(depth: Float[Tensor, "H W"], camera: Camera) -> Float[Tens
 
 
 def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], axis: int) -> Float[Tensor, "H W 3"]:
-    """From each point to the next along an axis, or from the last one to it: whichever depths differ less. [H, W, 3]"""
+    """Steps from each point to the next along an axis, or from the last to it: the smaller jump of depth. [H, W, 3]"""
     steps, jumps = torch.diff(points, dim=axis), torch.diff(depth, dim=axis).abs()
     jumps = torch.where(jumps.isfinite(), jumps, torch.inf)
     nothing = torch.full_like(points.narrow(axis, 0, 1), torch.nan)

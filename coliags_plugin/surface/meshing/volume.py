@@ -47,15 +47,15 @@ class Volume:
     def __init__(self, views: Sequence[DepthView], voxel_size: float, truncation: float) -> None:
         self.voxel_size, self.truncation = voxel_size, truncation
         keys = [self._keys_near(view) for view in views if (view.depth > 0).any()]
-        found = np.unique(np.concatenate(keys)) if keys else np.zeros(0, np.int64)
-        if len(found) > _MAX_BLOCKS:
+        blocks = np.unique(np.concatenate(keys)) if keys else np.zeros(0, np.int64)
+        if len(blocks) > _MAX_BLOCKS:
             raise InputError(
                 f"voxels of {voxel_size:.3g} scene units need more than {_MAX_BLOCKS:,} blocks of {_BLOCK}^3 voxels",
                 "larger voxels",
                 f"Try `voxel={2 * voxel_size:.2g}`",
             )
-        self._blocks = np.stack(np.unravel_index(found, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE
-        size = len(found) * _VOXELS
+        self._blocks = np.stack(np.unravel_index(blocks, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE
+        size = len(blocks) * _VOXELS
         self._distance, self._square, self._weight = torch.zeros(size), torch.zeros(size), torch.zeros(size)
         self._support, self._seen = torch.zeros(size), torch.zeros(size)
         for view in views:
@@ -67,12 +67,12 @@ class Volume:
         rays = view.camera.rays_at(torch.stack([column, row], dim=1)).numpy()
         center, z = view.camera.center.numpy(), view.depth[row, column].double().numpy()
         edge, band = _BLOCK * self.voxel_size, self.truncation * self.voxel_size
-        found = []
+        keys = []
         for shift in np.linspace(-band, band, 2 * math.ceil(2 * self.truncation / _BLOCK) + 1):
             places = np.floor((center + (z + shift)[:, None] * rays) / edge).astype(np.int64) + _HALF_RANGE
             # One number per block, as rows take ten times as long to sort.
-            found.append(np.unique(places @ _KEY))
-        return np.unique(np.concatenate(found))
+            keys.append(np.unique(places @ _KEY))
+        return np.unique(np.concatenate(keys))
 
     def _add(self, view: DepthView) -> None:
         camera, band = view.camera, self.truncation * self.voxel_size
@@ -119,8 +119,8 @@ class Volume:
         weight = self._weight.clamp(min=torch.finfo().tiny)
         variance = (self._square / weight - (self._distance / weight) ** 2).clamp(min=0.0)
         agreed = (self._seen >= min_views) & (variance <= max_conflict * self._support)
-        made = self._grid(torch.where(agreed, self._support, 0.0)).extract_triangle_mesh(least)
-        mesh = _in_order(made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64))
+        surface = self._grid(torch.where(agreed, self._support, 0.0)).extract_triangle_mesh(least)
+        mesh = _in_order(surface.vertex.positions.numpy(), surface.triangle.indices.numpy().astype(np.int64))
         return mesh.part(mesh.areas > 0.0)
 
     def _grid(self, weight: Float[Tensor, "N"]) -> Any:
@@ -155,7 +155,7 @@ def _in_order(vertices: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 
 
 
 def _in_frustum(centers: Float[Tensor, "B 3"], camera: Camera, edge: float) -> Bool[Tensor, "B"]:
-    """Which cubes, given in the camera's axes, may be inside its image. [B]"""
+    """Mask of cubes, given in the camera's axes, that may be inside its image. [B]"""
     right, below = camera.width - camera.cx, camera.height - camera.cy
     sides = [[camera.fx, 0, camera.cx], [-camera.fx, 0, right], [0, camera.fy, camera.cy], [0, -camera.fy, below]]
     normals = torch.nn.functional.normalize(torch.tensor(sides, dtype=centers.dtype), dim=1)
