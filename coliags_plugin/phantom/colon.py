@@ -271,7 +271,7 @@ def surface_of(
         vertices=grid.reshape(-1, 3).astype(np.float32),
         normals=unit(normals).reshape(-1, 3).astype(np.float32),
         tangents=unit(along).reshape(-1, 3).astype(np.float32),
-        triangles=_grid_triangles(*grid.shape[:2]),
+        triangles=grid_triangles(*grid.shape[:2]),
         areas=areas.reshape(-1).astype(np.float32),
         arc=arc,
         columns=grid.shape[1],
@@ -291,13 +291,30 @@ def _even_rows(anatomy: Anatomy, spacing: float) -> tuple[Float[np.ndarray, "R"]
     return np.interp(np.linspace(0.0, walked[-1], rows), walked, fine), float(walked[-1])
 
 
-def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "F 3"]:
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+def grid_triangles(rows: int, columns: int, corners: str = "abc dcb", wraps: bool = True) -> Int[np.ndarray, "F 3"]:
+    """Two triangles for each cell of a grid of vertices, whose columns may close upon themselves.
+
+    ``corners`` are theirs: a and c of one row, and b and d of the next.
+    """
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns if wraps else columns - 1), indexing="ij")
     following = (column + 1) % columns
-    a, b = row * columns + column, (row + 1) * columns + column
-    c, d = row * columns + following, (row + 1) * columns + following
-    even, odd = np.stack([a, b, c], axis=-1), np.stack([d, c, b], axis=-1)
-    return np.stack([even, odd], axis=2).reshape(-1, 3).astype(np.uint32)
+    index = {"a": row * columns + column, "b": (row + 1) * columns + column}
+    index |= {"c": row * columns + following, "d": (row + 1) * columns + following}
+    triangles = [np.stack([index[corner] for corner in triangle], axis=-1) for triangle in corners.split()]
+    return np.stack(triangles, axis=2).reshape(-1, 3).astype(np.uint32)
+
+
+def around_the_colon(
+    grid: Float[np.ndarray, "R C 3"], row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N 3"]:
+    """Bilinear values of a grid with periodic columns at fractional rows and columns, in the grid's precision."""
+    columns = grid.shape[1]
+    top, left = row.astype(np.int64), np.floor(column).astype(np.int64)
+    down, right = (row - top).astype(grid.dtype)[:, None], (column - left).astype(grid.dtype)[:, None]
+    flat, a, b = grid.reshape(-1, 3), top * columns + left % columns, top * columns + (left + 1) % columns
+    above = flat[a] * (1.0 - right) + flat[b] * right
+    below = flat[a + columns] * (1.0 - right) + flat[b + columns] * right
+    return np.asarray(above * (1.0 - down) + below * down)
 
 
 def unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:

@@ -115,9 +115,9 @@ def expose(
     step = max(_CHUNK // per_pixel, 1)
 
     def gathered(pose: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        hits = world.tracer.cast(pose, directions)
+        light, _, hits = _look(world, pose, directions, spacing, indirect)
         met[hits.triangle[hits.found]] = True
-        return _seen(world, pose, directions, hits, spacing, indirect)[0]
+        return light
 
     for start in range(0, pixels, step):
         samples = sensor.samples[start : start + step]
@@ -132,38 +132,41 @@ def expose(
     z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
     cover = np.zeros(pixels, np.uint8)
     if world.bodies:
-        cover = _seen(world, camera_to_world, sensor.centers, hits, spacing, None)[1]
+        cover = _look(world, camera_to_world, sensor.centers, spacing, None)[1]
     return Exposure(radiance, z_depth, np.flatnonzero(met), hits, cover)
-
-
-def _seen(
-    world: World,
-    camera_to_world: Float[np.ndarray, "4 4"],
-    directions: Float[np.ndarray, "N 3"],
-    hits: Hits,
-    spacing: float,
-    indirect: IndirectLight | None,
-) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"]]:
-    """Radiance along rays, from the wall and from what is over it, and what that is."""
-    light = np.zeros((len(directions), 3), np.float32)
-    light[hits.found] = shade(world, camera_to_world, directions[hits.found], hits.kept(), spacing, indirect)
-    cover = np.zeros(len(directions), np.uint8)
-    z_depth = hits.z_depth.copy()
-    for body in world.bodies:
-        drawn = body.draw(world.lamps, world.vignetting, camera_to_world, directions, z_depth, light)
-        cover[drawn] = body.cover
-    return light, cover
 
 
 def meter(
     world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
 ) -> Float[np.ndarray, "P 3"]:
     """Radiance of the pixels' centres only, for exposure metering."""
-    hits = world.tracer.cast(camera_to_world, sensor.centers)
-    return _seen(world, camera_to_world, sensor.centers, hits, float(np.sqrt(_pixel_solid_angle(sensor))), indirect)[0]
+    return _look(world, camera_to_world, sensor.centers, float(np.sqrt(_pixel_solid_angle(sensor))), indirect)[0]
 
 
-def shade(
+def _look(
+    world: World,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    directions: Float[np.ndarray, "N 3"],
+    spacing: float,
+    indirect: IndirectLight | None,
+) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N"], Hits]:
+    """Radiance along rays in camera axes with z = 1, from the wall and from bodies over it; covers; hits on the wall.
+
+    ``spacing`` is the distance between neighbouring samples at z-depth 1.
+    """
+    hits = world.tracer.cast(camera_to_world, directions)
+    light = np.zeros((len(directions), 3), np.float32)
+    found = hits.found
+    light[found] = _shade(world, camera_to_world, directions[found], hits.only(found), spacing, indirect)
+    cover = np.zeros(len(directions), np.uint8)
+    z_depth = hits.z_depth.copy()
+    for body in world.bodies:
+        drawn = body.draw(world.lamps, world.vignetting, camera_to_world, directions, z_depth, light)
+        cover[drawn] = body.cover
+    return light, cover, hits
+
+
+def _shade(
     world: World,
     camera_to_world: Float[np.ndarray, "4 4"],
     directions: Float[np.ndarray, "N 3"],
@@ -173,8 +176,7 @@ def shade(
 ) -> Float[np.ndarray, "N 3"]:
     """Radiance reflected from ray hits, all valid, towards the camera.
 
-    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``, summed over lamps. Directions
-    are in camera axes with z = 1; ``spacing`` is the distance between neighbouring samples at z-depth 1.
+    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``, summed over lamps.
     """
     length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
     cos_theta = 1.0 / length

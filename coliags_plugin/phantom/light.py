@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.phantom.colon import RADIUS, ColonSurface
+from coliags_plugin.phantom.colon import RADIUS, ColonSurface, around_the_colon
 from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw
 from coliags_plugin.phantom.streams import smoothstep
 from coliags_plugin.phantom.tracing import Tracer
@@ -51,7 +51,7 @@ class CameraLight:
         tilt = np.radians(preset.tilt)
         offsets = settings.lamps or (settings.light_offset or (0.0, 0.0, 0.0),)
         shares = settings.lamp_shares or (1.0,) * len(offsets)
-        one = cls(
+        lamp = cls(
             offset=offsets[0],
             axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
             spread_law=preset.spread_law,
@@ -62,13 +62,13 @@ class CameraLight:
             diffuse_roughness=settings.diffuse_roughness,
         )
         return tuple(
-            replace(one, offset=offset, share=share / sum(shares))
+            replace(lamp, offset=offset, share=share / sum(shares))
             for offset, share in zip(offsets, shares, strict=True)
         )
 
     @property
     def casts_shadows(self) -> bool:
-        """Whether the lamp is off the optical axis."""
+        """Return whether the lamp is off the optical axis."""
         return bool(np.hypot(self.offset[0], self.offset[1]) > 0.0)
 
     def beam(self, cosine: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
@@ -80,7 +80,7 @@ class CameraLight:
         return np.asarray(shape * smoothstep(cosine / _EDGE), dtype=cosine.dtype)
 
     def position(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
-        """Where it is in the world, mm."""
+        """The lamp's position in the world, mm."""
         return np.asarray(camera_to_world[:3, 3] + camera_to_world[:3, :3] @ np.asarray(self.offset))
 
     def irradiance(
@@ -168,17 +168,8 @@ class IndirectLight:
 
     def at(self, row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
         """Bilinear interpolation between patch centres; columns are periodic."""
-        rows, columns = self.irradiance.shape[:2]
-        y = np.clip(row * self.rows_per_row - 0.5, 0.0, rows - 1.001)
-        x = column * self.columns_per_column - 0.5
-        top, left = y.astype(np.int64), np.floor(x).astype(np.int64)
-        down, right = (y - top).astype(np.float32)[:, None], (x - left).astype(np.float32)[:, None]
-        a, b = left % columns, (left + 1) % columns
-        flat, upper = self.irradiance.reshape(-1, 3), top * columns
-        lower = upper + columns
-        above = flat[upper + a] * (1.0 - right) + flat[upper + b] * right
-        below = flat[lower + a] * (1.0 - right) + flat[lower + b] * right
-        return np.asarray(above * (1.0 - down) + below * down)
+        y = np.clip(row * self.rows_per_row - 0.5, 0.0, len(self.irradiance) - 1.001)
+        return around_the_colon(self.irradiance, y, column * self.columns_per_column - 0.5)
 
 
 @dataclass(frozen=True)

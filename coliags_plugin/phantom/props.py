@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin.phantom.colon import ColonSurface, unit
+from coliags_plugin.phantom.colon import ColonSurface, around_the_colon, grid_triangles, unit
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
@@ -138,11 +138,8 @@ def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh
         along = arc[:, None] * np.cos(turn) + across[None, :] * np.sin(turn)
         slope += 0.03 * np.sin(2.0 * np.pi * (along - speed * time) / scale)
     normals = unit(-down + slope[:, :, None] * side + slope[:, ::-1, None] * np.cross(side, down))
-    row, column = np.meshgrid(np.arange(len(rows) - 1), np.arange(len(across) - 1), indexing="ij")
-    a = row * len(across) + column
-    b = a + len(across)
-    corners = np.stack([np.stack([a, a + 1, b], -1), np.stack([a + 1, b + 1, b], -1)], 2)
-    return _mesh(points.reshape(-1, 3), normals.reshape(-1, 3), corners.reshape(-1, 3))
+    triangles = grid_triangles(len(rows), len(across), "acb cdb", wraps=False)
+    return _mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles)
 
 
 def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh:
@@ -157,17 +154,10 @@ def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> M
     speed = _DRIFT * generator.uniform(0.5, 1.5, clusters)[cluster]
     row = np.interp(arc - speed * time, surface.arc, np.arange(surface.rows))
     column = (clock / (2.0 * np.pi) * surface.columns) % surface.columns
-    low, left = row.astype(int), column.astype(int)
-    down, right = (row - low)[:, None], (column - left)[:, None]
-    following = (left + 1) % surface.columns
-
-    def on_wall(values: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "N 3"]:
-        grid = values.reshape(surface.rows, surface.columns, 3)
-        above = grid[low, left] * (1.0 - right) + grid[low, following] * right
-        below = grid[low + 1, left] * (1.0 - right) + grid[low + 1, following] * right
-        return np.asarray(above * (1.0 - down) + below * down)
-
-    centres = on_wall(surface.vertices) + 0.5 * radius[:, None] * unit(on_wall(surface.normals))
+    shape = (surface.rows, surface.columns, 3)
+    grids = (values.reshape(shape).astype(np.float64) for values in (surface.vertices, surface.normals))
+    foot, normal = (around_the_colon(grid, row, column) for grid in grids)
+    centres = foot + 0.5 * radius[:, None] * unit(normal)
     sphere = _sphere()
     vertices = centres[:, None] + radius[:, None, None] * sphere.vertices
     normals = np.broadcast_to(sphere.normals, vertices.shape)
@@ -200,10 +190,7 @@ def _sphere() -> Mesh:
     theta = np.linspace(0.0, np.pi, bands + 1)[:, None]
     phi = np.arange(sectors) * (2.0 * np.pi / sectors)
     points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi], axis=-1)
-    row, column = np.meshgrid(np.arange(bands), np.arange(sectors), indexing="ij")
-    a, b = row * sectors + column, row * sectors + (column + 1) % sectors
-    triangles = np.stack([np.stack([a, a + sectors, b], -1), np.stack([b, a + sectors, b + sectors], -1)], axis=2)
-    return _mesh(points.reshape(-1, 3), points.reshape(-1, 3), triangles.reshape(-1, 3))
+    return _mesh(points.reshape(-1, 3), points.reshape(-1, 3), grid_triangles(bands + 1, sectors, "abc cbd"))
 
 
 def _mesh(

@@ -84,14 +84,12 @@ def exposures(
     the sequence's median, in steps if there are any; fixed exposure is the median. With ``settled``, ideal gains of
     other views, the gains are those at which the exposure of these settles.
     """
-    wanted = np.log(np.asarray(ideal, np.float64))
-    reference = float(np.median(wanted))
-    if settled is not None:
-        wanted = np.log(np.asarray(settled, np.float64))
+    reference = float(np.median(np.log(np.asarray(ideal, np.float64))))
+    levels = np.log(np.asarray(ideal if settled is None else settled, np.float64))
     if settings.gain == "fixed":
-        return np.full(len(wanted), np.exp(reference))
+        return np.full(len(levels), np.exp(reference))
     half_span = 0.5 * np.log(settings.gain_span)
-    followed = np.clip(wanted, reference - half_span, reference + half_span)
+    followed = np.clip(levels, reference - half_span, reference + half_span)
     if settled is None:
         share = 1.0 if settings.gain_lag == 0.0 else 1.0 - np.exp(-1.0 / settings.gain_lag)
         state = followed[0]

@@ -7,12 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config.registry import phantom_layouts
@@ -42,41 +37,31 @@ _Offset = Annotated[_Triple, AfterValidator(_near_lens)]
 
 @dataclass(frozen=True)
 class Preset:
-    """Lamp and lens, defaults of settings left at None (see :class:`PhantomSettings`), and motion parameters."""
+    """Lamp and lens, defaults of settings left at None (see :class:`PhantomSettings`), and motion parameters.
 
-    light_offset: tuple[float, float, float]
-    spread_law: SpreadLaw
-    spread: float  # how narrow the beam is
-    vignetting: float  # exponent of the lens's cos theta fall-off
-    tilt: float  # lamp axis against optical axis, downwards, degrees; measured 0.64 on one endoscope
-    gain: GainMode
-    white_balance_drift: float
-    turn: tuple[float, float, float]  # largest yaw, pitch and roll of the wobble, degrees
-    scan: float  # largest rotation away from the lumen of the rotation trajectory, degrees
-    wobble: tuple[float, float]  # smallest and largest lateral excursion from the centre line, mm
-    approaches: int  # how often the camera comes close to the wall
-    closest: float  # camera-to-wall distance of an approach, mm
+    The default is ``c3vd``, which is fair: its fall-off towards the rim adds up to the cos^1.25 that a free fit of real
+    C3VD pixels gave, its look direction stays near C3VD's median of 7 degrees, and its exposure is automatic
+    (docs/phantom.md 3, 4).
+    """
+
+    light_offset: tuple[float, float, float] = (0.0, 0.0, -3.6)
+    spread_law: SpreadLaw = "exponential"
+    spread: float = 0.75  # how narrow the beam is
+    vignetting: float = 0.5  # exponent of the lens's cos theta fall-off
+    tilt: float = 0.6  # lamp axis against optical axis, downwards, degrees; measured 0.64 on one endoscope
+    gain: GainMode = "auto"
+    white_balance_drift: float = 0.02
+    turn: tuple[float, float, float] = (5.5, 4.5, 3.0)  # largest yaw, pitch and roll of the wobble, degrees
+    scan: float = 28.0  # largest rotation away from the lumen of the rotation trajectory, degrees
+    wobble: tuple[float, float] = (1.5, 3.0)  # smallest and largest lateral excursion from the centre line, mm
+    approaches: int = 0  # how often the camera comes close to the wall
+    closest: float = 9.0  # camera-to-wall distance of an approach, mm
 
 
-#: ``c3vd`` is the fair default. Its fall-off towards the rim adds up to the cos^1.25 that a free fit of real C3VD
-#: pixels gave, its look direction stays near C3VD's median of 7 degrees, and its exposure is automatic
-#: (docs/phantom.md 3, 4). ``strong`` is the stress case (docs/phantom.md 4): the lamp at the lens,
-#: cos^1.5 spread under cos^2.5 vignetting, a fixed exposure, large rotations and two approaches to 9 mm.
+#: ``strong`` is the stress case (docs/phantom.md 4): the lamp at the lens, cos^1.5 spread under cos^2.5 vignetting, a
+#: fixed exposure, large rotations and two approaches to 9 mm.
 PRESETS: dict[str, Preset] = {
-    "c3vd": Preset(
-        light_offset=(0.0, 0.0, -3.6),
-        spread_law="exponential",
-        spread=0.75,
-        vignetting=0.5,
-        tilt=0.6,
-        gain="auto",
-        white_balance_drift=0.02,
-        turn=(5.5, 4.5, 3.0),
-        scan=28.0,
-        wobble=(1.5, 3.0),
-        approaches=0,
-        closest=9.0,
-    ),
+    "c3vd": Preset(),
     "strong": Preset(
         light_offset=(0.0, 0.0, 0.0),
         spread_law="cosine",
@@ -89,7 +74,6 @@ PRESETS: dict[str, Preset] = {
         scan=34.0,
         wobble=(1.5, 3.5),
         approaches=2,
-        closest=9.0,
     ),
 }
 
@@ -216,13 +200,13 @@ class PhantomSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _presets_where_not_given(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        given = {**IN_VIVO, **given} if given.get("preset") == "in-vivo" else given
-        light = PRESETS.get(str(given.get("light", "c3vd")))
-        left_open = [name for name in ("light_offset", "gain", "white_balance_drift") if given.get(name) is None]
-        return given if light is None else {**given, **{name: getattr(light, name) for name in left_open}}
+    def _presets_where_not_given(cls, options: Any) -> Any:
+        if not isinstance(options, dict):
+            return options
+        options = {**IN_VIVO, **options} if options.get("preset") == "in-vivo" else options
+        light = PRESETS.get(str(options.get("light", "c3vd")))
+        missing = [name for name in ("light_offset", "gain", "white_balance_drift") if options.get(name) is None]
+        return options if light is None else {**options, **{name: getattr(light, name) for name in missing}}
 
     @field_validator("layout")
     @classmethod
@@ -256,12 +240,12 @@ class PhantomSettings(Settings):
 
     @property
     def moves(self) -> bool:
-        """Whether the wall moves."""
+        """Return whether the wall moves."""
         return self.wave > 0.0 or self.breathing > 0.0
 
     @property
     def covers(self) -> bool:
-        """Whether anything but the wall is in view."""
+        """Return whether anything but the wall is in view."""
         return bool(self.fluid or self.bubbles or self.tool or self.washes)
 
     @property

@@ -82,6 +82,15 @@ class SolidNoise:
         return np.asarray(noise.reshape(points.shape[:-1]))
 
 
+#: Golden angle, radians: multiples of it distribute any number of directions evenly.
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def quintic(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Perlin's quintic step over [0, 1], whose first and second derivatives are 0 at its ends."""
+    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+
+
 def smoothstep(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Cubic Hermite step: 0 below 0, 1 above 1."""
     x = np.clip(x, 0.0, 1.0)

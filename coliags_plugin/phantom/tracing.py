@@ -22,10 +22,6 @@ class Hits:
     triangle: Int[np.ndarray, "N"]  # index
     barycentric: Float[np.ndarray, "N 2"]  # weights of the second and third corner
 
-    def kept(self) -> Hits:
-        """Hits of the rays that meet the wall."""
-        return self.only(self.found)
-
     def only(self, keep: Bool[np.ndarray, "N"]) -> Hits:
         """Hits of some of the rays."""
         return Hits(self.found[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
@@ -71,7 +67,7 @@ class Tracer:
     def visible(
         self, points: Float[np.ndarray, "N 3"], viewpoints: Float[np.ndarray, "3"] | Float[np.ndarray, "N 3"]
     ) -> Bool[np.ndarray, "N"]:
-        """Whether points on the wall are visible from viewpoints off it.
+        """Return which points on the wall are visible from viewpoints off it.
 
         The last thousandth of the ray is ignored, as the point is on the wall itself.
         """
@@ -89,7 +85,7 @@ def seen_from(
     mask: Bool[np.ndarray, "H W"],
     tracer: Tracer,
 ) -> Bool[np.ndarray, "N"]:
-    """Whether at least one camera sees each point of the wall: it projects to a lit pixel and is not occluded.
+    """Return which points of the wall at least one camera sees: it projects to a lit pixel and is not occluded.
 
     Seen points are not tested again: give the poses that are likeliest to see the points first.
     """

@@ -17,9 +17,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom.colon import CentreLine, WallMotion
+from coliags_plugin.geometry.poses.rigid import rigid
+from coliags_plugin.phantom.colon import CentreLine, WallMotion, frame_times
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.streams import Purpose, stream
+from coliags_plugin.phantom.streams import GOLDEN_ANGLE, Purpose, quintic, stream
 from coliags_plugin.phantom.tracing import Tracer
 
 #: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
@@ -41,10 +42,8 @@ def poses_between(poses: Float[np.ndarray, "T 4 4"], at: Float[np.ndarray, "N"])
     """Poses at fractional frames; positions and rotations are linear from frame to frame."""
     at = np.clip(at, 0.0, len(poses) - 1.0)
     numbers = np.arange(len(poses))
-    between = np.tile(np.eye(4), (len(at), 1, 1))
-    between[:, :3, :3] = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
-    between[:, :3, 3] = np.stack([np.interp(at, numbers, axis) for axis in poses[:, :3, 3].T], axis=1)
-    return between
+    rotations = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
+    return rigid(rotations, np.stack([np.interp(at, numbers, axis) for axis in poses[:, :3, 3].T], axis=1))
 
 
 def poses_during(
@@ -82,6 +81,11 @@ def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarr
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
 
 
+def square_to(clock: float) -> Float[np.ndarray, "3"]:
+    """Axis about which a camera turns towards a clock angle around its optical axis, radians."""
+    return np.array([-np.sin(clock), np.cos(clock), 0.0])
+
+
 def _farthest(is_clear: Callable[[float], bool], most: float, steps: int) -> float:
     """Largest clear amount, up to ``most``, by so many bisections."""
     low, high = 0.0, most
@@ -99,10 +103,14 @@ def looking(
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = frames[:, :, 0] - (frames[:, :, 0] * forward).sum(axis=1, keepdims=True) * forward
     right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (len(centers), 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
-    poses[:, :3, 3] = centers
-    return poses
+    return rigid(np.stack([right, np.cross(forward, right), forward], axis=2), centers)
+
+
+def shifted(
+    points: Float[np.ndarray, "T 3"], frames: Float[np.ndarray, "T 3 3"], offsets: Float[np.ndarray, "T K"]
+) -> Float[np.ndarray, "T 3"]:
+    """Points of the centre line moved along the first axes of its frames there, mm."""
+    return points + np.einsum("tck,tk->tc", frames[:, :, : offsets.shape[1]], offsets)
 
 
 def draw_sway(generator: np.random.Generator, cycles: Float[np.ndarray, "3"] = _CYCLES) -> Curve:
@@ -155,7 +163,7 @@ class _Withdrawal:
         points, frames = self.centre_line.at(arc)
         sideways = self.most * np.stack([curve(time) for curve in self.drift], axis=1)
         sideways *= (1.0 - nearness(time))[:, None]
-        return points + np.einsum("tck,tk->tc", frames[:, :, :2], sideways), frames
+        return shifted(points, frames, sideways), frames
 
 
 #: A near stop in the centre line's frame: the camera's offset from the withdrawal, mm, and the rotation vector from the
@@ -181,21 +189,15 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
     time = times(settings)
     points, frames = withdrawal.at(time)
     rolls = np.radians(settings.light_preset.turn[2]) * roll(time)
-    poses = np.tile(np.eye(4), (settings.frames, 1, 1))
-    poses[:, :3, :3] = frames @ _matrices(resting(turns, time)) @ _matrices(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
-    poses[:, :3, 3] = points + np.einsum("tck,tk->tc", frames, resting(shifts, time))
-    return poses
+    rotations = frames @ _matrices(resting(turns, time)) @ _matrices(rolls[:, None] * np.array([0.0, 0.0, 1.0]))
+    return rigid(rotations, shifted(points, frames, resting(shifts, time)))
 
 
 def resting(values: Float[np.ndarray, "S K"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T K"]:
-    """A twice continuously differentiable curve through values at even times from 0 to 1, which rests at each.
-
-    Between two of them it follows Perlin's quintic, whose first and second derivatives are 0 at its ends.
-    """
+    """A twice continuously differentiable curve through values at even times from 0 to 1, which rests at each."""
     position = time * (len(values) - 1)
     low = np.minimum(position.astype(int), len(values) - 2)
-    x = (position - low)[:, None]
-    share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    share = quintic((position - low)[:, None])
     return np.asarray(values[low] * (1.0 - share) + values[low + 1] * share)
 
 
@@ -223,8 +225,7 @@ def _choose_spots(withdrawal: _Withdrawal, tracer: Tracer, seed: int, generator:
                 "Choose another seed",
             )
         spots.append(spot)
-        # The golden angle distributes any number of directions evenly.
-        clock = tried + np.pi * (3.0 - np.sqrt(5.0))
+        clock = tried + GOLDEN_ANGLE
     return spots
 
 
@@ -277,7 +278,7 @@ def _distances(
 
 def _turn(angle: float, clock: float) -> Float[np.ndarray, "3"]:
     """Rotation vector that turns the third axis by an angle towards a clock angle around it, radians."""
-    return angle * np.array([-np.sin(clock), np.cos(clock), 0.0])
+    return angle * square_to(clock)
 
 
 def _matrices(turns: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
@@ -306,16 +307,14 @@ def examining_path(
 ) -> Float[np.ndarray, "T 4 4"]:
     """Camera-to-world pose of every frame, OpenCV axes, mm; ``touch`` measures clearance in the wall of a frame."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
-    seconds = settings.frames / settings.frame_rate
-    share = np.linspace(0.0, 1.0, settings.frames)
+    seconds, share = settings.frames / settings.frame_rate, times(settings)
     slow = np.stack([draw_sway(generator, _SLOW * seconds)(share) for _ in range(3)], axis=1)
     quick = np.stack([draw_sway(generator, _QUICK * seconds)(share) for _ in range(3)], axis=1)
     arc = SHALLOW_END + _BACK + settings.path_length * (1.0 - share) + _BACK * slow[:, 0]
     points, frames = centre_line.at(arc)
     sideways = np.einsum("tck,tk->tc", frames[:, :, :2], _SIDEWAYS / np.sqrt(2.0) * slow[:, 1:])
     sideways *= _permitted(points, sideways, clearance, settings)[:, None]
-    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
-    poses = looking(points + sideways, ahead, frames)
+    poses = looking(points + sideways, centre_line.at(arc + _LOOK_AHEAD)[0], frames)
     turns = np.radians(_TURN) * quick
     for pose, (yaw, pitch, roll) in zip(poses, turns, strict=True):
         pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([0.0, 0.0, 1.0]), roll)
@@ -326,14 +325,13 @@ def examining_path(
     for number, event in enumerate(events):
         middle = (number + generator.uniform(0.35, 0.65)) / len(events) * seconds
         clock = generator.uniform(0.0, 2.0 * np.pi)
-        across = np.array([-np.sin(clock), np.cos(clock), 0.0])
         stages = _FAST_TIMES if event == "turn" else _CONTACT_TIMES
-        swing = _swing(np.arange(settings.frames) / settings.frame_rate - middle, stages)
+        swing = _swing(frame_times(settings) - middle, stages)
         angle = generator.uniform(*_FAST_TURN) if event == "turn" else _CONTACT_TURN
         frame = min(round(middle * settings.frame_rate), settings.frames - 1)
         aside = poses[frame, :3, :3] @ np.array([np.cos(clock), np.sin(clock), 0.0])
         for pose, amount in zip(poses, swing, strict=True):
-            pose[:3, :3] = pose[:3, :3] @ rotation_about(across, amount * np.radians(angle))
+            pose[:3, :3] = pose[:3, :3] @ rotation_about(square_to(clock), amount * np.radians(angle))
         if event == "contact":
             poses[:, :3, 3] += _reach(poses, swing, aside, frame, touch)[:, None] * aside
     return poses
@@ -360,7 +358,7 @@ def _swing(time: Float[np.ndarray, "T"], stages: tuple[float, float, float]) -> 
     """0, then 1 during the second stage, whose middle is time 0, then 0; Perlin's quintic between."""
     there, stay, back = stages
     x = np.clip(np.minimum((time + 0.5 * stay + there) / there, (0.5 * stay + back - time) / back), 0.0, 1.0)
-    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+    return quintic(x)
 
 
 def _reach(
@@ -432,7 +430,7 @@ def camera_path(
 
 
 def every_8th(index: int) -> bool:
-    """Whether a frame is held out by the default split: 0, 8, 16, ..."""
+    """Return whether a frame is held out by the default split: 0, 8, 16, ..."""
     return index % TEST_EVERY == 0
 
 
@@ -450,16 +448,14 @@ def turn_away(
     for number in range(settings.rotation_views):
         position = (number + 0.5) / settings.rotation_views * len(training)
         frame = training[min(int(position), len(training) - 1)]
-        # The golden angle distributes any number of directions evenly.
-        clock += np.pi * (3.0 - np.sqrt(5.0))
+        clock += GOLDEN_ANGLE
         turn = generator.uniform(*_ROTATION_TURN)
         direction = clock
         if settings.trajectory == "rotation":
             middle = poses[frame, :3, :3].T @ poses[:, :3, 2].mean(axis=0)
             direction = float(np.arctan2(-middle[1], -middle[0]))
-        axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
         pose = poses[frame].copy()
-        pose[:3, :3] = pose[:3, :3] @ rotation_about(axis, np.radians(turn))
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(square_to(direction), np.radians(turn))
         views.append(RotationView(frame, float(turn), pose))
     return views
 
@@ -482,11 +478,8 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
     amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
     sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
 
-    def centers(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T 3"]:
-        return np.asarray(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways))
-
     def distances(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T"]:
-        return tracer.clearance(centers(sideways))
+        return tracer.clearance(shifted(points, frames, sideways))
 
     for _ in range(30):
         if distances(sideways).min() >= NEAREST + 0.5:
@@ -494,8 +487,7 @@ def _withdrawing_path(centre_line: CentreLine, settings: PhantomSettings, tracer
         sideways = 0.85 * sideways
     for approach in range(0 if on_the_spot else preset.approaches):
         sideways = _with_approach(sideways, distances, preset.closest, approach, time, generator)
-    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
-    poses = looking(centers(sideways), ahead, frames)
+    poses = looking(shifted(points, frames, sideways), centre_line.at(arc + _LOOK_AHEAD)[0], frames)
     if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
     else:

@@ -119,7 +119,7 @@ class Colour(Loss):
 
     Settings = LossSettings
 
-    def __cgaussians_(self, step):
+    def __call__(self, step):
         return masked_mean((step.output.rgb - step.target.rgb).abs(), step.target.mask)
 
 
@@ -174,7 +174,12 @@ class Plain(ViewModule):
         return {}
 
 
-# Broken ones: what breaks is in the name of the class.
+# Broken ones: what breaks is in the name.
+
+
+def changed(base, **attributes):
+    """A subclass with other attributes and methods."""
+    return type(base.__name__, (base,), {"__module__": __name__, **attributes})
 
 
 class DoublesItsSize(Balls):
@@ -200,35 +205,22 @@ class LooseSettings(BaseModel):
         return self.weight
 
 
-class AcceptsAnyOption(Colour):
-    Settings = LooseSettings
-
-
-class CrashesWhenMade(Balls):
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        return 1 / 0
-
-
 class HasAnUngroupedParameter(Balls):
     def __init__(self, settings, count):
         super().__init__(settings, count)
         self.forgotten = nn.Parameter(torch.zeros(3))
 
 
-class SharesAParameter(Balls):
-    def parameter_groups(self):
-        return {"means": [self.means], "logits": [self.logits, self.means]}
+AcceptsAnyOption = changed(Colour, Settings=LooseSettings)
+CrashesWhenMade = changed(Balls, from_scene=lambda scene, settings, generator: 1 / 0)
+SharesAParameter = changed(
+    Balls, parameter_groups=lambda self: {"means": [self.means], "logits": [self.logits, self.means]}
+)
 
 
 def loss(change):
     """The loss with its value, at a step, changed by a function."""
-
-    class Changed(Colour):
-        def __cgaussians_(self, step):
-            return change(super().__cgaussians_(step), step)
-
-    return Changed
+    return changed(Colour, __call__=lambda self, step: change(Colour.__call__(self, step), step))
 
 
 TurnsNaN = loss(lambda value, step: value * (torch.nan if step.step == 5 else 1.0))
@@ -239,47 +231,74 @@ AssumesDepth = loss(lambda value, step: value + 0.0 * step.target.depth.nanmean(
 CountsMaskedPixels = loss(lambda value, step: (step.output.rgb - step.target.rgb).abs().mean())
 
 
-def balls(change):
+def balls(change, **attributes):
     """The field with its Gaussians changed by a function."""
-
-    class Changed(Balls):
-        def gaussians(self, camera):
-            return change(super().gaussians(camera))
-
-    return Changed
+    return changed(Balls, gaussians=lambda self, camera: change(Balls.gaussians(self, camera)), **attributes)
 
 
 HasADetachedGroup = balls(lambda gaussians: replace(gaussians, means=gaussians.means.detach()))
 RendersWithChance = balls(lambda gaussians: replace(gaussians, means=gaussians.means + 0.01 * torch.randn(3)))
 CrashesInALibrary = balls(lambda gaussians: torch.cat([gaussians.means, torch.zeros(2, 2)]))
+NaNFeature = balls(
+    lambda gaussians: replace(gaussians, features={"albedo": torch.full((len(gaussians.means), 1), torch.nan)}),
+    feature_channels=frozenset({"albedo"}),
+)
 
 
-class NaNFeature(Balls):
-    feature_channels = frozenset({"albedo"})
+def renderer(render, base=CpuRenderer, **attributes):
+    """A renderer that calls a function with the method of its base and the arguments of that."""
 
-    def gaussians(self, camera):
-        albedo = torch.full((len(self.means), 1), torch.nan)
-        return replace(super().gaussians(camera), features={"albedo": albedo})
+    class Altered(base):
+        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+            return render(super().render, field, camera, wants, pixels)
+
+    return changed(Altered, **attributes)
 
 
 def spoiling(name, spoil):
-    """A renderer whose output is spoilt: by a function of a map, where that is there, or of the whole output."""
+    """A renderer one of whose maps is spoilt, where it is there, or left out: by None."""
 
-    class Spoilt(CpuRenderer):
-        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-            output = super().render(field, camera, wants, pixels)
-            if name is None:
-                return spoil(output)
-            maps = {key: spoil(values) if key == name else values for key, values in output.maps.items()}
-            return replace(output, maps={key: values for key, values in maps.items() if values is not None})
+    def render(draw, *request):
+        output = draw(*request)
+        maps = {key: spoil(values) if key == name else values for key, values in output.maps.items()}
+        return replace(output, maps={key: values for key, values in maps.items() if values is not None})
 
-    return Spoilt
+    return renderer(render)
 
+
+def without_expected_depth(draw, field, camera, wants, pixels):
+    if "depth_expected" in wants:
+        raise InputError("depth_expected", "another output")
+    return draw(field, camera, wants, pixels)
+
+
+def swapped(draw, field, camera, wants, pixels):
+    output = draw(field, camera, wants, pixels)
+    return output if pixels is None else replace(output, rgb=output.rgb.flip(0) + 0.01)
+
+
+def spoilt_alpha(draw, *request):
+    output = draw(*request)
+    return replace(output, alpha=1.5 * output.alpha)
+
+
+#: Names of all outputs.
+NAMES = {name: name for name in CpuRenderer.outputs}
 
 LacksNormals = spoiling("normals", lambda values: None)
 DepthInMetres = spoiling("depth_median", lambda values: values / 1000.0)
 FlatNormals = spoiling("normals", lambda values: values[..., 0])
-AlphaAboveOne = spoiling(None, lambda output: replace(output, alpha=1.5 * output.alpha))
+AlphaAboveOne = renderer(spoilt_alpha)
+FixedSize = renderer(lambda draw, field, camera, *rest: draw(field, replace(camera, width=40, height=32), *rest))
+IgnoresUnknownOutputs = renderer(
+    lambda draw, field, camera, wants, pixels: draw(field, camera, [name for name in wants if name in NAMES])
+)
+CrashesForUnknownOutputs = renderer(
+    lambda draw, field, camera, wants, pixels: draw(field, camera, [NAMES[name] for name in wants])
+)
+IgnoresPixels = renderer(lambda draw, field, camera, wants, pixels: draw(field, camera, wants))
+SwapsPixels = renderer(swapped, VolumeRenderer)
+HasNoExpectedDepth = renderer(without_expected_depth, outputs=CpuRenderer.outputs - {"depth_expected"})
 
 
 class CrashesForFreeCameras(Plain):
@@ -288,40 +307,8 @@ class CrashesForFreeCameras(Plain):
         return camera
 
 
-#: Of all outputs.
-NAMES = {name: name for name in CpuRenderer.outputs}
-
-
-def drawing(draw):
-    """A renderer that is asked for something else: a function is given its method and the arguments."""
-
-    class Drawing(CpuRenderer):
-        def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-            return draw(super().render, field, camera, wants, pixels)
-
-    return Drawing
-
-
-FixedSize = drawing(lambda draw, field, camera, *rest: draw(field, replace(camera, width=40, height=32), *rest))
-IgnoresUnknownOutputs = drawing(
-    lambda draw, field, camera, wants, pixels: draw(field, camera, [name for name in wants if name != "no_such_output"])
-)
-CrashesForUnknownOutputs = drawing(
-    lambda draw, field, camera, wants, pixels: draw(field, camera, [NAMES[name] for name in wants])
-)
-IgnoresPixels = drawing(lambda draw, field, camera, wants, pixels: draw(field, camera, wants))
-
-
-class SwapsPixels(VolumeRenderer):
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        output = super().render(field, camera, wants, pixels)
-        return output if pixels is None else replace(output, rgb=output.rgb.flip(0) + 0.01)
-
-
 class ForgetsABuffer(Balls):
-    def __init__(self, settings, count):
-        super().__init__(settings, count)
-        self.glow = 0.0
+    glow = 0.0
 
     def before_step(self, step, schedule):
         self.glow = 0.01 * step
@@ -329,6 +316,14 @@ class ForgetsABuffer(Balls):
     def gaussians(self, camera):
         plain = super().gaussians(camera)
         return replace(plain, colors=(plain.colors + self.glow).clamp_max(1.0))
+
+
+class ReadsWhatIsThere(Balls):
+    @classmethod
+    def from_state(cls, state, settings):
+        field = cls(settings, len(next(iter(state.values()))))
+        field.load_state_dict(state, strict=False)
+        return field
 
 
 class ForgetsItsPlace(FrameSampler):
@@ -340,6 +335,19 @@ class ForgetsItsPlace(FrameSampler):
         return [Draw(next(self.turns) % min(7, len(self.sizes)))]
 
 
+class CrashesAlone(Sampler):
+    """Needs two frames."""
+
+    Settings = Settings
+    whole_images = True
+
+    def next(self):
+        pairs = len(self.sizes) // 2
+        if not self.queue:
+            self.queue = torch.randint(2 * pairs, (4,), generator=self.generator).tolist()
+        return [Draw(self.queue.pop())]
+
+
 class HasAHiddenCounter(Division):
     counters = ()
 
@@ -349,32 +357,25 @@ class HasAHiddenCounter(Division):
         return {}
 
 
-class ReadsWhatIsThere(Balls):
-    @classmethod
-    def from_state(cls, state, settings):
-        field = cls(settings, len(next(iter(state.values()))))
-        field.load_state_dict(state, strict=False)
-        return field
-
-
 class ForgetsAGroup(Division):
     def add(self, field, rows, born):
         super().add(field, rows, born)
         rows.keep_rows(["logits"], torch.arange(len(field.logits)) < len(field.logits) - 1)
 
 
-class ForgetsTheBuffer(Division):
+def forgetting(attribute, of_field):
+    """A strategy that leaves an attribute of the field, or its own, as it was before rows came."""
+
     def add(self, field, rows, born):
-        ages = field.ages
-        super().add(field, rows, born)
-        field.ages = ages
+        owner = field if of_field else self
+        before = getattr(owner, attribute)
+        Division.add(self, field, rows, born)
+        setattr(owner, attribute, before)
+
+    return changed(Division, add=add)
 
 
-class ForgetsTheCounter(Division):
-    def add(self, field, rows, born):
-        steps = self.steps
-        super().add(field, rows, born)
-        self.steps = steps
+ForgetsTheBuffer, ForgetsTheCounter = forgetting("ages", of_field=True), forgetting("steps", of_field=False)
 
 
 class GoesPastAdam(Division):
@@ -400,25 +401,3 @@ class WantsAlbedo(Protocol):
 
     def compare(self, output, frame):
         raise NotImplementedError
-
-
-class HasNoExpectedDepth(CpuRenderer):
-    outputs = CpuRenderer.outputs - {"depth_expected"}
-
-    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        if "depth_expected" in wants:
-            raise InputError("depth_expected", "another output")
-        return super().render(field, camera, wants, pixels)
-
-
-class CrashesAlone(Sampler):
-    """Wants two frames."""
-
-    Settings = Settings
-    whole_images = True
-
-    def next(self):
-        pairs = len(self.sizes) // 2
-        if not self.queue:
-            self.queue = torch.randint(2 * pairs, (4,), generator=self.generator).tolist()
-        return [Draw(self.queue.pop())]

@@ -69,7 +69,7 @@ class Layout(ABC):
         return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height), np.ones((height, width), bool)
 
     def is_test(self, index: int) -> bool:
-        """Whether a frame of the video is held out by the layout's split; default: 0, 8, 16, ...
+        """Return whether a frame of the video is held out by the layout's split; default: 0, 8, 16, ...
 
         Points, rotation views and seen masks depend on it.
         """

@@ -44,13 +44,13 @@ class C3VDLayout(Layout):
     has_rotation = True
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`."""
+        """Write the image, and depth in 16-bit steps up to 100 mm."""
         folder = part_folder(folder, frame.part)
         write_image(folder / "images" / f"{frame.index:04d}_color.png", frame.color)
         write_image(folder / "depths" / f"{frame.index:04d}_depth.png", depth_steps(frame.z_depth))
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+        """Write ``camera_pose.txt`` and ``camera.json``."""
         folder = part_folder(folder, part)
         write_poses(folder / "camera_pose.txt", poses)
         write_camera_json(folder / "camera.json", lens.pinhole, h=lens.height, w=lens.width)
@@ -65,9 +65,9 @@ def depth_steps(
     z_depth: Float[np.ndarray, "H W"], per_mm: float = _LAST / 100.0, beyond: int = _LAST
 ) -> UInt16[np.ndarray, "H W"]:
     """z-depth, mm, in 16-bit steps, by default C3VD's: 0 where unknown, ``beyond`` where it is out of their range."""
-    known = np.isfinite(z_depth) & (z_depth > 0.0)
-    steps = np.maximum(np.rint(np.where(known, z_depth, 0.0) * per_mm), 1)
-    return np.where(known, np.where(steps > _LAST, beyond, steps), 0).astype(np.uint16)
+    is_known = np.isfinite(z_depth) & (z_depth > 0.0)
+    steps = np.maximum(np.rint(np.where(is_known, z_depth, 0.0) * per_mm), 1)
+    return np.where(is_known, np.where(steps > _LAST, beyond, steps), 0).astype(np.uint16)
 
 
 class SeenPoints(NamedTuple):
@@ -105,25 +105,25 @@ class ColmapLayout(Layout):
     has_points = True
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; depth is not part of this layout."""
+        """Write the image; depth is not part of this layout."""
         write_image(folder / "images" / f"{frame.index:04d}.png", frame.color)
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`; poses are part of the model."""
+        """Write nothing: poses are part of the model."""
 
     def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`. Points seen in fewer than two images are left out, as COLMAP leaves them out."""
+        """Write the model; points seen in fewer than two images are left out, as COLMAP leaves them out."""
         names = [f"{index:04d}.png" for index in range(len(poses))]
         model = posed_model(colmap_poses(poses), names, [lens.pinhole], [0] * len(poses))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _SEEN_IN_ONE_OF == 0) for index in range(len(poses))]
-        kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)
+        chosen = np.flatnonzero(np.sum(seen, axis=0) >= 2)
         observations = []
         for index, matrix in enumerate(inverse(poses)):
-            indices = np.flatnonzero(seen[index][kept])
-            local = points.positions[kept[indices]] @ matrix[:3, :3].T + matrix[:3, 3]
+            indices = np.flatnonzero(seen[index][chosen])
+            local = points.positions[chosen[indices]] @ matrix[:3, :3].T + matrix[:3, 3]
             observations.append(SeenPoints(lens.project(local), indices))
-        add_points(model, observations, points.positions[kept], points.colors[kept])
+        add_points(model, observations, points.positions[chosen], points.colors[chosen])
         write_reconstruction(folder / "sparse/0", model)
         write_unit(folder, "mm")
 
@@ -137,14 +137,14 @@ class NerfstudioLayout(Layout):
         return OpenCVLens(**vars(plain.pinhole), **_DISTORTION), lit
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`."""
+        """Write the image, and depth in steps of 0.01 mm."""
         name = f"frame_{frame.index + 1:05d}.png"
         write_image(folder / "images" / name, frame.color)
         steps = np.rint(frame.z_depth / _DEPTH_UNIT).clip(0, _LAST)
         write_image(folder / "depth" / name, steps.astype(np.uint16))
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+        """Write ``transforms.json`` and ``unit.txt``."""
         names = [f"frame_{index + 1:05d}.png" for index in range(len(poses))]
         frames = [
             {
@@ -165,13 +165,13 @@ class RGBDLayout(Layout):
     """Images and depth named by timestamps, groundtruth.txt, camera.json, and TUM's file lists."""
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`."""
+        """Write the image, and depth in TUM's steps."""
         name = f"{_time(frame.index)}.png"
         write_image(folder / "rgb" / name, frame.color)
         write_image(folder / "depth" / name, depth_steps(frame.z_depth, DEPTH_SCALE, 0))
 
     def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
-        """See :class:`Layout`."""
+        """Write the trajectory, the camera, ``unit.txt`` and the lists of files."""
         times = [_time(index) for index in range(len(poses))]
         tum.write(folder / "groundtruth.txt", Trajectory(poses, timestamps=np.array(times, np.float64)))
         write_camera_json(folder / "camera.json", lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
