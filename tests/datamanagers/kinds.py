@@ -40,6 +40,11 @@ class Kind:
     #: Of depth, mm: half a step, and where images are undistorted, up to half a stored pixel beside the ray.
     accuracy: float = 0.0
     prepare: Spoil | None = None  # what makes another form of the layout
+    groups: str = ""  # names of GROUPS that it is in, whose faults it shares
+    test: tuple[int, ...] = (0, 8)  # frames of the video that are held out by default
+    seen_split: str = "every-8th"  # that its seen masks are for
+    has_own_tests: bool = False  # test views are apart from the video
+    image_name: Callable[[int], str] = r"0*{}(_color|_depth)?".format  # pattern of the name of the image of a place
 
     @property
     def is_undistorted(self) -> bool:
@@ -77,35 +82,83 @@ _RAW = ("c3vd-raw", "c3vd", "*_color.png", "*_depth.tiff", "pose.txt")
 _RGBD = ("rgbd", "rgbd", "rgb/*.png", "depth/*.png", "groundtruth.txt", "camera.json")
 _COLMAP = ("colmap", "colmap", "images/*.png", "")
 _ENDOGSLAM = ("c3vd-endogslam", "color/*.png", "depth/*.tiff")
+_MATRICES = "matrices paired depth-16"
+_MAPPED: dict[str, Any] = {"test": (7,), "seen_split": "endogslam"}
 KINDS = {
-    "c3vd": Kind("c3vd", "c3vd", "images/*.png", "depths/*.png", "camera_pose.txt", "camera.json", accuracy=0.001),
-    "c3vd-raw": Kind(*_RAW, accuracy=1.5),
+    "c3vd": Kind(
+        *("c3vd", "c3vd", "images/*.png", "depths/*.png", "camera_pose.txt", "camera.json"),
+        accuracy=0.001,
+        groups=f"{_MATRICES} camera.json",
+    ),
+    "c3vd-raw": Kind(*_RAW, accuracy=1.5, groups=_MATRICES),
     # C3VD's release under review: matrices row by row.
-    "c3vd-raw-old": Kind(*_RAW, accuracy=1.5, prepare=change_matrices(lambda matrices: matrices.transpose(0, 2, 1))),
-    "c3vd-v2": Kind("c3vd-v2", "c3vd-v2", "rgb/*.png", "depth/*.tiff", "pose.txt", accuracy=1.6),
+    "c3vd-raw-old": Kind(
+        *_RAW,
+        accuracy=1.5,
+        prepare=change_matrices(lambda matrices: matrices.transpose(0, 2, 1)),
+        groups=_MATRICES,
+    ),
+    "c3vd-v2": Kind("c3vd-v2", "c3vd-v2", "rgb/*.png", "depth/*.tiff", "pose.txt", accuracy=1.6, groups=_MATRICES),
     # A step is 0.39 mm, rounded down.
-    "c3vd-endogslam": Kind("endogslam", *_ENDOGSLAM, "pose.txt", params="params.npz", accuracy=0.4),
+    "c3vd-endogslam": Kind(
+        *("endogslam", *_ENDOGSLAM, "pose.txt"),
+        params="params.npz",
+        accuracy=0.4,
+        groups="matrices paired params",
+        **_MAPPED,
+    ),
     "pr-endo": Kind(
         *("pr-endo", *_ENDOGSLAM, "", "", "C3VD/phantom"),
         params="../../C3VD_endogslam_optimized/phantom/params.npz",
         accuracy=0.4,
+        groups="paired params",
+        **_MAPPED,
     ),
     "rotatecolon": Kind(
-        *("rotatecolon", "rotatecolon", "train_views/*.png", "depth_train/*.exr", "transforms.json"), accuracy=1e-4
+        *("rotatecolon", "rotatecolon", "train_views/*.png", "depth_train/*.exr", "transforms.json"),
+        accuracy=1e-4,
+        groups="json",
+        test=(),
+        seen_split="all-train",
+        has_own_tests=True,
     ),
-    "colmap": Kind(*_COLMAP, "", "cameras.bin"),
-    "colmap-text": Kind(*_COLMAP, "sparse/0/images.txt", "cameras.txt", prepare=_as_text),
+    "colmap": Kind(*_COLMAP, "", "cameras.bin", groups="both-colmap"),
+    "colmap-text": Kind(*_COLMAP, "sparse/0/images.txt", "cameras.txt", prepare=_as_text, groups="both-colmap"),
     "endomapper": Kind(
-        *("endomapper", "endomapper", "rgb/*.png", "depth/*.png", "trajectory.txt", "calibration.xml"), accuracy=2.0
+        *("endomapper", "endomapper", "rgb/*.png", "depth/*.png", "trajectory.txt", "calibration.xml"),
+        accuracy=2.0,
+        groups="tum by-order depth-16",
     ),
     "nerfstudio": Kind(
-        *("nerfstudio", "nerfstudio", "images/*.png", "depth/*.png", *["transforms.json"] * 2), accuracy=0.7
+        *("nerfstudio", "nerfstudio", "images/*.png", "depth/*.png", *["transforms.json"] * 2),
+        accuracy=0.7,
+        groups="json depth-16",
+        image_name=lambda place: f"frame_{place + 1:05d}",
     ),
-    "rgbd": Kind(*_RGBD, accuracy=0.0011),
-    "rgbd-by-order": Kind(*_RGBD, accuracy=0.0011, prepare=_in_order),
+    "rgbd": Kind(
+        *_RGBD,
+        accuracy=0.0011,
+        groups="tum camera.json depth-16",
+        image_name=lambda place: f"{1_305_031_102 + place / 30:.6f}",
+    ),
+    "rgbd-by-order": Kind(*_RGBD, accuracy=0.0011, prepare=_in_order, groups="tum by-order camera.json"),
     "reim-nerf": Kind(
-        *("reim-nerf", "reim-nerf", "images/*.png", "distmaps/*.png", *["transforms_train.json"] * 2), accuracy=1.5
+        *("reim-nerf", "reim-nerf", "images/*.png", "distmaps/*.png", *["transforms_train.json"] * 2),
+        accuracy=1.5,
+        groups="json depth-16",
+        test=(1, 2, 3, 4, 6, 7, 8, 9),
+        seen_split="own",
     ),
+}
+#: Kinds by what they have in common: poses of sixteen numbers a line or in frames of a JSON file, TUM's trajectory and
+#: whether line n of it belongs to image n, a camera.json, EndoGSLAM's result, and depth for every image of a number.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "all": tuple(KINDS),
+    "depth": tuple(name for name, kind in KINDS.items() if kind.depths),
+    **{
+        group: tuple(name for name, kind in KINDS.items() if group in kind.groups.split())
+        for group in {group for kind in KINDS.values() for group in kind.groups.split()}
+    },
 }
 
 
@@ -298,29 +351,7 @@ def change_binary_pose(place: int, change: Callable[[np.ndarray], np.ndarray]) -
 
 # Faults
 
-#: Kinds by what they have in common: poses of sixteen numbers a line or in frames of a JSON file, TUM's trajectory and
-#: whether line n of it belongs to image n, a camera.json, EndoGSLAM's result, and depth for every image of a number.
-GROUPS: dict[str, tuple[str, ...]] = {
-    "all": tuple(KINDS),
-    "matrices": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam"),
-    "json": ("rotatecolon", "nerfstudio", "reim-nerf"),
-    "tum": ("rgbd", "rgbd-by-order", "endomapper"),
-    "by-order": ("rgbd-by-order", "endomapper"),
-    "camera.json": ("c3vd", "rgbd", "rgbd-by-order"),
-    "both-colmap": ("colmap", "colmap-text"),
-    "params": ("c3vd-endogslam", "pr-endo"),
-    "paired": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "pr-endo"),
-    "depth": tuple(name for name, kind in KINDS.items() if kind.depths),
-    "depth-16": ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "endomapper", "nerfstudio", "rgbd", "reim-nerf"),
-}
 RUBBISH = bytes(range(256))
-
-
-def image_name(name: str, place: int) -> str:
-    """What the image of a place is called, as a pattern."""
-    if name == "rgbd":
-        return f"{1_305_031_102 + place / 30:.6f}"
-    return f"frame_{place + 1:05d}" if name == "nerfstudio" else rf"0*{place}(_color|_depth)?"
 
 
 def expanded(table: str, damages: Mapping[str, Callable[[Kind], Spoil]]) -> dict[tuple[str, str], tuple[Spoil, str]]:
@@ -337,7 +368,7 @@ def expanded(table: str, damages: Mapping[str, Callable[[Kind], Spoil]]) -> dict
         for name in [name for group in filter(None, groups.split(", ")) for name in GROUPS.get(group, (group,))]:
             kind = KINDS[name]
             pattern = message.replace("<size>", kind.size or r"<0>\.png").replace("<poses>", kind.poses)
-            pattern = re.sub(r"<(\d)>", lambda match, name=name: image_name(name, int(match[1])), pattern)
+            pattern = re.sub(r"<(\d)>", lambda match, kind=kind: kind.image_name(int(match[1])), pattern)
             result[fault, name] = damages[fault](kind), pattern
     return result
 

@@ -45,10 +45,6 @@ from tests.datamanagers.wall_scenes import (
 )
 
 ROOT = Path(__file__).parents[2]
-#: Test frames by the default split, and the split that seen masks are for.
-SPLITS = {"c3vd-endogslam": ([7], "endogslam"), "rotatecolon": ([], "all-train")}
-SPLITS |= {"reim-nerf": ([1, 2, 3, 4, 6, 7, 8, 9], "own")}
-ROTATED = ("c3vd", "c3vd-raw", "c3vd-v2", "c3vd-endogslam", "rotatecolon")
 
 
 def load(folder: Path, name: str, **options) -> Scene:
@@ -57,7 +53,7 @@ def load(folder: Path, name: str, **options) -> Scene:
 
 def in_order(scene: Scene, name: str) -> list[Frame]:
     """Frames of the video: RotateColon's test frames are of another."""
-    return scene.train if name == "rotatecolon" else scene.video
+    return scene.train if KINDS[name].has_own_tests else scene.video
 
 
 def to_true_world(name: str) -> np.ndarray:
@@ -83,10 +79,9 @@ def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
         scene = load(folder, name)
     assert caplog.records == []
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
-    test, _ = SPLITS.get(kind.format, ([0, 8], ""))
-    frames, held_out = in_order(scene, name), [frame for frame in scene.test_sets["test"] if name != "rotatecolon"]
+    frames, held_out = in_order(scene, name), () if kind.has_own_tests else scene.test_sets["test"]
     assert [frame.index for frame in frames] == list(range(FRAMES))
-    assert [frame.index for frame in held_out] == test
+    assert tuple(frame.index for frame in held_out) == kind.test
     assert len(set(names([*scene.train, *(frame for part in scene.test_sets.values() for frame in part)]))) == sum(
         scene.provenance.frames[part] for part in ("train", *scene.test_sets)
     )
@@ -284,7 +279,8 @@ def apart(scene: Scene) -> list[Frame]:
 def test_seen_masks_are_read_for_the_training_frames_that_they_are_for(walls, caplog, name):
     kind, folder = KINDS[name], walls(name)
     scene = load(folder, name)
-    assert len(scene.test_sets.get("rotation", ())) == (2 if kind.layout in {"endogslam", *ROTATED[:3]} else 0)
+    has_rotation = layout_of(kind.layout).has_rotation and not kind.has_own_tests
+    assert len(scene.test_sets.get("rotation", ())) == (2 if has_rotation else 0)
     for frame in apart(scene):
         seen = frame.seen.numpy()
         assert seen[:, : WIDTH // 2 - 1].all() and not seen[:, WIDTH // 2 + 1 :].any()
@@ -294,7 +290,7 @@ def test_seen_masks_are_read_for_the_training_frames_that_they_are_for(walls, ca
         scene = load(folder, name, initial_points="none", **options)
         assert all(frame.seen is None for frame in (*scene.train, *apart(scene)))
         assert seen_warnings(caplog) == [
-            f"{folder}: seen masks are for split '{SPLITS.get(kind.format, (0, 'every-8th'))[1]}' of all frames; this "
+            f"{folder}: seen masks are for split '{kind.seen_split}' of all frames; this "
             "run trains on other frames, so metrics on seen pixels are unavailable"
         ] * bool(apart(scene))
 

@@ -1,14 +1,16 @@
-"""Layouts of public datasets, in which phantoms are written here so that their readers have something to read."""
+"""Layouts of public datasets, in which phantoms are written here so that their readers have something to read.
+
+Every subclass of Layout with a ``name`` in a module of this folder is registered.
+"""
+
+from importlib import import_module
+from pathlib import Path
 
 from coliags_plugin.config.registry import phantom_layouts
+from coliags_plugin.phantom.layouts.base import Layout
 
-for name, target in {
-    "c3vd-raw": "c3vd:C3VDRawLayout",
-    "c3vd-v2": "c3vd:C3VDv2Layout",
-    "endogslam": "endogslam:EndoGSLAMLayout",
-    "endomapper": "endomapper:EndoMapperLayout",
-    "pr-endo": "endogslam:PREndoLayout",
-    "reim-nerf": "reim_nerf:ReimNerfLayout",
-    "rotatecolon": "rotatecolon:RotateColonLayout",
-}.items():
-    phantom_layouts.register(name, f"tests.layouts.{target}", source="tests")
+for path in sorted(Path(__file__).parent.glob("[!_]*.py")):
+    module = import_module(f"{__name__}.{path.stem}")
+    for kind in vars(module).values():
+        if isinstance(kind, type) and issubclass(kind, Layout) and kind.__module__ == module.__name__:
+            phantom_layouts.register(kind.name, f"{module.__name__}:{kind.__name__}", source="tests")

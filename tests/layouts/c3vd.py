@@ -13,6 +13,7 @@ from coliags_plugin.phantom.layouts.built_in import depth_steps, write_poses
 class C3VDRawLayout(Layout):
     """The release's files: distorted frames with black corners, TIFF depth, pose.txt."""
 
+    name = "c3vd-raw"
     default_size = (1350, 1080)
     has_rotation = True
 
@@ -31,6 +32,8 @@ class C3VDRawLayout(Layout):
 
 class C3VDv2Layout(C3VDRawLayout):
     """Distorted frames with black corners in folders by kind, pose.txt, and the lens in camera_intrinsics.txt."""
+
+    name = "c3vd-v2"
 
     def lens(self, width, height):
         """The candidate for C3VDv2's lens, behind C3VD's octagonal mask."""

@@ -26,6 +26,7 @@ _SIZE = 0.3
 class EndoGSLAMLayout(Layout):
     """color/, 8-bit depth/, pose.txt, and params.npz of an ideal EndoGSLAM run on the training frames."""
 
+    name = "endogslam"
     default_size = (PREPARED_PINHOLE.width, PREPARED_PINHOLE.height)
     has_rotation = True
     has_points = True
@@ -55,6 +56,7 @@ class EndoGSLAMLayout(Layout):
 class PREndoLayout(EndoGSLAMLayout):
     """C3VD/phantom without poses, and the result of an ideal EndoGSLAM run on all frames, also as a 3DGS PLY."""
 
+    name = "pr-endo"
     has_rotation = False
 
     def write_frame(self, folder, frame):

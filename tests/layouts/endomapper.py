@@ -24,6 +24,7 @@ _LIT = 75.0
 class EndoMapperLayout(Layout):
     """Fisheye images, depth and masks named by number, trajectory.txt and calibration.xml."""
 
+    name = "endomapper"
     default_size = (1440, 1080)
 
     def lens(self, width, height):

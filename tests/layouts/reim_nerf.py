@@ -24,6 +24,7 @@ _AHEAD = 30.0
 class ReimNerfLayout(Layout):
     """Circular fisheye images, distance maps, rgb_mask.png, and a JSON file per part."""
 
+    name = "reim-nerf"
     default_size = (1350, 1080)
 
     def __init__(self):

@@ -26,6 +26,7 @@ _ANGLE = 2.0 * math.atan(169.0 / 200.8769)
 class RotateColonLayout(Layout):
     """Blender's files: training views with EXR depth, and rotated test views without depth."""
 
+    name = "rotatecolon"
     has_rotation = True
     has_points = True
 
