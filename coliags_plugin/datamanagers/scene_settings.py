@@ -110,14 +110,14 @@ class SceneSettings(Settings):
     width: int | None = Field(
         None,
         gt=0,
-        description="Working width, pixels. None: the format's own (docs/data.md 2): what fits 338 x 270, the paper's "
-        "quarter of a raw frame; for 'reim-nerf' 270 x 216; for 'c3vd-endogslam' and 'rotatecolon' as stored.",
+        description="Working width, pixels. None: the format's own (docs/data.md 2), for most of them what fits 338 x "
+        "270, the paper's quarter of a raw frame.",
     )
     height: int | None = Field(None, gt=0, description="Working height, pixels; goes with width.")
     unit: Unit | None = Field(
         None,
         description="Unit of length of the scene's files, 'mm', 'cm', 'm' or 'unknown'; known lengths are converted to "
-        "mm. None: as stated by unit.txt, or else the format's: mm for C3VD's and REIM-NeRF's, unknown for others.",
+        "mm. None: as stated by unit.txt, or else the format's.",
     )
     focal_scale: float = Field(
         1.0,

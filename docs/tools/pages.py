@@ -40,6 +40,7 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     files.append(File.generated(config, "site.css", content=STYLE))
     files.append(File.generated(config, "options.md", content=options.page()))
     files.append(File.generated(config, "method_table.md", content=methods.page()))
+    files.append(File.generated(config, "layouts/index.md", content=formats()))
     for path in sorted(notebooks.NOTEBOOKS.glob("*.ipynb")):
         page = f"notebooks/{path.stem}.md"
         files.append(File.generated(config, page, content=notebooks.as_markdown(path)))
@@ -49,8 +50,14 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Called by mkdocs for each page: links to notebooks lead to their pages."""
-    return re.sub(r"\.ipynb\)", ".md)", markdown)
+    """Called by mkdocs for each page: links to notebooks and to the folder of formats lead to their pages."""
+    return re.sub(r"\.ipynb\)", ".md)", markdown).replace("](layouts/)", "](layouts/index.md)")
+
+
+def formats() -> str:
+    """A page that lists those of the data formats."""
+    titles = {path.name: path.read_text(encoding="utf-8").partition("\n")[0] for path in DOCS.glob("layouts/*.md")}
+    return "# Formats\n\n" + "".join(f"- [{title[2:]}]({name})\n" for name, title in sorted(titles.items()))
 
 
 def for_site(text: str) -> str:
