@@ -122,14 +122,15 @@ class ReimNerfDataManager(RecordedDataManager):
                 "the test frames of split 'own'",
                 "Add it, or choose another split",
             )
-        # A short video may have no validation frames, but there must be training frames.
+        contents = {part: read_json(file, "a JSON object with frames") for part, file in files.items()}
         parts = {
             part: Transforms(file, settings.outside_files)
             for part, file in files.items()
-            if part == "train" or not _has_no_frames(file)
+            # A short video may have no validation frames, but there must be training frames.
+            if part == "train" or not isinstance(contents[part], dict) or contents[part].get("frames") != []
         }
-        file, first = files["train"], parts["train"].content
-        _refuse_different(parts)
+        file, first = files["train"], contents["train"]
+        _refuse_different(files, contents)
         lens, (scale, shift) = _lens(file, first), _normalisation(file, first)
         distmap_scale = read_number(
             {"distmap_scale": math.pi, **first}, "distmap_scale", file, "a number above 0", above=0.0
@@ -203,19 +204,14 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
 
 
-def _has_no_frames(file: Path) -> bool:
-    content = read_json(file, "a JSON object with frames")
-    return isinstance(content, dict) and content.get("frames") == []
-
-
-def _refuse_different(parts: Mapping[str, Transforms]) -> None:
+def _refuse_different(files: Mapping[str, Path], contents: Mapping[str, Mapping[str, Any]]) -> None:
     """Refuse files whose camera or scale differs from that of the training frames."""
-    first = parts["train"]
-    for part in parts.values():
-        key = next((key for key in _SHARED if part.content.get(key) != first.content.get(key)), None)
+    first = contents["train"]
+    for part, content in contents.items():
+        key = next((key for key in _SHARED if content.get(key) != first.get(key)), None)
         if key is not None:
             raise InputError(
-                f"{part.path}: {key} differs from {first.path.name}",
+                f"{files[part]}: {key} differs from {files['train'].name}",
                 "one camera and one scale for all files",
                 "Write all files in one run",
             )

@@ -117,6 +117,7 @@ def numbered_images(folder: Path, what: str, expected: str, example: str) -> dic
     images = numbered(folder, what, frozenset({".png"}))
     if not images:
         searched = folder if folder.is_dir() else folder.parent
+        require_folder(searched, expected)
         do = f"Name the sequence's own folder, for instance {example}"
         raise InputError(f"{searched} holds {inventory(searched)}", expected, do)
     return images
