@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> FinishedComparison:
     """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
 
+    Images, poses and depth of a scene that contradict each other, as far as that is quickly seen, are warned of before
+    the first run.
+
     Args:
         methods: Names of methods, paths of method configs, or variants (:func:`variant`).
         options: See below.
@@ -30,13 +33,15 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
             run.
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
+    from coliags_plugin.api.training import warn_of_suspect_data
     from coliags_plugin.comparison.compare import carry_out, make_request
     from coliags_plugin.comparison.folder import ComparisonFolder
     from coliags_plugin.engine.tasks import ExecutionOptions
 
     names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
     execution = ExecutionOptions(**{name: getattr(options, name) for name in names})
-    return carry_out(make_request(methods, options), ComparisonFolder(options.output), execution)
+    folder = ComparisonFolder(options.output)
+    return carry_out(make_request(methods, options), folder, execution, warn_of_suspect_data)
 
 
 @takes(AblateOptions)

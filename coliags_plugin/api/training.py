@@ -50,7 +50,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     if_exists: IfExists = "resume" if options.resume else "overwrite" if options.overwrite else "refuse"
     with open_training(options, folder, on, if_exists) as trainer:
         if not options.resume:
-            _warn_of_suspect_data(trainer.scene)
+            warn_of_suspect_data(trainer.scene)
         title = f"{trainer.method.name} on {trainer.scene.name}, seed {trainer.seed}"
         config = trainer.method.config.model_dump()
         followers: list[Follower] = [logger(folder.path, title, config, trainer.step) for logger in chosen_loggers]
@@ -64,7 +64,7 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
     return Run(folder.path, data=options.data, device=options.device)
 
 
-def _warn_of_suspect_data(scene: Scene) -> None:
+def warn_of_suspect_data(scene: Scene) -> None:
     """Warn of what the quick checks of ``coliags data check`` find, in the lengths of the dataset."""
     from coliags_plugin.checks.data.check import check_scene
 

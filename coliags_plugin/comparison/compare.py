@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
@@ -19,9 +21,11 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.options import CompareOptions
-from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number, did_you_mean
+from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number
 from coliags_plugin.core.files import user_path
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.scene_settings import Split
+from coliags_plugin.engine.data_formats import data_manager
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.engine.task_queue import Job, JobQueue, make_executor
 from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor
@@ -33,103 +37,96 @@ from coliags_plugin.results.record import SEEN_SUFFIX, Result
 log = logging.getLogger(__name__)
 
 
-class CellRuns:
-    """Cells to run, whose scenes are there, and what became of them.
-
-    Of cells with the same result key, one is run; the others are equal to it.
-    """
-
-    def __init__(
-        self,
-        folder: ComparisonFolder,
-        executor: Executor,
-        options: ExecutionOptions,
-        cells: Sequence[ComparisonCell],
-    ) -> None:
-        self.folder, self.executor, self.options = folder, executor, options
-        self.failures, self._count = list[FailureRecord](), len(cells)
-        self._ended = {"done": 0, "failed": 0}
-        equal: dict[str, list[ComparisonCell]] = {}
-        for cell in cells:
-            if (result := folder.done(cell)) is not None:
-                folder.add(cell, result)
-                self._ended["done"] += 1
-            else:
-                equal.setdefault(cell.known_keys.result, []).append(cell)
-        jobs = [CellJob(same, self) for same in equal.values()]
-        total = sum(cell.steps for cell in cells)
-        self._queue = JobQueue(executor, options.retries, jobs, total, total - sum(job.size for job in jobs))
-
-    def run(self) -> list[FailureRecord]:
-        """Complete all cells, and add their results to the folder; returns the failures.
-
-        Raises:
-            InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
-        """
-        try:
-            self._queue.run("compare", self._told)
-        except KeyboardInterrupt as error:
-            raise InterruptedRunError(
-                f"stopped with {self._ended['done']} of {self._count} cells done; "
-                "the same command goes on where it stopped"
-            ) from error
-        return self.failures
-
-    def end(self, cell: ComparisonCell, how: str, reason: str = "") -> None:
-        """Count a cell that is ``done`` or has ``failed``, and tell so."""
-        self._ended[how] += 1
-        log.info("[%d/%d] %s: %s%s", sum(self._ended.values()), self._count, cell.title, how, reason)
-
-    def _told(self, running: Sequence[Job]) -> str:
-        waiting = self._count - len(running) - sum(self._ended.values())
-        counts = {"waiting": waiting, "running": len(running), **self._ended}
-        return ", ".join(f"{count} {phase}" for phase, count in counts.items() if count)
-
-
 class CellJob(Job):
     """Cells of one result key: the first is run, the others are equal to it."""
 
-    def __init__(self, equal: Sequence[ComparisonCell], runs: CellRuns) -> None:
-        self._equal, self._runs, cell = equal, runs, equal[0]
-        self.size = sum(cell.steps for cell in equal)
-        self._run, method = runs.folder.run(cell), cell.variant.method
+    task: CellTask
+
+    def __init__(
+        self,
+        cells: Sequence[ComparisonCell],
+        comparison: ComparisonFolder,
+        executor: Executor,
+        device: str,
+        ended: Callable[[ComparisonCell, str], None],
+    ) -> None:
+        self.cells, self.comparison, self.ended = cells, comparison, ended
+        self.size = sum(cell.steps for cell in cells)
+        cell, method, planned = cells[0], cells[0].variant.method, cells[0].planned
+        self._run = comparison.run(cell)
         self.task = CellTask(
             title=cell.title,
-            key=cell.known_keys.result,
+            key=planned.key,
+            folder=self._run.path,
+            device=device,
+            log=comparison.path / planned.log,
+            threads=executor.threads,
             name=cell.variant.name,
             method=str(user_path(method).resolve()) if is_path(method) else method,
             overrides=cell.overrides,
             scene=cell.scene.name,
-            data=str(cell.scene.path),
+            data=cell.scene.path,
             data_format=cell.scene.data_format,
             seed=cell.seed,
-            device=runs.options.device,
             protocol=cell.protocol,
-            run=str(self._run.path),
-            result=str(runs.folder.result(cell)),
-            log=str(runs.folder.log(cell)),
-            threads=runs.executor.threads,
-            save_seconds=runs.options.save_seconds,
+            result=comparison.path / planned.result,
         )
 
     def progress(self) -> int:
         """Steps taken; the last one of a cell is over with its evaluation."""
-        return min(self._run.logged_step, self._equal[0].steps - 1)
+        return min(self._run.logged_step, self.cells[0].steps - 1)
 
     def finish(self) -> Sequence[Job]:
         """Add the result to all cells that it is of."""
-        result = read_result(self._runs.folder.result(self._equal[0]))
-        for cell in self._equal:
-            self._runs.folder.add(cell, result)
-            self._runs.end(cell, "done")
+        result = read_result(self.task.result)
+        for cell in self.cells:
+            self.comparison.add(cell, result)
+            self.ended(cell, "done")
         return ()
 
     def fail(self, reason: str, attempts: int, ending: Ending) -> Sequence[Job]:
         """Record the failure of all cells that wait for the run."""
-        for cell in self._equal:
-            self._runs.failures.append(self._runs.folder.fail(cell, reason, attempts))
-            self._runs.end(cell, "failed", f": {reason}")
+        for cell in self.cells:
+            self.comparison.fail(cell, reason, attempts)
+            self.ended(cell, f"failed: {reason}")
         return ()
+
+
+def run_cells(
+    cells: Sequence[ComparisonCell], comparison: ComparisonFolder, executor: Executor, options: ExecutionOptions
+) -> None:
+    """Complete all cells, whose scenes are there, and add their results and failures to the folder.
+
+    Raises:
+        InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
+    """
+    missing: dict[str, list[ComparisonCell]] = {}
+    for cell in cells:
+        if (result := comparison.done(cell)) is not None:
+            comparison.add(cell, result)
+        else:
+            missing.setdefault(cell.planned.key, []).append(cell)
+    numbers = itertools.count(1 + len(cells) - sum(map(len, missing.values())))
+
+    def ended(cell: ComparisonCell, how: str) -> None:
+        log.info("[%d/%d] %s: %s", next(numbers), len(cells), cell.title, how)
+
+    def facts(running: Sequence[Job]) -> str:
+        done, failed = sum(comparison.done(cell) is not None for cell in cells), len(comparison.failures)
+        waiting = len(cells) - len(running) - done - failed
+        counts = {"waiting": waiting, "running": len(running), "done": done, "failed": failed}
+        return ", ".join(f"{count} {phase}" for phase, count in counts.items() if count)
+
+    jobs = [CellJob(same, comparison, executor, options.device, ended) for same in missing.values()]
+    total = sum(cell.steps for cell in cells)
+    queue = JobQueue(executor, options.retries, jobs, total, total - sum(job.size for job in jobs))
+    try:
+        queue.run("compare", facts)
+    except KeyboardInterrupt as error:
+        done = sum(comparison.done(cell) is not None for cell in cells)
+        raise InterruptedRunError(
+            f"stopped with {done} of {len(cells)} cells done; the same command goes on where it stopped"
+        ) from error
 
 
 #: Metrics of a summary unless others are chosen.
@@ -152,16 +149,16 @@ class FinishedComparison:
             InputError: No result has one of the metrics.
         """
         units = {name: metric.unit for result in self.results for name, metric in result.metrics.items()}
-        for name in columns:
-            if self.results and name not in units:
-                raise InputError(f"no metric '{name}'", f"one of {', '.join(units)}", did_you_mean(name, units))
-        rows, by_method = [], defaultdict(list)
-        for result in self.results:
-            by_method[result.method].append(result)
-        for method, count in Counter(cell.variant.name for cell in self.cells).items():
-            own = by_method[method]
-            means = {name: _mean(own, name) for name in columns}
-            rows.append({"method": method, "done": f"{len(own)} of {count}", **means})
+        for name in columns if self.results else ():
+            check_name("metric", name, units)
+        rows: list[dict[str, Value]] = []
+        for name, count in Counter(cell.variant.name for cell in self.cells).items():
+            results = [result for result in self.results if name == result.method]
+            rows.append({"method": name, "done": f"{len(results)} of {count}"})
+            for metric in columns:
+                means = [result.mean(metric) for result in results if metric in result.metrics]
+                numbers = [mean for mean in means if mean is not None]
+                rows[-1][metric] = sum(numbers) / len(numbers) if numbers else None
         return DisplayTable(
             f"{len(self.results)} of {len(self.cells)} cells",
             [Column("method"), Column("done"), *(Column(name, unit=units.get(name, "")) for name in columns)],
@@ -186,61 +183,67 @@ class FinishedComparison:
         return self.table()._repr_html_()
 
 
-def _mean(results: Sequence[Result], metric: str) -> float | None:
-    means = [mean for each in results if metric in each.metrics and (mean := each.mean(metric)) is not None]
-    return sum(means) / len(means) if means else None
-
-
-def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> FinishedComparison:
+def carry_out(
+    request: Request,
+    comparison: ComparisonFolder,
+    options: ExecutionOptions,
+    check_data: Callable[[Scene], None] | None = None,
+) -> FinishedComparison:
     """Train and evaluate methods on scenes, as far as that is not done in a folder, which is new or extended.
+
+    Every scene with a cell that is missing is given to ``check_data`` before the first run.
 
     Raises:
         InputError: Something is not valid or not there; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
     executor = make_executor(options)
-    cells = _plan_cells(request, folder)
-    with folder.held():
-        missing = {cell.scene.name: cell.scene for cell in cells if folder.done(cell) is None}
-        if any(not scene.is_there for scene in missing.values()):
+    cells = _plan_cells(request, comparison)
+    with comparison.held():
+        missing = {cell.scene.name: cell for cell in cells if comparison.done(cell) is None}
+        if any(not cell.scene.is_there for cell in missing.values()):
             with progress_callback() as progress:
-                make_phantoms(list(missing.values()), progress)
-            cells = make_cells(request, folder.recorded_fingerprint)
-        log.info("%s", _states(cells, folder).title)
-        scenes = {cell.scene.path for cell in cells if folder.done(cell) is None}
-        if scenes:
-            executor.check(folder.path, sorted(scenes))
-        folder.record(request, cells)
-        failures = CellRuns(folder, executor, options, cells).run()
-        results = [(cell.title, result) for cell in cells if (result := folder.done(cell)) is not None]
+                make_phantoms([cell.scene for cell in missing.values()], progress)
+            cells = make_cells(request, comparison.recorded_fingerprint)
+            missing = {cell.scene.name: cell for cell in cells if comparison.done(cell) is None}
+        log.info("%s", _states(cells, comparison).title)
+        if missing:
+            executor.check(comparison.path, sorted(cell.scene.path for cell in missing.values()))
+        if check_data is not None:
+            for cell in missing.values():
+                with suppress(InputError):  # of which the cell fails
+                    check_data(data_manager(cell.config.datamanager, cell.scene.path).load(cell.scene.path))
+        comparison.record(request, cells)
+        run_cells(cells, comparison, executor, options)
+        results = [(cell.title, result) for cell in cells if (result := comparison.done(cell)) is not None]
     for title, result in results:
-        for name, part in result.sets.items():
-            if part.blank:
-                log.warning("%s, set %s: %s", title, name, part.transparency_warning)
-    return FinishedComparison(folder.path, cells, [result for _, result in results], failures)
+        for name, record in result.sets.items():
+            if record.blank:
+                log.warning("%s, set %s: %s", title, name, record.transparency_warning)
+    return FinishedComparison(comparison.path, cells, [result for _, result in results], comparison.failures)
 
 
-def dry_run(request: Request, folder: ComparisonFolder) -> DisplayTable:
+def dry_run(request: Request, comparison: ComparisonFolder) -> DisplayTable:
     """List what :func:`carry_out` would do with each cell; writes nothing."""
-    cells = _plan_cells(request, folder)
-    folder.read_results()
-    return _states(cells, folder)
+    cells = _plan_cells(request, comparison)
+    comparison.read_results()
+    return _states(cells, comparison)
 
 
-def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> DisplayTable:
+def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> DisplayTable:
     """Every cell with its state: done, resume, new, same (as an earlier cell), or scene to make."""
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
     for cell in cells:
         key, step, changed = "" if cell.keys is None else cell.keys.result, 0, ""
-        if folder.done(cell) is not None:
+        if comparison.done(cell) is not None:
             state = "done"
         elif key in keys:
             state = "same"
         elif not cell.scene.is_there:
             state = "scene to make"
         else:
-            step, changed = folder.run(cell).step, folder.changes(cell)
+            step, changed = comparison.run(cell).step, comparison.changes(cell)
             state = "resume" if step else "new"
         keys |= {key} if key else set()
         steps = f"{step} of {cell.steps}" if step else str(cell.steps)
@@ -253,11 +256,11 @@ def _states(cells: Sequence[ComparisonCell], folder: ComparisonFolder) -> Displa
     return DisplayTable(f"{len(cells)} cells: {states}", columns, rows)
 
 
-def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCell]:
+def _plan_cells(request: Request, comparison: ComparisonFolder) -> list[ComparisonCell]:
     """The cells that are asked for, after what can be checked without writing anything."""
-    folder.check()
-    folder.check_extends(request)
-    return make_cells(request, folder.recorded_fingerprint)
+    comparison.check()
+    comparison.check_extends(request)
+    return make_cells(request, comparison.recorded_fingerprint)
 
 
 def make_request(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> Request:

@@ -11,14 +11,11 @@ from pathlib import Path
 from coliags_plugin._version import __version__
 from coliags_plugin.comparison.plan import ComparisonCell, Request
 from coliags_plugin.comparison.plan_file import (
-    FAILURES,
     PLAN_FILE,
     RESULTS,
-    RUNS,
     ComparisonPlan,
     Decision,
     FailureRecord,
-    PlannedCell,
     PlannedScene,
     read_plan,
 )
@@ -47,22 +44,11 @@ class ComparisonFolder:
         self.path = path.resolve()
         self._by_path: dict[Path, Result] = {}  # as of read_results, and added since
         self._by_key: dict[str, Result] = {}
+        self.failures: list[FailureRecord] = []  # of this process
 
     def run(self, cell: ComparisonCell) -> RunFolder:
         """Run folder of a cell."""
-        return RunFolder(self.path / RUNS / cell.run_path)
-
-    def result(self, cell: ComparisonCell) -> Path:
-        """Results file of a cell."""
-        return self.path / RESULTS / f"{cell.result_path}.json"
-
-    def failure(self, cell: ComparisonCell) -> Path:
-        """File with the reason why a cell failed."""
-        return self.path / FAILURES / f"{cell.result_path}.json"
-
-    def log(self, cell: ComparisonCell) -> Path:
-        """Messages of the processes that worked on a cell's run."""
-        return self.path / "logs" / f"{cell.run_path}.log"
+        return RunFolder(self.path / cell.planned.run)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -93,12 +79,9 @@ class ComparisonFolder:
     def check_extends(self, request: Request) -> None:
         """Refuse to mix runs of different length or with different changes, and to decide after the first run."""
         before, options = read_plan(self.path), request.options
-        decided, now = (
-            None if before is None else before.decided,
-            (options.reference, tuple(dict.fromkeys(options.primary))),
-        )
+        decided, now = None if before is None else before.decided, _decision(request)
         is_begun = before is not None or (self.path / RESULTS).is_dir()
-        if is_begun and options.reference is not None and now != (decided and (decided.reference, decided.primary)):
+        if is_begun and now is not None and now != (decided and decided.model_copy(update={"date": now.date})):
             earlier = "nothing" if decided is None else f"{decided.reference} by {', '.join(decided.primary)}"
             raise InputError(
                 f"`reference={options.reference}` and `primary={' '.join(options.primary)}`, where {self.path} had "
@@ -123,38 +106,31 @@ class ComparisonFolder:
 
         Only a new plan takes up a decision.
         """
-        former_plan, options = read_plan(self.path), request.options
-        before = former_plan or ComparisonPlan()
+        former = read_plan(self.path)
+        before = former or ComparisonPlan(decided=_decision(request))
         entries = {entry.identity: entry for entry in before.cells}
-        changed = [
-            cell for cell in cells if cell.identity in entries and entries[cell.identity].key != cell.known_keys.result
-        ]
+        planned = {cell.planned.identity: cell.planned for cell in cells}
+        changed = [name for name, cell in planned.items() if name in entries and entries[name].key != cell.key]
         if changed:
             log.warning(
-                "%d cells are not those of the former plan, as their method, scene or the code has changed, such as %s",
+                "%d cells are not those of the former plan, as their method, scene or the code has changed, such as "
+                "%s %s seed %d",
                 len(changed),
-                changed[0].title,
+                *changed[0][:3],
             )
-        scenes = dict(before.scenes)
-        for cell in cells:
-            entries[cell.identity] = PlannedCell(
-                **cell.named,
-                run=self.run(cell).path.relative_to(self.path).as_posix(),
-                result=self.result(cell).relative_to(self.path).as_posix(),
+        scenes = {
+            cell.scene.name: PlannedScene(
+                phantom=cell.scene.phantom_record, fingerprint=cell.keys.fingerprint, package_version=__version__
             )
-            scenes[cell.scene.name] = PlannedScene(
-                phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__
-            )
-        decided = before.decided
-        if former_plan is None and options.reference is not None:
-            today = datetime.now(timezone.utc).date().isoformat()
-            decided = Decision(reference=options.reference, primary=tuple(dict.fromkeys(options.primary)), date=today)
+            for cell in cells
+            if cell.keys is not None
+        }
         plan = ComparisonPlan(
-            steps=options.steps,
-            overrides=options.settings,
-            decided=decided,
-            scenes=scenes,
-            cells=tuple(entries.values()),
+            steps=request.options.steps,
+            overrides=request.options.settings,
+            decided=before.decided,
+            scenes={**before.scenes, **scenes},
+            cells=tuple({**entries, **planned}.values()),
         )
         write_json(self.path / PLAN_FILE, plan.model_dump(mode="json"))
 
@@ -183,15 +159,15 @@ class ComparisonFolder:
         """The result of a cell; under another name where another method is the same; None where it is not done."""
         if cell.keys is None:
             return None
-        own = self._by_path.get(self.result(cell))
-        return own if own is not None and own.key == cell.keys.result else self._by_key.get(cell.keys.result)
+        result = self._by_path.get(self.path / cell.planned.result)
+        return result if result is not None and result.key == cell.keys.result else self._by_key.get(cell.keys.result)
 
     def changes(self, cell: ComparisonCell) -> str:
         """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
         if cell.keys is None:
             return ""
-        place, seed = self.result(cell).parent, f"s{cell.seed}-"
-        former = [each for path, each in self._by_path.items() if path.parent == place and path.name.startswith(seed)]
+        place, _, _ = str(self.path / cell.planned.result).rpartition("-")  # without the key
+        former = [each for path, each in self._by_path.items() if str(path).rpartition("-")[0] == place]
         former = [each for each in former if each.protocol.name == cell.protocol]
         if not former:
             return ""
@@ -207,23 +183,29 @@ class ComparisonFolder:
 
         The result may be that of a cell whose method is the same under another name.
         """
-        path, name = self.result(cell), cell.variant.name
+        path, name = self.path / cell.planned.result, cell.variant.name
         if result.method != name:
             provenance = {**result.provenance, "same_as": result.method}
             result = result.model_copy(update={"method": name, "provenance": provenance})
         if self._by_path.get(path) != result:
             write_result(path, result)
         self._by_path[path] = self._by_key[result.key] = result
-        self.failure(cell).unlink(missing_ok=True)
+        (self.path / cell.planned.failure).unlink(missing_ok=True)
 
-    def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> FailureRecord:
+    def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> None:
         """Record why a cell failed; a full disk loses the record, not the reason."""
-        reason = without_places(reason, (self.path, cell.scene.path))
-        failure = FailureRecord(
-            **cell.named, reason=reason, attempts=attempts, log=str(self.log(cell).relative_to(self.path))
-        )
+        reason, planned = without_places(reason, (self.path, cell.scene.path)), cell.planned
+        names = planned.model_dump(exclude={"run", "result"})
+        failure = FailureRecord(**names, reason=reason, attempts=attempts, log=planned.log)
         try:
-            write_json(self.failure(cell), failure.model_dump(mode="json"))
+            write_json(self.path / planned.failure, failure.model_dump(mode="json"))
         except InputError as error:
             log.warning("%s", error)
-        return failure
+        self.failures.append(failure)
+
+
+def _decision(request: Request) -> Decision | None:
+    """What a request decides before the first run, if anything."""
+    reference, primary = request.options.reference, tuple(dict.fromkeys(request.options.primary))
+    today = datetime.now(timezone.utc).date().isoformat()
+    return None if reference is None else Decision(reference=reference, primary=primary, date=today)

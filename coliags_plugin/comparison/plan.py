@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
-from pathlib import PurePosixPath
-from typing import Any
 
 from coliags_plugin.comparison.named_files import Variant
+from coliags_plugin.comparison.plan_file import RESULTS, RUNS, PlannedCell
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.engine.data_formats import data_manager, load_method_for
@@ -48,50 +46,30 @@ class ComparisonCell:
     keys: CellKeys | None  # None while the scene, a phantom, is not there
 
     @property
-    def named(self) -> dict[str, Any]:
-        """Scene, method, seed, protocol and key of its result, as records hold them."""
-        return {
-            "scene": self.scene_label,
-            "method": self.variant.name,
-            "seed": self.seed,
-            "protocol": self.protocol,
-            "key": self.known_keys.result,
-        }
-
-    @property
-    def identity(self) -> tuple[str, str, int, str]:
-        """Name of the cell: scene, method, seed, protocol."""
-        return self.scene_label, self.variant.name, self.seed, self.protocol
-
-    @property
     def steps(self) -> int:
         """Length of its training."""
         return self.config.schedule.steps
 
     @property
     def title(self) -> str:
-        """For messages: scene, method and seed."""
+        """Scene, method and seed, for messages."""
         return f"{self.scene_label} {self.variant.name} seed {self.seed}"
 
     @property
-    def known_keys(self) -> CellKeys:
-        """Its keys."""
+    def planned(self) -> PlannedCell:
+        """Names, key and places (``SCENE/METHOD/sSEED-KEY``) of a cell whose scene is there."""
         if self.keys is None:
             raise ValueError(f"{self.title}: the scene is not there, so that it has no key")
-        return self.keys
-
-    @property
-    def run_path(self) -> PurePosixPath:
-        """Place of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
-        return self._path(self.known_keys.training)
-
-    @property
-    def result_path(self) -> PurePosixPath:
-        """Place of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
-        return self._path(self.known_keys.result)
-
-    def _path(self, key: str) -> PurePosixPath:
-        return PurePosixPath(self.scene_label, self.variant.name.replace("/", "-"), f"s{self.seed}-{key[:_SHORT]}")
+        place = f"{self.scene_label}/{self.variant.name.replace('/', '-')}/s{self.seed}"
+        return PlannedCell(
+            scene=self.scene_label,
+            method=self.variant.name,
+            seed=self.seed,
+            protocol=self.protocol,
+            key=self.keys.result,
+            run=f"{RUNS}/{place}-{self.keys.training[:_SHORT]}",
+            result=f"{RESULTS}/{place}-{self.keys.result[:_SHORT]}.json",
+        )
 
 
 @dataclass(frozen=True)
@@ -103,21 +81,12 @@ class Request:
     options: CompareOptions  # of which the runs' are used: their seeds, protocol, splits, steps, and settings
 
 
-def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[ComparisonCell]:
+def make_cells(request: Request, recorded: RecordedFingerprint = lambda scene: None) -> list[ComparisonCell]:
     """All cells, those of one seed together, and within it those of one scene."""
     options, seeds = request.options, range(request.options.seeds)
     version = registry.protocols.get(options.protocol).version
     steps = () if options.steps is None else (f"schedule.steps={options.steps}",)
-    known: dict[tuple[str, str, str], str] = {}  # fingerprints, each computed once for each way of reading a scene
-
-    def fingerprint(scene: SceneSource, component: Component) -> str | None:
-        if not scene.is_there:
-            return None if recorded is None else recorded(scene)
-        key = (str(scene.path), component.name, component.settings.model_dump_json())
-        if key not in known:
-            known[key] = data_manager(component, scene.path).fingerprint(scene.path)
-        return known[key]
-
+    fingerprints: dict[str, str | None] = {}  # each computed once for each way of reading a scene
     cells: list[ComparisonCell] = []
     with _warnings_only():
         for scene, split, variant in product(
@@ -126,17 +95,19 @@ def make_cells(request: Request, recorded: RecordedFingerprint | None = None) ->
             chosen = () if split is None else (f"datamanager.split={split}",)
             overrides = (*scene.overrides, *chosen, *variant.overrides, *steps, *options.settings)
             config = _config(scene, variant.method, overrides)
-            own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
-            label = scene.name if used in (None, own) else f"{scene.name}-{used}"
-            data, plain = fingerprint(scene, config.datamanager), config.model_dump()
+            usual, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
+            label = scene.name if used in (None, usual) else f"{scene.name}-{used}"
+            reader, plain = config.datamanager, config.model_dump()
+            way = f"{scene.name} {reader.name} {reader.settings.model_dump_json()}"
+            if way not in fingerprints:
+                manager = data_manager(reader, scene.path)
+                fingerprints[way] = manager.fingerprint(scene.path) if scene.is_there else recorded(scene)
             for seed in seeds:
                 keys = None
-                if data is not None:
-                    keys = CellKeys(
-                        data,
-                        training_key(plain, data, seed, code_key()),
-                        result_key(plain, data, seed, code_key(), options.protocol, version),
-                    )
+                if (data := fingerprints[way]) is not None:
+                    training = training_key(plain, data, seed, code_key())
+                    result = result_key(plain, data, seed, code_key(), options.protocol, version)
+                    keys = CellKeys(data, training, result)
                 cells.append(ComparisonCell(variant, scene, label, seed, options.protocol, overrides, config, keys))
     return sorted(cells, key=lambda cell: cell.seed)
 

@@ -12,7 +12,7 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
 
 #: Names within the folder of a comparison.
-PLAN_FILE, RESULTS, RUNS, FAILURES = "plan.json", "results", "runs", "failures"
+PLAN_FILE, RESULTS, RUNS, FAILURES, LOGS = "plan.json", "results", "runs", "failures", "logs"
 #: Version of the schema below.
 VERSION = 2
 _EXPECTED = "what `coliags compare` wrote"
@@ -47,17 +47,35 @@ class _NamedCell(_PlanPart):
 
 
 class PlannedCell(_NamedCell):
-    """A cell of a plan; what else archived plans say of it is not read."""
+    """A cell of a plan, and its places relative to the folder; what else archived plans say of it is not read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    run: str = Field(pattern=f"^{RUNS}/")  # run folder, relative to the comparison's
-    result: str = Field(pattern=f"^{RESULTS}/")  # results file, likewise; there once the cell is done
+    run: str = Field(pattern=f"^{RUNS}/")  # run folder; protocols share it
+    result: str = Field(pattern=f"^{RESULTS}/")  # results file; there once the cell is done
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
         """Name of the cell: scene, method, seed, protocol."""
         return self.scene, self.method, self.seed, self.protocol
+
+    @property
+    def failure(self) -> str:
+        """File with the reason why it failed."""
+        return f"{FAILURES}/{self.result.removeprefix(f'{RESULTS}/')}"
+
+    @property
+    def log(self) -> str:
+        """Messages of the processes that worked on its run."""
+        return f"{LOGS}/{self.run.removeprefix(f'{RUNS}/')}.log"
+
+
+class FailureRecord(_NamedCell):
+    """Reason why a cell failed."""
+
+    reason: str  # one line
+    attempts: int  # processes that tried
+    log: str  # their messages, relative to the comparison's folder
 
 
 class ComparisonPlan(_PlanPart):
@@ -70,14 +88,6 @@ class ComparisonPlan(_PlanPart):
     decided: Decision | None = None  # when the plan was first written
     scenes: dict[str, PlannedScene] = {}
     cells: tuple[PlannedCell, ...] = ()  # in the order in which they were asked for
-
-
-class FailureRecord(_NamedCell):
-    """Reason why a cell failed."""
-
-    reason: str  # one line
-    attempts: int  # processes that tried
-    log: str  # their messages, relative to the comparison's folder
 
 
 def read_plan(folder: Path) -> ComparisonPlan | None:

@@ -24,19 +24,18 @@ from coliags_plugin.engine.tasks import STOPPING, Executor, LocalWorker, Task, T
 
 log = logging.getLogger(__name__)
 
-#: For an answer of a node to the question what it sees, seconds.
+#: Time for an answer of a node to the question what it sees, seconds.
 _ANSWER = 120.0
-#: For a connection to the cluster's address, seconds.
+#: Time for a connection to the cluster's address, seconds.
 _CONNECT = 10.0
 _PAUSE = 0.1
-#: What a node lacks: what was seen, what was expected, and what to do.
-_Fault = tuple[str, str, str]
 #: Ray's errors of tasks that ended without a word, whose own texts are long.
 _DEATHS = {
     "NodeDiedError": "the node died",
     "OutOfMemoryError": "the node's memory ran out",
     "WorkerCrashedError": "the task's process was ended",
 }
+_START = "Start one: `ray start --head`, and `ray start --address HOST:PORT` on every other machine"
 
 
 class RayExecutor(Executor):
@@ -54,8 +53,7 @@ class RayExecutor(Executor):
             raise InputError(
                 f"`device={device}` with `executor=ray`", "auto, cpu or cuda", "Ray gives each run its GPU"
             )
-        self._ray = _library()
-        self._connect(address)
+        self._ray = _connected(address or os.environ.get("RAY_ADDRESS") or "auto")
         self.threads, self._slots = threads, slots
         self._gpus = 0 if device == "cpu" or not self._resource("GPU") else 1
         if device == "cuda" and not self._gpus:
@@ -66,9 +64,9 @@ class RayExecutor(Executor):
     @property
     def slots(self) -> int:  # type: ignore[override]
         """As many as the cluster has room for now, or fewer where that was asked for."""
-        of_cpus = int(self._resource("CPU") // self.threads)
-        room = min(of_cpus, int(self._resource("GPU"))) if self._gpus else of_cpus
-        return max(1, room if self._slots is None else min(room, self._slots))
+        rooms = [int(self._resource("CPU") // self.threads)]
+        rooms += [int(self._resource("GPU"))] if self._gpus else []
+        return max(1, min(rooms if self._slots is None else [*rooms, self._slots]))
 
     def check(self, folder: Path, inputs: Sequence[Path]) -> None:
         """Have every node read and write in the folder, and see the inputs."""
@@ -76,10 +74,8 @@ class RayExecutor(Executor):
         atomic_write(file, "")
         try:
             for node in (node for node in self._ray.nodes() if node["Alive"]):
-                fault = self._ask(node, file, [path.resolve() for path in inputs])
-                if fault is not None:
-                    seen, expected, do = fault
-                    raise InputError(f"node {node['NodeManagerAddress']} {seen}", expected, do)
+                if fault := self._ask(node, file, [path.resolve() for path in inputs]):
+                    raise InputError(f"node {node['NodeManagerAddress']} {fault[0]}", *fault[1:])
         finally:
             for path in folder.resolve().glob(f"{file.name}*"):
                 path.unlink(missing_ok=True)
@@ -90,8 +86,6 @@ class RayExecutor(Executor):
 
     def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """See :class:`Executor`."""
-        if not self._tasks:
-            return []
         ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=seconds)
         return [(self._tasks.pop(reference), self._outcome(reference)) for reference in ready]
 
@@ -105,44 +99,23 @@ class RayExecutor(Executor):
                 self._ray.cancel(reference, force=True)
         self._tasks.clear()
 
-    def _connect(self, address: str | None) -> None:
-        if self._ray.is_initialized():
-            return
-        address = address or os.environ.get("RAY_ADDRESS") or "auto"
-        start = "Start one: `ray start --head`, and `ray start --address HOST:PORT` on every other machine"
-        if address != "auto" and "://" not in address:
-            host, _, port = address.rpartition(":")
-            try:
-                socket.create_connection((host, int(port)), _CONNECT).close()
-            except (OSError, ValueError) as error:
-                raise InputError(f"no Ray cluster at {address}: {error}", "HOST:PORT of its head", start) from error
-        try:
-            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            reason = str(error).strip().partition("\n")[0]
-            raise InputError(f"no Ray cluster at '{address}': {reason}", "one that is running", start) from error
-
     def _resource(self, name: str) -> float:
         return float(self._ray.cluster_resources().get(name, 0.0))
 
-    def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> _Fault | None:
-        """Fault of a node; None where it lacks nothing, or is gone meanwhile."""
+    def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> tuple[str, ...]:
+        """What a node lacks, what was expected, and what to do; empty where it lacks nothing, or is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+        there, errors = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False), self._ray.exceptions
         look = self._ray.remote(_fault_of_node).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
-        question = look.remote(__version__, str(file), [str(path) for path in inputs])
         try:
-            fault: _Fault | None = self._ray.get(question, timeout=_ANSWER)
-        except self._ray.exceptions.RayError as error:
-            if isinstance(error, (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)):
-                log.warning("node %s is gone", node["NodeManagerAddress"])
-                return None
-            return (
-                f"cannot run tasks: {_last_line(error)}",
-                f"coliags_plugin {__version__} on every node",
-                "Install it there in the Python that runs `ray start`",
-            )
+            fault: tuple[str, ...] = self._ray.get(look.remote(__version__, file, inputs), timeout=_ANSWER)
+        except (errors.TaskUnschedulableError, errors.NodeDiedError):
+            log.warning("node %s is gone", node["NodeManagerAddress"])
+            return ()
+        except errors.RayError as error:
+            expected = f"coliags_plugin {__version__} on every node"
+            return f"cannot run tasks: {_last_line(error)}", expected, "Install it there in the Python of `ray start`"
         return fault
 
     def _outcome(self, reference: Any) -> TaskOutcome:
@@ -155,28 +128,41 @@ class RayExecutor(Executor):
             return TaskOutcome("died", reason or f"{type(error).__name__}: {_last_line(error)}")
 
 
-def _fault_of_node(version: str, file: str, inputs: Sequence[str]) -> _Fault | None:
+def _connected(address: str) -> Any:
+    """Ray, connected to the cluster at an address; to the one that it is connected to already."""
+    try:
+        import ray
+    except ImportError as error:
+        expected, do = "the package with its extra 'sweep'", 'pip install "coliags_plugin[sweep]"'
+        raise InputError("`executor=ray`, but Ray is not installed", expected, do) from error
+    if ray.is_initialized():
+        return ray
+    try:
+        if address != "auto" and "://" not in address:  # Ray itself would wait for long
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), _CONNECT).close()
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise InputError(
+            f"no Ray cluster at {address}: {reason}", "HOST:PORT of a running one's head", _START
+        ) from error
+    return ray
+
+
+def _fault_of_node(version: str, file: Path, inputs: Sequence[Path]) -> tuple[str, ...]:
     """On a node: whether it has this version, can write beside a file that the driver wrote, and sees the inputs."""
     if version != __version__:
         return f"has coliags_plugin {__version__}", f"{version}, as here", "Install it there"
-    path = Path(file)
+    place = "on storage that all machines share, under the same path"
     try:
-        path.rename(path.with_name(f"{path.name}-seen"))
-        path.with_name(f"{path.name}-seen").rename(path)
-    except OSError as problem:
-        return (
-            f"does not see {path.parent}, or cannot write there: {problem.strerror or problem}",
-            "an `output` on storage that all machines share, under the same path",
-            "Choose a folder on a network file system",
-        )
-    missing = [each for each in inputs if not Path(each).exists()]
-    if missing:
-        return (
-            f"does not see {', '.join(missing)}",
-            "inputs on storage that all machines share, under the same paths",
-            "Copy them there, or give a path that all machines share",
-        )
-    return None
+        renamed = file.rename(file.with_name(f"{file.name}-seen"))
+        renamed.rename(file)
+    except OSError as error:
+        seen = f"does not see {file.parent}, or cannot write there: {error.strerror or error}"
+        return seen, f"an `output` {place}", "Choose a folder on a network file system"
+    missing = ", ".join(str(path) for path in inputs if not path.exists())
+    return (f"does not see {missing}", f"inputs {place}", "Copy them there") if missing else ()
 
 
 def _work(task: Task) -> dict[str, Any]:
@@ -191,18 +177,6 @@ def _work(task: Task) -> dict[str, Any]:
         with suppress(KeyboardInterrupt):
             worker.wait_or_kill(STOPPING)
         return asdict(TaskOutcome("stopped"))
-
-
-def _library() -> Any:
-    try:
-        import ray
-    except ImportError as error:
-        raise InputError(
-            "`executor=ray`, but Ray is not installed",
-            "the package with its extra 'sweep'",
-            'pip install "coliags_plugin[sweep]"',
-        ) from error
-    return ray
 
 
 def _last_line(error: Exception) -> str:

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal, get_args
 
 from coliags_plugin.core.errors import InputError, check_name, check_number
 from coliags_plugin.engine.devices import find_device
@@ -19,11 +18,9 @@ from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Loca
 
 log = logging.getLogger(__name__)
 
-ExecutorName = Literal["local", "ray"]
-
-#: Between two reports of progress, seconds.
+#: Time between two reports of progress, seconds.
 POLL_INTERVAL_S = 1.0
-#: Between lines of progress besides those of the jobs, where there is neither a terminal nor a notebook, seconds.
+#: Time between lines of progress besides those of the jobs, where there is neither a terminal nor a notebook, seconds.
 _PLAIN_LINE_EVERY_S = 60.0
 
 
@@ -32,7 +29,7 @@ def make_executor(options: ExecutionOptions) -> Executor:
     check_number("jobs", options.jobs)
     check_number("threads", options.threads)
     check_number("retries", options.retries, least=0)
-    check_name("executor", options.executor, get_args(ExecutorName))
+    check_name("executor", options.executor, ("local", "ray"))
     if options.executor == "ray":
         return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
     cpus, gpus = available_cpus(), _gpus(options.device)
@@ -53,8 +50,8 @@ def _gpus(device: str) -> list[str]:
     if chosen.type != "cuda":
         return []
     visible = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
-    found = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
-    return [found[chosen.index]] if ":" in device else found
+    gpus = (visible or list(map(str, range(torch.cuda.device_count()))))[: torch.cuda.device_count()]
+    return [gpus[chosen.index]] if ":" in device else gpus
 
 
 class Job(ABC):
@@ -100,8 +97,8 @@ class JobQueue:
         self._waiting, self._running = deque(jobs), dict[str, Job]()
         self._attempts: Counter[str] = Counter()
 
-    def run(self, title: str, told: Callable[[Sequence[Job]], str]) -> None:
-        """Do all jobs; ``told`` of those that run are the facts beside the progress.
+    def run(self, title: str, facts: Callable[[Sequence[Job]], str]) -> None:
+        """Do all jobs; ``facts`` of those that run stand beside the progress.
 
         Raises:
             KeyboardInterrupt: Ctrl-C, or the system's request to end; all tasks have saved their state.
@@ -111,22 +108,18 @@ class JobQueue:
             ProgressReport(title, self._total, self._over, _PLAIN_LINE_EVERY_S, log_console()) as report,
         ):
             try:
-                self._start()
-                while self._running:
-                    self._report(report, told)
-                    for task, outcome in self._executor.wait(POLL_INTERVAL_S):
-                        self._take(self._running.pop(task.key), outcome)
+                while self._waiting or self._running:
                     self._start()
-                self._report(report, told)
+                    running = tuple(self._running.values())
+                    report.update(self._over + sum(job.progress() for job in running), facts(running))
+                    for task, outcome in self._executor.wait(POLL_INTERVAL_S) if running else ():
+                        self._take(self._running.pop(task.key), outcome)
+                report.update(self._over, facts(()))
             except KeyboardInterrupt:
                 log.info("stopping: the state is saved; Ctrl-C again to stop at once")
                 raise
             finally:
                 self._executor.stop()
-
-    def _report(self, report: ProgressReport, told: Callable[[Sequence[Job]], str]) -> None:
-        running = tuple(self._running.values())
-        report.update(self._over + sum(job.progress() for job in running), told(running))
 
     def _start(self) -> None:
         """Start what can be started."""
@@ -143,7 +136,7 @@ class JobQueue:
 
     def _take(self, job: Job, outcome: TaskOutcome) -> None:
         """Take the result of a job whose worker has ended; retry or fail it, or take up what comes after it."""
-        reason, attempts = outcome.reason or outcome.ending, self._attempts[job.task.key]
+        attempts = self._attempts[job.task.key]
         if outcome.ending == "done":
             try:
                 self._waiting.extendleft(reversed(job.finish()))
@@ -153,9 +146,9 @@ class JobQueue:
         elif outcome.ending in ("failed", "unwritable"):
             self._fail(job, outcome.reason, outcome.ending)
         elif attempts > self._retries:
-            self._fail(job, f"{reason}, {attempts} times")
+            self._fail(job, f"{outcome.reason or outcome.ending}, {attempts} times")
         else:
-            log.warning("%s: %s; trying again", job.task.title, reason)
+            log.warning("%s: %s; trying again", job.task.title, outcome.reason or outcome.ending)
             self._waiting.appendleft(job)
 
     def _fail(self, job: Job, reason: str, ending: Ending = "failed") -> None:

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from coliags_plugin.core.errors import (
     InputError,
@@ -23,7 +23,7 @@ from coliags_plugin.core.errors import (
 )
 from coliags_plugin.core.jobs import locked
 from coliags_plugin.engine.task_queue import Job, JobQueue
-from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, TaskOutcome, attempt, run_worker
+from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, run_worker
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
 from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
@@ -150,14 +150,14 @@ class StageJob(Job):
             title=f"{context.out.resolve().name}, {'poses' if submap is None else f'sub-map {submap}'}",
             key=f"{out} {name}",
             device=str(context.device) if workers is None else workers.options.device,
-            log=str(out / LOGS / f"{name}.log"),
+            folder=out,
+            log=out / LOGS / f"{name}.log",
             threads=1 if workers is None else workers.executor.threads,
-            source=str(context.source.resolve()),
-            root=str(out),
+            source=context.source.resolve(),
             segment=context.segment,
             submap=submap,
             settings=context.settings.model_dump_json(),
-            mask=None if context.mask is None else str(context.mask.resolve()),
+            mask=None if context.mask is None else context.mask.resolve(),
             data_format=context.data_format,
         )
 
@@ -228,44 +228,36 @@ def worker_name(context: StageContext) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageTask(Task):
-    """The stages of one context, for a worker process."""
+    """The stages of one context, for a worker process; its folder is the root of the reconstruction."""
 
-    worker: ClassVar[str] = "coliags_plugin.pipeline.jobs"
-    source: str
-    root: str
+    source: Path
     segment: str
     submap: int | None  # number; None: the stages that all need
     settings: str  # JSON
-    mask: str | None
+    mask: Path | None
     data_format: str | None
 
+    def complete(self) -> None:
+        """Run the stages that are not done.
 
-def work(task: StageTask) -> TaskOutcome:
-    """Run the stages that are not done."""
-    return attempt(task.title, task.root, lambda: complete(task))
+        Raises:
+            InputError: One cannot be done; the message is in the record, too.
+        """
+        import torch
 
+        from coliags_plugin.engine.devices import choose_device
 
-def complete(task: StageTask) -> None:
-    """Run the stages that are not done.
-
-    Raises:
-        InputError: One cannot be done; the message is in the record, too.
-    """
-    import torch
-
-    from coliags_plugin.engine.devices import choose_device
-
-    torch.set_num_threads(task.threads)
-    settings = ReconstructionSettings.model_validate_json(task.settings, strict=False)  # of lists
-    mask, device = None if task.mask is None else Path(task.mask), choose_device(task.device)
-    context = StageContext(
-        Path(task.root), Path(task.source), settings, mask, task.data_format, device, segment=task.segment
-    )
-    if task.submap is not None:
-        context = next(one for one in context.submaps() if one.submap and one.submap.number == task.submap)
-    with locked(worker_lock(context.root, worker_name(context)), context.root, LOCK_SECONDS):
-        run_stages(stages_of(context), Record.of(context.root, context.places))
+        torch.set_num_threads(self.threads)
+        settings = ReconstructionSettings.model_validate_json(self.settings, strict=False)  # of lists
+        device = choose_device(self.device)
+        context = StageContext(
+            self.folder, self.source, settings, self.mask, self.data_format, device, segment=self.segment
+        )
+        if self.submap is not None:
+            context = next(one for one in context.submaps() if one.submap and one.submap.number == self.submap)
+        with locked(worker_lock(context.root, worker_name(context)), context.root, LOCK_SECONDS):
+            run_stages(stages_of(context), Record.of(context.root, context.places))
 
 
 if __name__ == "__main__":
-    run_worker(lambda text: work(StageTask.from_json(text)))
+    run_worker(StageTask)

@@ -15,7 +15,7 @@ import pytest
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import carry_out, make_request
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.worker import CellTask, work
+from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.engine.tasks import ExecutionOptions, TaskOutcome
 from tests.task_list import TaskList
@@ -34,17 +34,18 @@ class InlineExecutor(TaskList):
     """Works on cells in this process."""
 
     def outcome(self, task: CellTask) -> TaskOutcome:
-        return work(task)
+        return task.attempt()
 
 
-def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=()):
+def compare_inline(
+    methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=(), check_data=None
+):
     """A comparison in this process."""
     options = CompareOptions(scenes, Path(output), seeds=seeds, splits=splits, steps=steps, settings=tuple(overrides))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "make_executor", lambda options: executor or InlineExecutor())
-        return carry_out(
-            make_request(methods, options), ComparisonFolder(options.output), ExecutionOptions(device="cpu")
-        )
+        request, folder = make_request(methods, options), ComparisonFolder(options.output)
+        return carry_out(request, folder, ExecutionOptions(device="cpu"), check_data)
 
 
 def hashes(folder: Path) -> dict[str, str]:

@@ -109,6 +109,24 @@ def test_views_that_show_nothing_are_told(wall, folder, caplog):
     assert warning.startswith("wall coliags seed 0, set test: 1 of 2 views show nothing")
 
 
+def test_scenes_are_checked_once_before_the_first_run(wall, bare, tmp_path):
+    checked = []
+
+    class Watching(InlineExecutor):
+        def start(self, task):
+            assert [scene.name for scene in checked] == ["wall", "bare"]
+            super().start(task)
+
+    for _ in range(2):
+        compare_inline(
+            ["scaffold-gs", "scaffold-gs-distance"],
+            [wall, bare],
+            tmp_path / "new",
+            Watching(),
+            check_data=checked.append,
+        )
+
+
 def test_a_comparison_is_extended(wall, folder):
     _, ran = again(wall, folder, ["scaffold-gs", "coliags"], seeds=2)
     assert ran == ["wall scaffold-gs seed 1", "wall coliags seed 1"]

@@ -66,10 +66,10 @@ def test_a_method_under_another_name_has_the_same_key(wall):
         wall, ["coliags", Variant("whole", "ablations/depth-imve-imia"), Variant("no-lamp", "ablations/depth-imve")]
     )
     assert ours.keys == same.keys and ours.keys != other.keys
-    assert ours.run_path != same.run_path
+    assert ours.planned.run != same.planned.run
     (cell,) = cells(wall, ["ablations/depth"])
-    assert str(cell.run_path) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
-    assert str(cell.result_path) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"
+    assert cell.planned.run == f"runs/wall/ablations-depth/s0-{cell.keys.training[:8]}"
+    assert cell.planned.result == f"results/wall/ablations-depth/s0-{cell.keys.result[:8]}.json"
 
 
 def test_the_fingerprint_is_that_of_the_loaded_scene(wall):

@@ -20,7 +20,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine import ray_executor
 from coliags_plugin.engine.ray_executor import RayExecutor
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.tasks import Task
 from tests.commands import refused
 from tests.comparison.small import (
     OFTEN,
@@ -224,7 +223,7 @@ def test_every_run_gets_a_gpu_of_its_own(cluster, wall, tmp_path, monkeypatch):
     for device, gpus in (("auto", {"0", "1"}), ("cpu", {""})):
         executor = RayExecutor(made.address, None, 1, device)
         for _ in range(2):
-            executor.start(object.__new__(Task))
+            executor.start(None)
         ended = []
         while len(ended) < 2:
             ended += executor.wait(60.0)

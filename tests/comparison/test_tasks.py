@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.comparison.worker import CellTask, work
+from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.tasks import LocalExecutor, TaskOutcome
 
 
 @pytest.fixture
 def task(tmp_path):
-    places = {name: str(tmp_path / name) for name in ("data", "run", "result", "log")}
+    places = {name: tmp_path / name for name in ("data", "folder", "result", "log")}
     return CellTask(
         title="wall coliags seed 0",
         name="coliags",
@@ -69,15 +69,15 @@ def test_a_process_that_says_nothing_has_died(returncode, printed, reason):
 
 
 def test_a_scene_that_is_gone_is_the_reason(task):
-    outcome = work(task)
+    outcome = task.attempt()
     assert outcome.ending == "failed" and f"no folder {task.data}" in outcome.reason
 
 
 def test_a_run_that_another_process_has_is_left_alone(task):
-    with RunFolder(Path(task.run)).owned():
-        outcome = work(replace(task, lock_seconds=0.3))
+    with RunFolder(task.folder).owned():
+        outcome = replace(task, lock_seconds=0.3).attempt()
     assert outcome.ending == "failed"
-    owner = f"{task.run} is in use by process {os.getpid()} on {os.uname().nodename} since 20"
+    owner = f"{task.folder} is in use by process {os.getpid()} on {os.uname().nodename} since 20"
     assert outcome.reason.startswith(owner)
 
 
@@ -105,7 +105,7 @@ def test_the_local_executor_runs_as_many_as_it_has_slots_for_and_stops_them(task
     ] * 2
     # Each sees one GPU, which is cuda whatever its number is, and may not go without.
     assert task.device == "cpu" and all("# on cuda\n" in each._process.args[-1] for each in executor._workers.values())
-    while Path(task.log).read_text().count("up") < 2:
+    while task.log.read_text().count("up") < 2:
         time.sleep(0.01)
     processes = [worker._process for worker in executor._workers.values()]
     executor.stop()

@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps
-from coliags_plugin.pipeline.jobs import StageTask, work
+from coliags_plugin.pipeline.jobs import StageTask
 from coliags_plugin.pipeline.stages import StageRecord
 from coliags_plugin.reporting.video import write_video
 from tests.pipeline.films import film
@@ -122,7 +122,7 @@ class Workers(TaskList):
         ending = self.endings.pop(0) if self.endings else None
         if isinstance(ending, BaseException):
             raise ending
-        return ending or work(task)
+        return ending or task.attempt()
 
 
 @pytest.fixture
