@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -101,14 +102,18 @@ def compare_with_rivals(
 
     p-values are adjusted for the family: so many rivals, with or without values, and at least those that are here.
     """
+    sign, means = 1.0 if higher_is_better else -1.0, {method: scene_means(each) for method, each in values.items()}
     leads = {
-        rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
-        for rival, by_seed in values.items()
+        rival: {
+            scene: sign * (means[reference][scene] - by_scene[scene]) for scene in means[reference] if scene in by_scene
+        }
+        for rival, by_scene in means.items()
         if rival != reference
     }
-    samples = {rival: np.array([*own.values()]) for rival, own in leads.items() if len(own) >= FEWEST_SCENES}
+    samples = {rival: np.array([*each.values()]) for rival, each in leads.items() if len(each) >= FEWEST_SCENES}
     wilcoxon = {rival: wilcoxon_p(sample) for rival, sample in samples.items()}
-    t_test = {rival: p for rival, sample in samples.items() if (p := t_test_p(sample)) is not None}
+    student = {rival: t_statistics(sample) for rival, sample in samples.items()}
+    t_test = {rival: each.p for rival, each in student.items() if each.p is not None}
     wilcoxon_holm, t_test_holm = (
         dict(zip(p_values, holm([*p_values.values()], max(family, len(leads))), strict=True))
         for p_values in (wilcoxon, t_test)
@@ -119,8 +124,8 @@ def compare_with_rivals(
             wilcoxon_holm[rival],
             t_test.get(rival),
             t_test_holm.get(rival),
-            t_interval(sample),
-            cohen_dz(sample),
+            student[rival].interval,
+            student[rival].cohen_dz,
             rank_biserial(sample),
         )
         for rival, sample in samples.items()
@@ -128,19 +133,13 @@ def compare_with_rivals(
     return [
         RivalComparison(
             rival=rival,
-            scenes=tuple(own),
-            lead=float(np.mean([*own.values()])) if own else None,
-            better_on=sum(lead > 0.0 for lead in own.values()),
+            scenes=tuple(each),
+            lead=float(np.mean([*each.values()])) if each else None,
+            better_on=sum(lead > 0.0 for lead in each.values()),
             tests=tests.get(rival),
         )
-        for rival, own in leads.items()
+        for rival, each in leads.items()
     ]
-
-
-def _leads(reference: BySeed, rival: BySeed, sign: float) -> dict[str, float]:
-    """Lead of the reference on each common scene."""
-    one, other = scene_means(reference), scene_means(rival)
-    return {scene: sign * (one[scene] - other[scene]) for scene in common_scenes([reference, rival])}
 
 
 def smallest_p(scenes: int) -> float:
@@ -154,22 +153,29 @@ def wilcoxon_p(differences: Differences) -> float:
     Exact for up to 50 differences without ties, else the normal approximation; never below :func:`smallest_p`. Without
     a difference that is not zero it is 1.
     """
-    kept = differences[differences != 0.0]
-    return max(float(stats.wilcoxon(kept).pvalue), smallest_p(len(kept))) if kept.size else 1.0
+    nonzero = differences[differences != 0.0]
+    return max(float(stats.wilcoxon(nonzero).pvalue), smallest_p(len(nonzero))) if nonzero.size else 1.0
 
 
-def t_test_p(differences: Differences) -> float | None:
-    """Two-sided p of the paired t-test of two differences or more; undefined, None, where all are equal."""
-    if _constant(differences):
-        return None
-    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+class Student(NamedTuple):
+    """Statistics of paired differences by Student's t."""
+
+    p: float | None  # two-sided p of the paired t-test; None where all differences are equal
+    cohen_dz: float | None  # Cohen's d: mean over standard deviation (n - 1); None where all differences are equal
+    interval: tuple[float, float]  # 95 % interval of the mean; the mean alone where all differences are equal
 
 
-def cohen_dz(differences: Differences) -> float | None:
-    """Cohen's d of paired samples: mean over standard deviation (n - 1); None where all differences are equal."""
-    if _constant(differences):
-        return None
-    return float(np.mean(differences) / np.std(differences, ddof=1))
+def t_statistics(differences: Differences) -> Student:
+    """Student's t of two differences or more; those that are equal up to rounding have no standard deviation.
+
+    Where scenes are few, the interval covers more than bootstraps do (docs/reports.md 4).
+    """
+    mean = float(np.mean(differences))
+    if float(np.ptp(differences)) <= 1e-12 * float(np.max(np.abs(differences))):
+        return Student(None, None, (mean, mean))
+    test = stats.ttest_1samp(differences, 0.0)
+    low, high = test.confidence_interval(0.95)
+    return Student(float(test.pvalue), mean / float(np.std(differences, ddof=1)), (float(low), float(high)))
 
 
 def rank_biserial(differences: Differences) -> float:
@@ -178,22 +184,9 @@ def rank_biserial(differences: Differences) -> float:
     1 where all differences are positive, -1 where all are negative, 0 where none is other than zero. Source: Kerby,
     The simple difference formula, 2014.
     """
-    kept = differences[differences != 0.0]
-    if not kept.size:
-        return 0.0
-    ranks = stats.rankdata(np.abs(kept))
-    return float(np.sum(np.sign(kept) * ranks) / np.sum(ranks))
-
-
-def t_interval(differences: Differences) -> tuple[float, float]:
-    """95 % interval of the mean of two differences or more by Student's t; the mean alone where all are equal.
-
-    Where scenes are few, it covers more than bootstraps do (docs/reports.md 4).
-    """
-    if _constant(differences):
-        return float(np.mean(differences)), float(np.mean(differences))
-    found = stats.ttest_1samp(differences, 0.0).confidence_interval(0.95)
-    return float(found.low), float(found.high)
+    nonzero = differences[differences != 0.0]
+    ranks = stats.rankdata(np.abs(nonzero))
+    return float(np.sum(np.sign(nonzero) * ranks) / np.sum(ranks)) if nonzero.size else 0.0
 
 
 def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
@@ -203,16 +196,8 @@ def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
 
     Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
     """
-    count = len(p_values) if family is None else family
-    adjusted = [0.0] * len(p_values)
-    largest = 0.0
-    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda index: p_values[index])):
-        largest = max(largest, min(1.0, (count - rank) * p_values[index]))
-        adjusted[index] = largest
-    return adjusted
-
-
-def _constant(differences: Differences) -> bool:
-    """Tell whether all differences are equal up to rounding, so that their standard deviation is none."""
-    size = float(np.max(np.abs(differences), initial=0.0))
-    return float(np.ptp(differences)) <= 1e-12 * size
+    order, count = np.argsort(p_values, kind="stable"), len(p_values) if family is None else family
+    stepped = np.minimum(1.0, (count - np.arange(len(p_values))) * np.array(p_values, dtype=np.float64)[order])
+    adjusted = np.empty(len(p_values))
+    adjusted[order] = np.maximum.accumulate(stepped)
+    return adjusted.tolist()

@@ -10,7 +10,6 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from coliags_plugin.results.comparisons import (
-    cohen_dz,
     common_scenes,
     compare_with_rivals,
     holm,
@@ -18,8 +17,7 @@ from coliags_plugin.results.comparisons import (
     scene_means,
     smallest_p,
     spread,
-    t_interval,
-    t_test_p,
+    t_statistics,
     wilcoxon_p,
 )
 
@@ -150,27 +148,24 @@ def test_wilcoxon_counts_sign_changes(size):
 @given(differences, st.sampled_from([0.125, 0.5, 3.0, 1024.0]))
 def test_swap_and_scale(sample, factor):
     """Swapping the methods flips effects and keeps p; another unit keeps both."""
-    for test in (wilcoxon_p, t_test_p):
-        p = test(sample)
-        assert test(-sample) == (None if p is None else pytest.approx(p))
-        assert test(factor * sample) == (None if p is None else pytest.approx(p))
-    for effect in (cohen_dz, rank_biserial):
-        size = effect(sample)
-        assert effect(-sample) == (None if size is None else pytest.approx(-size))
-        assert effect(factor * sample) == (None if size is None else pytest.approx(size))
-    low, high = t_interval(sample)
-    assert t_interval(-sample) == pytest.approx((-high, -low))
-    assert t_interval(factor * sample) == pytest.approx((factor * low, factor * high))
+    assert wilcoxon_p(-sample) == wilcoxon_p(factor * sample) == pytest.approx(wilcoxon_p(sample))
+    assert rank_biserial(-sample) == pytest.approx(-rank_biserial(sample))
+    assert rank_biserial(factor * sample) == pytest.approx(rank_biserial(sample))
+    (p, size, (low, high)), swapped, scaled = map(t_statistics, (sample, -sample, factor * sample))
+    assert swapped.interval == pytest.approx((-high, -low))
+    assert scaled.interval == pytest.approx((factor * low, factor * high))
+    if p is None:
+        assert (size, *swapped[:2], *scaled[:2]) == (None,) * 5
+    else:
+        assert (*swapped[:2], *scaled[:2]) == pytest.approx((p, -size, p, size))
 
 
 def test_effect_sizes_and_the_interval_by_hand():
     sample = np.array([1.0, 2.0, 3.0, -4.0])
     reach = 3.182446 * np.sqrt(29 / 3 / 4)  # the .975 quantile of Student's t with 3 degrees of freedom
-    assert t_interval(sample) == pytest.approx((0.5 - reach, 0.5 + reach))
-    assert cohen_dz(sample) == pytest.approx(0.5 / np.sqrt(29 / 3))
+    assert t_statistics(sample).interval == pytest.approx((0.5 - reach, 0.5 + reach))
+    assert t_statistics(sample).cohen_dz == pytest.approx(0.5 / np.sqrt(29 / 3))
     assert rank_biserial(sample) == pytest.approx((1 + 2 + 3 - 4) / 10)
     assert [rank_biserial(np.array(each)) for each in ([0.0] * 3, [0.0, 1.0, 2.0])] == [0.0, 1.0]
     for value in (0.0, 0.1, -3.7):
-        equal = np.full(7, value)
-        assert (t_test_p(equal), cohen_dz(equal)) == (None, None)
-        assert t_interval(equal) == pytest.approx((value, value))
+        assert t_statistics(np.full(7, value)) == (None, None, pytest.approx((value, value)))

@@ -44,60 +44,38 @@ def pixel(column, row, camera):
     return math.sqrt(1 + x * x + y * y), math.degrees(math.acos(1 / math.sqrt(1 + x * x + y * y)))
 
 
-def test_a_pixel_on_the_axis_lies_at_its_depth_and_at_angle_zero():
-    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose())
-    found = profiles(view(camera, torch.tensor([[12.0]]), rgb_error=0.1, depth_error=3.0))
-    distance, angle = found["distance"], found["angle"]
-    assert distance.edges == DISTANCE_EDGES and distance.unit == "mm"
-    assert profiles(view(camera, torch.tensor([[12.0]])), unit="units")["distance"].unit == "units"
-    assert distance.pixels.index(1) == DISTANCE_EDGES.index(10.0) and sum(distance.pixels) == 1
-    assert distance.rgb_mse[2] == pytest.approx(0.01, rel=1e-5) and distance.depth_mse[2] == 9.0
-    assert angle.pixels[0] == 1 and angle.depth_mse[0] == 9.0 and angle.unit == "degrees"
-    assert [value for index, value in enumerate(distance.rgb_mse) if index != 2] == [None] * (len(distance.pixels) - 1)
-
-
 def test_a_distance_on_an_edge_belongs_to_the_bin_above():
     camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose())
     for edge, z in enumerate(DISTANCE_EDGES[1:-1], start=1):
         assert profiles(view(camera, torch.tensor([[z]])))["distance"].pixels[edge] == 1
 
 
-def test_every_pixel_is_counted_where_trigonometry_puts_it():
-    camera = Camera(20.0, 17.0, 15.0, 12.5, 32, 24, pose())
-    depth = torch.rand(24, 32, generator=torch.Generator().manual_seed(0)) * 90 + 1
-    found = profiles(view(camera, depth))
-    distances, angles = [], []
-    for row in range(24):
-        for column in range(32):
-            scale, angle = pixel(column, row, camera)
-            distances.append(scale * float(depth[row, column]))
-            angles.append(angle)
-    np.testing.assert_array_equal(found["distance"].pixels, np.histogram(distances, DISTANCE_EDGES)[0])
-    np.testing.assert_array_equal(found["angle"].pixels, np.histogram(angles, ANGLE_EDGES)[0])
-    assert sum(found["angle"].pixels) == 24 * 32
-
-
-def test_errors_are_those_of_the_bin():
+def test_pixels_and_errors_are_in_the_bins_where_trigonometry_puts_them():
     """Colour error grows with the angle and depth error with the distance: each bin has the mean over its pixels."""
     camera = Camera(20.0, 17.0, 15.0, 12.5, 32, 24, pose())
     rays = np.array([[pixel(column, row, camera) for column in range(32)] for row in range(24)])
-    depth = torch.full((24, 32), 25.0)
+    depth = torch.rand(24, 32, generator=torch.Generator().manual_seed(0)) * 90 + 1
     rgb_error, depth_error = rays[..., 1] / 1000, rays[..., 0]
-    made = view(camera, depth, torch.from_numpy(rgb_error)[..., None], torch.from_numpy(depth_error))
-    angle = profiles(made)["angle"]
-    for index, (low, high) in enumerate(pairwise(ANGLE_EDGES)):
-        inside = (rays[..., 1] >= low) & (rays[..., 1] < high)
-        assert angle.pixels[index] == inside.sum()
-        if inside.any():
-            assert angle.rgb_mse[index] == pytest.approx((rgb_error[inside] ** 2).mean(), rel=1e-4)
-            assert angle.depth_mse[index] == pytest.approx((depth_error[inside] ** 2).mean(), rel=1e-4)
+    compared = view(camera, depth, torch.from_numpy(rgb_error)[..., None], torch.from_numpy(depth_error))
+    found = profiles(compared)
+    assert (found["distance"].unit, found["angle"].unit) == ("mm", "degrees")
+    assert profiles(compared, unit="units")["distance"].unit == "units"
+    bins = {"distance": (rays[..., 0] * depth.numpy(), DISTANCE_EDGES), "angle": (rays[..., 1], ANGLE_EDGES)}
+    for name, (where, edges) in bins.items():
+        assert found[name].edges == edges and sum(found[name].pixels) == 24 * 32
+        for index, (low, high) in enumerate(pairwise(edges)):
+            inside = (where >= low) & (where < high)
+            assert found[name].pixels[index] == inside.sum()
+            for errors, means in ((rgb_error, found[name].rgb_mse), (depth_error, found[name].depth_mse)):
+                mean = pytest.approx((errors[inside] ** 2).mean(), rel=1e-4) if inside.any() else None
+                assert means[index] == mean
 
 
 def test_the_mean_is_over_the_pixels_of_all_frames_and_channels():
     camera, wide = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose()), Camera(1e3, 1e3, 1.0, 0.5, 2, 1, pose(1.0))
-    one = view(camera, torch.tensor([[12.0]]), rgb_error=torch.tensor([0.3, 0.0, 0.0]), depth_error=3.0)
-    two = view(wide, torch.tensor([[12.0, 13.0]]), rgb_error=0.0, depth_error=0.0)
-    found = profiles(one, two)["distance"]
+    first = view(camera, torch.tensor([[12.0]]), rgb_error=torch.tensor([0.3, 0.0, 0.0]), depth_error=3.0)
+    second = view(wide, torch.tensor([[12.0, 13.0]]), rgb_error=0.0, depth_error=0.0)
+    found = profiles(first, second)["distance"]
     assert found.pixels[2] == 3
     assert found.depth_mse[2] == 3.0
     assert found.rgb_mse[2] == pytest.approx(0.09 / 3 / 3, rel=1e-5)
