@@ -145,7 +145,7 @@ class DepthCommand:
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
-        from coliags_plugin.reconstruction.depth.views import DepthEstimationSettings
+        from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
 
         arguments.refuse_output(self.output, self.scene, self.overwrite)
         if (self.near is None) != (self.far is None):

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.reconstruction.depth.views import DepthEstimationSettings
+from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.surface.coverage.visibility import CoverageSettings
 from coliags_plugin.surface.meshing.views import MeshSettings

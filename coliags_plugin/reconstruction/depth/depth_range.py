@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.reconstruction.depth.views import MAX_TURN
+from coliags_plugin.reconstruction.depth.sweeping import MAX_TURN
 from coliags_plugin.reconstruction.structure.features import (
     Features,
     FeatureSettings,
@@ -21,14 +21,16 @@ from coliags_plugin.reconstruction.structure.features import (
     image_and_mask,
     quiet_colmap,
 )
-from coliags_plugin.reconstruction.structure.matching import Pose, epipolar_matches, rays
+from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
 
 log = logging.getLogger(__name__)
 
 #: Most frames whose depth is measured, and how many frames later their partners are.
 _FRAMES, _STEPS = 16, (1, 2, 4, 8, 16)
-#: Least triangulation angle, degrees, and largest reprojection error, pixels.
+#: Least triangulation angle, degrees, and largest Sampson distance, pixels.
 _LEAST_ANGLE, _ERROR = 1.0, 1.0
+#: Largest ratio in Lowe's test, and distance of descriptors.
+_MAX_RATIO, _MAX_DISTANCE = 0.8, 0.7
 #: Fewest points that give a range, and that give a frame's own median.
 _FEWEST, _FEWEST_OF_FRAME = 30, 10
 #: Relative difference within which two partners must agree about a point.
@@ -93,25 +95,32 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
 
 
 def triangulated_depths(first: Features, second: Features, one: Frame, other: Frame) -> Float[np.ndarray, "K"]:
-    """z-depths, in the first frame, of its features that match along epipolar lines and are seen at a sufficient angle.
+    """z-depths, in the first frame, of its features with matches on their epipolar lines at a sufficient angle.
 
     NaN for all others.
     """
     depths = np.full(len(first), np.nan)
-    cameras = (one.camera, other.camera)
     rotation, translation = Pose.of(one.camera).to(Pose.of(other.camera))
     turn = np.degrees(np.arccos(np.clip(float(one.camera.optical_axis @ other.camera.optical_axis), -1.0, 1.0)))
     if not np.linalg.norm(translation) > 0.0 or turn > MAX_TURN:
         return depths
-    pairs = epipolar_matches(first, second, cameras, _ERROR, 0.8, 0.7)
+    pairs = mutual_matches(first, second, _MAX_RATIO, _MAX_DISTANCE)
     turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T
     opposite = rays(second.pixels[pairs[:, 1]], other.camera)
+    # Epipolar lines in either image; coefficients of x and y divided by the focal lengths give distances in pixels.
+    lines, lines_back = np.cross(translation, turned), np.cross(opposite, translation) @ rotation
+    slopes = (
+        np.linalg.norm(line[:, :2] / (camera.fx, camera.fy), axis=1)
+        for line, camera in ((lines, other.camera), (lines_back, one.camera))
+    )
+    is_on_line = np.abs((opposite * lines).sum(axis=1)) <= _ERROR * np.hypot(*slopes)
     # Depth a of least distance between the lines a * turned + translation and b * opposite.
     aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (opposite, opposite), (turned, opposite)))
     sine = 1.0 - ab**2 / (aa * bb)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (ab * (opposite @ translation) - bb * (turned @ translation)) / (aa * bb - ab**2)
-    good = (sine > np.sin(np.radians(_LEAST_ANGLE)) ** 2) & (depth > 0.0)
+    good = is_on_line & (sine > np.sin(np.radians(_LEAST_ANGLE)) ** 2)
+    good &= have_positive_depths(turned, opposite, translation)
     depths[pairs[good, 0]] = depth[good]
     return depths
 

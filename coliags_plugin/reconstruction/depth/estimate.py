@@ -26,15 +26,6 @@ from coliags_plugin.reconstruction.depth.priors import (
     smooth_surface,
 )
 from coliags_plugin.reconstruction.depth.sweeping import (
-    Swept,
-    WeightedDepth,
-    depth_confidence,
-    fuse_frame,
-    ratios,
-    sweep_frame,
-    sweep_weight,
-)
-from coliags_plugin.reconstruction.depth.views import (
     MAX_BASELINE,
     MAX_TURN,
     SWEEPS,
@@ -42,7 +33,14 @@ from coliags_plugin.reconstruction.depth.views import (
     Guide,
     Map,
     Sweep,
+    Swept,
+    WeightedDepth,
+    depth_confidence,
+    fuse_frame,
     guide_of,
+    ratios,
+    sweep_frame,
+    sweep_weight,
 )
 from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
 

@@ -13,7 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.depth import read_exr_channel, scaled_depth
 from coliags_plugin.datamanagers.reading.files import files_in, first_few
-from coliags_plugin.reconstruction.depth.views import Map, Mask
+from coliags_plugin.reconstruction.depth.sweeping import Map, Mask
 from coliags_plugin.reconstruction.structure.matching import Pose
 
 #: Exponent from stored to linear intensity, and the least linear intensity.

@@ -22,7 +22,7 @@ from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior
-from coliags_plugin.reconstruction.depth.views import DepthEstimationSettings, Map, Mask
+from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings, Map, Mask
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
 from coliags_plugin.reconstruction.structure.features import image_and_mask
 from coliags_plugin.reconstruction.structure.matching import Pose

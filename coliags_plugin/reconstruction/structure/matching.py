@@ -23,8 +23,6 @@ Matches = Mapping[tuple[int, int], Pairs]
 
 #: Features closer than this are duplicates and do not count as the second-best match of each other. Pixels.
 _DUPLICATE_DISTANCE = 2.0
-#: Largest ratio of the scales of matched features.
-_MAX_SCALE_RATIO = 1.6
 
 
 def mutual_matches(first: Features, second: Features, max_ratio: float, max_distance: float) -> Pairs:
@@ -45,39 +43,9 @@ def mutual_matches(first: Features, second: Features, max_ratio: float, max_dist
     for of, duplicate in ((0, 1), (1, 0)):
         row, which = _joined(other, duplicates[:, of])
         similarity[row, duplicates[which, duplicate]] = -1.0
-    kept = _passes_ratio_test(best, similarity.max(axis=1, initial=-1.0), max_ratio, max_distance)
-    return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
-
-
-def epipolar_matches(
-    first: Features,
-    second: Features,
-    cameras: tuple[Camera, Camera],
-    max_error: float,
-    max_ratio: float,
-    max_distance: float,
-) -> Pairs:
-    """Match features of images with known poses among candidates that satisfy the epipolar constraint.
-
-    ``max_error`` is the largest Sampson distance, pixels. Fewer candidates make more matches pass the ratio test than
-    in :func:`mutual_matches`.
-    """
-    one, other = _epipolar_candidates(first, second, cameras, max_error)
-    if not len(one):
-        return np.empty((0, 2), np.uint32)
-    similarity = np.einsum("ij,ij->i", first.descriptors[one], second.descriptors[other])
-    best_of_one = _best(one, similarity, len(first))
-    best_of_other = _best(other, similarity, len(second))
-    candidates = best_of_one[best_of_one >= 0]
-    nearest = np.zeros(len(first), np.int64)
-    nearest[one[candidates]] = other[candidates]
-    apart = second.keypoints[other, :2] - second.keypoints[nearest[one], :2]
-    elsewhere = (apart**2).sum(axis=1) >= _DUPLICATE_DISTANCE**2
-    next_best = np.full(len(first), -1.0, np.float32)
-    np.maximum.at(next_best, one[elsewhere], similarity[elsewhere])
-    mutual = best_of_other[other[candidates]] == candidates
-    mutual &= _passes_ratio_test(similarity[candidates], next_best[one[candidates]], max_ratio, max_distance)
-    kept = candidates[mutual]
+    products = best, similarity.max(axis=1, initial=-1.0)
+    distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in products)
+    kept = (distance < max_distance) & (distance < max_ratio * second_best)
     return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
 
 
@@ -129,35 +97,6 @@ def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, 
     return PinholeLens.of(camera.intrinsics).unproject(pixels)
 
 
-def _epipolar_candidates(
-    first: Features, second: Features, cameras: tuple[Camera, Camera], max_error: float
-) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
-    """Pairs of features that satisfy the epipolar constraint, with similar scales and positive depths."""
-    rotation, translation = Pose.of(cameras[0]).to(Pose.of(cameras[1]))
-    if not np.linalg.norm(translation) > 0.0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    x, y, z = translation / np.linalg.norm(translation)
-    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-    ray_one, ray_other = rays(first.pixels, cameras[0]), rays(second.pixels, cameras[1])
-    # Epipolar lines in pixels: coefficients of x and y divided by the focal lengths.
-    line_in_other, line_in_one = ray_one @ essential.T, ray_other @ essential
-    slope_other = np.linalg.norm(line_in_other[:, :2] / (cameras[1].fx, cameras[1].fy), axis=1)
-    slope_one = np.linalg.norm(line_in_one[:, :2] / (cameras[0].fx, cameras[0].fy), axis=1)
-    # All pairs against a looser bound (a + b > hypot(a, b)) in single precision; the exact test follows on the rest.
-    rough = line_in_other.astype(np.float32) @ ray_other.T.astype(np.float32)
-    np.abs(rough, out=rough)
-    rough -= (1.01 * max_error * slope_other + 1e-6).astype(np.float32)[:, None]
-    one, other = np.nonzero(rough <= (1.01 * max_error * slope_one).astype(np.float32))
-    factor = first.keypoints[one, 2] / second.keypoints[other, 2]
-    alike = (factor < _MAX_SCALE_RATIO) & (factor > 1.0 / _MAX_SCALE_RATIO)
-    one, other = one[alike], other[alike]
-    error = np.abs(np.einsum("ij,ij->i", line_in_other[one], ray_other[other]))
-    near = error <= max_error * np.hypot(slope_other[one], slope_one[other])
-    one, other = one[near], other[near]
-    front = have_positive_depths(ray_one[one] @ rotation.T, ray_other[other], translation)
-    return one[front], other[front]
-
-
 def have_positive_depths(turned: np.ndarray, other: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """Whether the lines ``a * turned + translation`` and ``b * other`` are closest at positive a and b. [K]"""
     aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (other, other), (turned, other)))
@@ -184,12 +123,6 @@ def _joined(values: Int[np.ndarray, "A"], others: Int[np.ndarray, "B"]) -> tuple
     counts = end - start
     index = np.repeat(start - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     return np.repeat(np.arange(len(values)), counts), order[index]
-
-
-def _passes_ratio_test(best: np.ndarray, next_best: np.ndarray, max_ratio: float, max_distance: float) -> np.ndarray:
-    """Whether matches with these dot products pass the distance limit and Lowe's ratio test."""
-    distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in (best, next_best))
-    return np.asarray((distance < max_distance) & (distance < max_ratio * second_best))
 
 
 #: Focal length relative to the larger side of the fisheye that stands for an unknown endoscope: between neighbouring

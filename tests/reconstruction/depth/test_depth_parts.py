@@ -25,13 +25,15 @@ from coliags_plugin.reconstruction.depth.priors import (
 )
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
 from coliags_plugin.reconstruction.depth.sweeping import (
+    SWEEPS,
+    Sweep,
     WeightedDepth,
     depth_confidence,
     fuse_frame,
+    guide_of,
     ratios,
     sweep_frame,
 )
-from coliags_plugin.reconstruction.depth.views import SWEEPS, Sweep, guide_of
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from coliags_plugin.reconstruction.structure.matching import Pose
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
