@@ -70,19 +70,19 @@ class PosesSfmCommand:
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):
             raise InputError(f"--every {self.every}, --max-frames {self.max_frames}", "1 or more, and 2 or more")
         known_distance = self._known_distance()
-        given = [] if self.camera is None else [f"camera.model={self.camera}"]
-        given += [] if self.params is None else [f"camera.params=[{self.params}]"]
-        frames, settings = opened_recording(self.frames, settings_of(SfmSettings, [*given, *self.set]))
+        assignments = [] if self.camera is None else [f"camera.model={self.camera}"]
+        assignments += [] if self.params is None else [f"camera.params=[{self.params}]"]
+        frames, settings = opened_recording(self.frames, settings_of(SfmSettings, [*assignments, *self.set]))
         survey = FrameSurvey(frames)
         with progress_callback() as progress, image_files(frames, progress, survey.add) as files:
             images = files[:: self.every][: self.max_frames]
             for path in images if frames.is_dir() else ():
                 survey.add(read_image(path))
-            masks: Masks = (found := survey.mask())
+            masks: Masks = (surveyed := survey.mask())
             if self.mask is not None:
                 masks = masks_for(self.mask, images)
-            elif found is not None:
-                share = 100.0 * (1.0 - found.mean())
+            elif surveyed is not None:
+                share = 100.0 * (1.0 - surveyed.mean())
                 _LOG.info("ignored: black surroundings and overlays, %.0f %% of the image", share)
             atlas = reconstruct(images, settings, masks, progress)
             factor = millimetres(atlas.largest, self.diameter, known_distance)
@@ -140,8 +140,8 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     if intrinsics is None and size is None:
         return None
     if intrinsics is None or size is None:
-        given, lacking = ("--size", "--intrinsics") if intrinsics is None else ("--intrinsics", "--size")
-        raise InputError(f"{given} without {lacking}", "both, or neither")
+        passed, lacking = ("--size", "--intrinsics") if intrinsics is None else ("--intrinsics", "--size")
+        raise InputError(f"{passed} without {lacking}", "both, or neither")
     try:
         fx, fy, cx, cy = (float(part) for part in intrinsics.split(","))
     except ValueError as error:
@@ -231,7 +231,7 @@ class PosesAlignCommand:
     delta: int = 1
     """Matched frames between the two poses of a relative error."""
     match: Literal["auto", "name", "time", "index", "endogslam-train"] = "auto"
-    """How frames are matched; auto: by name, else by time, else by index."""
+    """Criterion by which frames are matched; auto: by name, else by time, else by index."""
     tolerance: float = 0.02
     """Largest difference of matched timestamps, s."""
     unit: options.OptionalText = None
@@ -310,10 +310,10 @@ class PosesExportCommand:
 
         manifest = export_atlas(self.reconstruction, self.output, self.overwrite, self.link)
         lines = [
-            f"{one['name']}: {len(one['frames'])} frames, unit {one['unit']}"
-            + ("" if one["nerfstudio"] else ", no dense depth")
-            + (f", joined to {one['joined_to']}" if one["joined_to"] != one["name"] else "")
-            for one in manifest["submaps"]
+            f"{submap['name']}: {len(submap['frames'])} frames, unit {submap['unit']}"
+            + ("" if submap["nerfstudio"] else ", no dense depth")
+            + (f", joined to {submap['joined_to']}" if submap["joined_to"] != submap["name"] else "")
+            for submap in manifest["submaps"]
         ]
         lines += [f"not read: {problem}" for problem in manifest["not_read"]]
         print_summary("\n".join(lines), manifest, written=[self.output / MANIFEST], as_json=self.json)

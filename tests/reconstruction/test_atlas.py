@@ -306,8 +306,8 @@ def test_a_wall_that_moves_is_split_into_stretches_of_which_each_can_give_depth(
 def test_the_angle_between_two_rays():
     rays = np.array([[2.0, 0.0, 30.0], [-2.0, 0.0, 30.0], [0.0, 0.0, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    found = widest_between(rays, np.array([0, 0, 1]), 2)
-    np.testing.assert_allclose(found, [np.degrees(2.0 * np.arctan(2.0 / 30.0)), 0.0], atol=1e-9)
+    angles = widest_between(rays, np.array([0, 0, 1]), 2)
+    np.testing.assert_allclose(angles, [np.degrees(2.0 * np.arctan(2.0 / 30.0)), 0.0], atol=1e-9)
 
 
 def measured(noise=0.0, speed=0.0):
@@ -421,9 +421,9 @@ def test_models_that_are_too_long_together_are_related(halves, moves, monkeypatc
     else:
         short = TRACKED.model_copy(update={"tracks": TrackSettings(longest_window=LONG - 1)})
     with quiet_colmap(0):
-        same, kept, apart = join_models(video, parts, short)
+        same, models, apart = join_models(video, parts, short)
     assert same is video
-    assert [part.frames for part in kept] == [list(range(HALF)), list(range(HALF, LONG))]
+    assert [part.frames for part in models] == [list(range(HALF)), list(range(HALF, LONG))]
     matrix = np.array(apart[HALF - 1].similarity)
     assert np.cbrt(np.linalg.det(matrix[:, :3])) == pytest.approx(1.0 / SCALE, rel=0.03)
     np.testing.assert_allclose(SCALE * matrix[:, :3], TURN.T, atol=0.03)

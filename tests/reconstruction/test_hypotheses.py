@@ -211,8 +211,8 @@ def test_correlation_of_exact_falloff_and_of_too_few_points():
 def test_brightness_is_the_mean_around_a_pixel():
     image = np.zeros((20, 30, 3), np.uint8)
     image[5:12, 10:17] = 70
-    found = brightness_at(image, np.array([(13.5, 8.5), (25.0, 18.0), (29.9, 19.9)]))
-    np.testing.assert_allclose(found, [70.0, 0.0, 0.0])
+    brightness = brightness_at(image, np.array([(13.5, 8.5), (25.0, 18.0), (29.9, 19.9)]))
+    np.testing.assert_allclose(brightness, [70.0, 0.0, 0.0])
 
 
 def test_c3vd_at_full_size_is_the_official_calibration():

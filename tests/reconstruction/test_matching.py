@@ -37,17 +37,17 @@ def features(pixels, descriptors, scale=2.0):
 @settings(max_examples=15, deadline=None)
 def test_mutual_matches_are_those_of_a_plain_loop(seed):
     rng = np.random.default_rng(seed)
-    one = features(rng.uniform(0, 12, (20, 2)), rng.normal(size=(20, 128)) + 1.0)
-    other = features(rng.uniform(0, 12, (25, 2)), rng.normal(size=(25, 128)) + 1.0)
-    distance = np.linalg.norm(one.descriptors[:, None] - other.descriptors[None], axis=2)
+    first = features(rng.uniform(0, 12, (20, 2)), rng.normal(size=(20, 128)) + 1.0)
+    second = features(rng.uniform(0, 12, (25, 2)), rng.normal(size=(25, 128)) + 1.0)
+    distance = np.linalg.norm(first.descriptors[:, None] - second.descriptors[None], axis=2)
     expected = []
     for i in range(20):
         j = distance[i].argmin()
-        apart = np.linalg.norm(other.pixels - other.pixels[j], axis=1) > 2.0
+        apart = np.linalg.norm(second.pixels - second.pixels[j], axis=1) > 2.0
         if distance[:, j].argmin() == i and distance[i, j] < min(1.0, 0.97 * distance[i, apart].min()):
             expected.append((i, j))
-    np.testing.assert_array_equal(mutual_matches(one, other, 0.97, 1.0), np.array(expected).reshape(-1, 2))
-    assert mutual_matches(one, Features(other.keypoints[:0], other.descriptors[:0]), 0.97, 1.0).shape == (0, 2)
+    np.testing.assert_array_equal(mutual_matches(first, second, 0.97, 1.0), np.array(expected).reshape(-1, 2))
+    assert mutual_matches(first, Features(second.keypoints[:0], second.descriptors[:0]), 0.97, 1.0).shape == (0, 2)
 
 
 def test_highlights_and_masks_yield_no_features():
@@ -72,12 +72,14 @@ def video(places, reach, seed=0):
     rng = np.random.default_rng(seed)
     landmarks = rng.normal(size=(2 * (max(places) + 2 * reach), 128)).astype(np.float32)
     landmarks /= np.linalg.norm(landmarks, axis=1, keepdims=True)
-    made = []
+    features = []
     for place in places:
-        seen = landmarks[2 * place : 2 * (place + reach)]
-        keypoints = np.column_stack([rng.uniform(0, 300, (len(seen), 2)), np.ones(len(seen)), np.zeros(len(seen))])
-        made.append(Features(keypoints.astype(np.float32), seen))
-    return made
+        visible = landmarks[2 * place : 2 * (place + reach)]
+        keypoints = np.column_stack(
+            [rng.uniform(0, 300, (len(visible), 2)), np.ones(len(visible)), np.zeros(len(visible))]
+        )
+        features.append(Features(keypoints.astype(np.float32), visible))
+    return features
 
 
 def test_neighbours_growing_steps_while_alike_and_loop_closures():
@@ -87,8 +89,8 @@ def test_neighbours_growing_steps_while_alike_and_loop_closures():
     # Nothing in common: neighbours alone.
     assert {second - first for first, second in alike_pairs(video(range(0, 400, 10), 8), SfmSettings())} == {1, 2}
     places = [*range(0, 300, 6), *range(300, 0, -6)]
-    loops = [(one, other) for one, other in alike_pairs(video(places, 14), SfmSettings()) if other - one > 16]
-    assert loops and all(abs(places[one] - places[other]) < 14 for one, other in loops)
+    loops = [(first, second) for first, second in alike_pairs(video(places, 14), SfmSettings()) if second - first > 16]
+    assert loops and all(abs(places[first] - places[second]) < 14 for first, second in loops)
 
 
 @pytest.mark.parametrize("count", [30, 100])
@@ -97,7 +99,7 @@ def test_the_middle_of_a_video_is_matched_too(count):
     pairs = alike_pairs(features, SfmSettings())
     names = tuple(map(str, range(count)))
     matches = {pair: np.zeros((0, 2), np.uint32) for pair in pairs}
-    keypoints = tuple(one.keypoints for one in features)
+    keypoints = tuple(image_features.keypoints for image_features in features)
     whole = MatchedVideo(tuple(map(Path, names)), names, ((8, 8),) * count, keypoints, (np.zeros(0),) * count, matches)
     part = whole.search_part(24)
     assert len(part.images) == len(part.keypoints) == 24
@@ -179,8 +181,8 @@ def test_the_lamp_drops_out_of_the_texture():
     row = np.linspace(0.4, 1.0, 120)[:, None, None]
     bright, dim = wall(), np.clip(wall() * row, 0, 255).astype(np.uint8)
     inner = slice(20, -20)
-    for one, other in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
-        assert np.corrcoef(one[inner, inner].ravel(), other[inner, inner].ravel())[0, 1] > 0.95
+    for texture, dim_texture in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
+        assert np.corrcoef(texture[inner, inner].ravel(), dim_texture[inner, inner].ravel())[0, 1] > 0.95
 
 
 def test_points_that_fit_no_motion_are_outliers():
@@ -191,8 +193,8 @@ def test_points_that_fit_no_motion_are_outliers():
     fx, fy, cx, cy = INTRINSICS
     rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(200)], axis=1)
     depth = first.depth.numpy()[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    one, other = (frame.camera.camera_to_world.double().numpy() for frame in (first, second))
-    local = ((rays * depth[:, None]) @ one[:3, :3].T + one[:3, 3] - other[:3, 3]) @ other[:3, :3]
+    pose, second_pose = (frame.camera.camera_to_world.double().numpy() for frame in (first, second))
+    local = ((rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3] - second_pose[:3, 3]) @ second_pose[:3, :3]
     moved_to = local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy)
     wrong = np.arange(200) % 5 == 0
     moved_to[wrong] += rng.choice([-25.0, 25.0], (wrong.sum(), 2))

@@ -52,7 +52,7 @@ def atlas(tube):
 
 
 @pytest.fixture(scope="module")
-def found(atlas):
+def largest(atlas):
     return atlas.largest
 
 
@@ -82,33 +82,35 @@ def share_of_path(trajectory, poses):
     return result.ate_share, result.rpe_rotation_deg.rmse
 
 
-def test_a_known_camera_finds_its_path(atlas, found):
-    assert found.registered == tuple(range(COUNT))
+def test_a_known_camera_finds_its_path(atlas, largest):
+    assert largest.registered == tuple(range(COUNT))
     assert (atlas.lost, len(atlas.models)) == ({}, 1)
-    error, degrees = share_of_path(found.trajectory, TRUTH)
+    error, degrees = share_of_path(largest.trajectory, TRUTH)
     assert error < 0.005
     assert degrees < 0.2
-    (camera,) = found.model.cameras.values()
+    (camera,) = largest.model.cameras.values()
     assert tuple(camera.params) == INTRINSICS
-    assert f"{COUNT} of {COUNT} images posed" in found.summary()
-    assert found.trajectory.names == tuple(path.name for path in found.images)
+    assert f"{COUNT} of {COUNT} images posed" in largest.summary()
+    assert largest.trajectory.names == tuple(path.name for path in largest.images)
     depths = []
-    for place, pose in zip(found.registered, found.camera_to_world, strict=True):
-        for seen in found.model.images[place + 1].get_observation_points2D():
-            point = found.model.points3D[seen.point3D_id].xyz
+    for place, pose in zip(largest.registered, largest.camera_to_world, strict=True):
+        for observation in largest.model.images[place + 1].get_observation_points2D():
+            point = largest.model.points3D[observation.point3D_id].xyz
             depths.append(((point - pose[:3, 3]) @ pose[:3, :3])[2])
-    assert found.median_depth == pytest.approx(np.median(depths))
+    assert largest.median_depth == pytest.approx(np.median(depths))
 
 
-def test_the_written_scene_is_read_as_it_is(atlas, found, tmp_path):
+def test_the_written_scene_is_read_as_it_is(atlas, largest, tmp_path):
     mask = np.ones((128, 160), bool)
     mask[:20] = False
     write_sfm_scene(tmp_path / "scene", atlas, mask)
-    for path in found.images:
+    for path in largest.images:
         assert (tmp_path / "scene" / "images" / path.name).read_bytes() == path.read_bytes()
-    np.testing.assert_allclose(colmap.read(tmp_path / "scene" / "sparse" / "0").camera_to_world, found.camera_to_world)
+    np.testing.assert_allclose(
+        colmap.read(tmp_path / "scene" / "sparse" / "0").camera_to_world, largest.camera_to_world
+    )
     scene = open_scene(tmp_path / "scene", options=["split=all-train"])
-    assert len(scene.points) == found.model.num_points3D()
+    assert len(scene.points) == largest.model.num_points3D()
     assert all(len(frame.sparse_depth.depth) > 20 and not frame.mask[:20].any() for frame in scene.train)
     # Points have the images' colours.
     assert scene.points.colors.float().std() > 20
@@ -118,32 +120,32 @@ def test_the_written_scene_is_read_as_it_is(atlas, found, tmp_path):
 def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     images = list_images(phantom / "images")
     with caplog.at_level(logging.INFO):
-        found = reconstruct(images).largest
-    assert len(found.registered) == len(images)
-    assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
-    (camera,) = found.model.cameras.values()
+        largest = reconstruct(images).largest
+    assert len(largest.registered) == len(images)
+    assert share_of_path(largest.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
+    (camera,) = largest.model.cameras.values()
     assert camera.model_name == "SIMPLE_RADIAL"
     assert distortion(camera) < 0.1
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.1)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     # The lamp is at the lens.
-    assert found.correlation < -0.5
+    assert largest.correlation < -0.5
 
 
 @pytest.mark.thorough
 def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
-    found = reconstruct(
+    largest = reconstruct(
         list_images(phantom / "images"), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE"))
     ).largest
-    (camera,) = found.model.cameras.values()
+    (camera,) = largest.model.cameras.values()
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
 
 
 @pytest.mark.thorough
 def test_an_implausible_focal_length_is_refused(tube):
     camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
-    told = r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees"
-    refusal(told, tube, SfmSettings(camera=camera))
+    message = r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees"
+    refusal(message, tube, SfmSettings(camera=camera))
     wide = camera.model_copy(update={"field_of_view": (20.0, 150.0)})
     assert reconstruct(list_images(tube), SfmSettings(camera=wide)).largest.registered
 
@@ -157,9 +159,9 @@ def test_features_of_a_long_video_are_those_of_its_sharpest_images(tube, tmp_pat
         write_png(tmp_path / f"{2 * place}.png", torch.from_numpy(first))
         write_png(tmp_path / f"{2 * place + 1}.png", torch.from_numpy(second))
     settings = KNOWN.model_copy(update={"features_at_most": COUNT})
-    found = reconstruct(list_images(tmp_path), settings)
-    assert [path.stem for path in found.images] == ["0", "3", "4", "7", "8", "11"]
-    assert share_of_path(found.largest.trajectory, TRUTH)[0] < 0.005
+    sharp = reconstruct(list_images(tmp_path), settings)
+    assert [path.stem for path in sharp.images] == ["0", "3", "4", "7", "8", "11"]
+    assert share_of_path(sharp.largest.trajectory, TRUTH)[0] < 0.005
 
 
 @pytest.mark.thorough
@@ -194,8 +196,8 @@ def test_masked_parts_have_no_features(tube):
     mask = np.ones((128, 160), bool)
     mask[64:] = False
     half = reconstruct(list_images(tube), KNOWN, mask).largest
-    seen = [point.y() for image in half.model.images.values() for point in image.get_observation_points2D()]
-    assert max(seen) < 62
+    rows = [point.y() for image in half.model.images.values() for point in image.get_observation_points2D()]
+    assert max(rows) < 62
 
 
 @pytest.mark.thorough
@@ -235,13 +237,13 @@ def test_images_without_motion_are_refused(tube, tmp_path):
     refusal(r"no model from 4 images with \d+ points.*\(4 images: .*the camera has to move", tmp_path)
 
 
-def test_images_that_repeat_are_left_out_and_named(found, tube, tmp_path, caplog):
+def test_images_that_repeat_are_left_out_and_named(largest, tube, tmp_path, caplog):
     for index, path in enumerate(list_images(tube)):
         for again in range(3):
             write_png(tmp_path / f"{index}_{again}.png", read_rgb(path))
     atlas = reconstruct(list_images(tmp_path), KNOWN)
     assert [path.name for path in atlas.images] == [f"{index}_0.png" for index in range(COUNT)]
-    np.testing.assert_array_equal(atlas.largest.camera_to_world, found.camera_to_world)
+    np.testing.assert_array_equal(atlas.largest.camera_to_world, largest.camera_to_world)
     assert "12 of 18 images repeat the one before and are left out: 0_1.png, 0_2.png, 1_1.png" in caplog.text
     for path in list_images(tmp_path)[3:]:
         path.unlink()
@@ -249,7 +251,7 @@ def test_images_that_repeat_are_left_out_and_named(found, tube, tmp_path, caplog
 
 
 @pytest.mark.thorough
-def test_black_surroundings_move_the_cameras_centre(found, tube, tmp_path):
+def test_black_surroundings_move_the_cameras_centre(largest, tube, tmp_path):
     """Of an unknown camera: the same path as of the picture alone."""
     settings = SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factors=(0.63,), refine=False))
     alone = reconstruct(list_images(tube), settings).largest
@@ -307,7 +309,7 @@ def test_folders_without_images_are_refused(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".bmp"])
 @pytest.mark.parametrize("kind", ["grey", "16 bits", "alpha"])
-def test_images_are_written_as_readers_take_them(atlas, found, tmp_path, suffix, kind):
+def test_images_are_written_as_readers_take_them(atlas, largest, tmp_path, suffix, kind):
     if suffix in {"grey": (), "16 bits": (".jpg", ".bmp"), "alpha": (".jpg", ".bmp")}[kind]:
         return
     change = {
@@ -315,16 +317,16 @@ def test_images_are_written_as_readers_take_them(atlas, found, tmp_path, suffix,
         "16 bits": lambda rgb: rgb.astype(np.uint16) * 257,
         "alpha": lambda rgb: np.dstack([rgb, np.where(np.arange(rgb.shape[1]) < 40, 0, 255)[None].repeat(len(rgb), 0)]),
     }[kind]
-    expected = {path.stem: read_rgb(path) for path in found.images}
+    expected = {path.stem: read_rgb(path) for path in largest.images}
     images = [tmp_path / f"{stem}{suffix}" for stem in expected]
     for path, rgb in zip(images, expected.values(), strict=True):
         pixels = change(rgb)
         write_image(path, pixels.astype(np.uint8) if kind == "alpha" else pixels)
-    model = pycolmap.Reconstruction(found.model)
+    model = pycolmap.Reconstruction(largest.model)
     for image in model.images.values():
         image.name = Path(image.name).stem + suffix
     names = tuple(path.name for path in images)
-    changed = replace(found, model=model, images=tuple(images), names=names)
+    changed = replace(largest, model=model, images=tuple(images), names=names)
     write_sfm_scene(tmp_path / "scene", replace(atlas, images=tuple(images), models=(changed,)))
     scene = open_scene(tmp_path / "scene", options=["split=all-train"])
     for frame in scene.train:

@@ -66,7 +66,7 @@ class Lens(ABC):
     def shows(
         self, points: Float[np.ndarray, "N 3"], mask: Bool[np.ndarray, "H W"] | None = None
     ) -> Bool[np.ndarray, "N"]:
-        """Whether points in camera axes fall into the image and, where there is a mask, on its pixels."""
+        """True for points in camera axes that fall into the image and, where there is a mask, on its pixels."""
         pixels = self.project(points)
         with np.errstate(invalid="ignore"):
             inside = np.asarray(((pixels >= 0.0) & (pixels < (self.width, self.height))).all(axis=1))
@@ -92,21 +92,21 @@ class PinholeLens(Intrinsics, Lens):
 
     @property
     def pinhole(self) -> Intrinsics:
-        """See :class:`Lens`."""
+        """The nominal pinhole camera."""
         return Intrinsics(**vars(self))
 
     def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
-        """See :class:`Lens`."""
+        """The lens of the part of the image whose top left pixel is (x0, y0)."""
         return replace(self, width=width, height=height, cx=self.cx - x0, cy=self.cy - y0)
 
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
-        """See :class:`Lens`."""
+        """Viewing directions of pixels, (column, row), with z = 1. [N, 3]"""
         pixels = np.asarray(pixels, np.float64)
         x, y = (pixels[:, 0] - self.cx) / self.fx, (pixels[:, 1] - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=1)
 
     def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
-        """See :class:`Lens`."""
+        """Pixels, (column, row), of points in camera axes. [N, 2]"""
         points = np.asarray(points, np.float64)
         z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         return np.stack([self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy], axis=1)
@@ -135,23 +135,23 @@ class CalibratedLens(Lens):
                     raise InputError(f"a lens with {each.name} {number:g}", f"at most {limit:g} in magnitude")
 
     def resized(self, width: int, height: int) -> Self:
-        """See :class:`Lens`."""
+        """The lens of the image resampled to another size."""
         x, y = self.width / width, self.height / height
         return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
 
     def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
-        """See :class:`Lens`."""
+        """The lens of the part of the image whose top left pixel is (x0, y0)."""
         origin = (self.origin[0] + self.stretch[0] * x0, self.origin[1] + self.stretch[1] * y0)
         return replace(self, width=width, height=height, origin=origin)
 
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
-        """See :class:`Lens`."""
+        """Viewing directions of pixels, (column, row), with z = 1. [N, 3]"""
         calibrated = np.asarray(pixels, np.float64) * self.stretch + self.origin
         xy = self._tangents(calibrated)
         return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
 
     def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
-        """See :class:`Lens`."""
+        """Pixels, (column, row), of points in camera axes. [N, 2]"""
         points = np.asarray(points, np.float64)
         z = points[:, 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -160,7 +160,7 @@ class CalibratedLens(Lens):
 
     @property
     def pinhole(self) -> Intrinsics:
-        """See :class:`Lens`."""
+        """The nominal pinhole camera."""
         fx, fy, cx, cy = self._calibrated_pinhole
         x, y = 1.0 / self.stretch[0], 1.0 / self.stretch[1]
         center = (cx - self.origin[0]) * x, (cy - self.origin[1]) * y
@@ -279,13 +279,13 @@ class MappedLens(CalibratedLens):
 
     def _tangents(self, pixels: Array) -> Array:
         tangents = np.full_like(pixels, np.nan)
-        asked = np.flatnonzero(np.isfinite(pixels).all(axis=1))
+        finite_rows = np.flatnonzero(np.isfinite(pixels).all(axis=1))
         tree, seeds = self._seeds
-        if not len(asked) or not len(seeds):
+        if not len(finite_rows) or not len(seeds):
             return tangents
-        target = pixels[asked]
+        target = pixels[finite_rows]
         angles = seeds[tree.query(target)[1]]
-        going = np.arange(len(asked))
+        going = np.arange(len(finite_rows))
         for _ in range(30):
             miss = self._at(angles[going]) - target[going]
             off = np.linalg.norm(miss, axis=1) > 1e-4 * _TOLERANCE
@@ -296,8 +296,8 @@ class MappedLens(CalibratedLens):
             angles[going] = self._kept_inside(before - _solved(self._jacobian(before), miss))
             # What no direction shows ends at the rim and stays there.
             going = going[np.abs(angles[going] - before).max(axis=1) > 1e-15]
-        found = np.linalg.norm(self._at(angles) - target, axis=1) < _TOLERANCE
-        tangents[asked[found]] = _directions(angles[found])
+        is_reached = np.linalg.norm(self._at(angles) - target, axis=1) < _TOLERANCE
+        tangents[finite_rows[is_reached]] = _directions(angles[is_reached])
         return tangents
 
     @cached_property
@@ -460,8 +460,8 @@ def along(direction: Array, length: Array, new_length: Array, ratio_at_zero: flo
 
 def _first_root(coefficients: list[float]) -> float:
     """The smallest positive real root of a polynomial, constant term first; infinite where there is none."""
-    kept = np.polynomial.polyutils.trimcoef(coefficients, _NEGLIGIBLE)
-    roots = np.polynomial.Polynomial(kept).roots()
+    terms = np.polynomial.polyutils.trimcoef(coefficients, _NEGLIGIBLE)
+    roots = np.polynomial.Polynomial(terms).roots()
     positive = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0.0)]
     return float(positive.min(initial=np.inf))
 

@@ -16,7 +16,7 @@ NOWHERE = -10.0
 
 
 def undistortion_map(lens: Lens, pinhole: Intrinsics) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Where ``cv2.remap`` finds each pixel of a pinhole image in the distorted image: its columns and rows.
+    """Map for ``cv2.remap``: column and row in the distorted image of each pixel of a pinhole image.
 
     Unlike elsewhere, pixel centres are at INTEGERS, as OpenCV counts. Places may lie outside the distorted image, and
     are :data:`NOWHERE` where the lens does not reach.

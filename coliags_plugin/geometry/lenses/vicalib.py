@@ -41,23 +41,25 @@ def read_calibration(path: Path) -> Calibration:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{path} is not XML: {error}", _EXPECTED, "Restore the whole file") from error
-    found = {_read_model(path, model) for model in root.iter("camera_model")}
-    if len(found) != 1:
-        raise InputError(f"{path} has {len(found)} different cameras", _EXPECTED, "Leave the one of the recording")
-    return found.pop()
+    calibrations = {_read_model(path, model) for model in root.iter("camera_model")}
+    if len(calibrations) != 1:
+        raise InputError(
+            f"{path} has {len(calibrations)} different cameras", _EXPECTED, "Leave the one of the recording"
+        )
+    return calibrations.pop()
 
 
 def find_calibration(folder: Path) -> Calibration | None:
     """The calibration in a folder, whose calibration files must agree; None where there is no such file."""
-    found = [read_calibration(path) for path in calibration_files(folder)]
-    other = next((one for one in found if one.lens != found[0].lens), None)
+    calibrations = [read_calibration(path) for path in calibration_files(folder)]
+    other = next((calibration for calibration in calibrations if calibration.lens != calibrations[0].lens), None)
     if other is not None:
         raise InputError(
-            f"{found[0].path} and {other.path.name} have different cameras",
+            f"{calibrations[0].path} and {other.path.name} have different cameras",
             "the calibration of the endoscope that filmed",
             "Move the others away",
         )
-    return found[0] if found else None
+    return calibrations[0] if calibrations else None
 
 
 def calibration_files(folder: Path) -> list[Path]:

@@ -131,8 +131,8 @@ def encode_mesh(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
         document["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": material}]
         document["meshes"][0]["primitives"][0]["material"] = 0
 
-    made = trimesh.Trimesh(mesh.vertices, mesh.triangles, visual=visual, process=False)
-    return bytes(export_glb(trimesh.Scene(made), tree_postprocessor=both_sides))
+    exported = trimesh.Trimesh(mesh.vertices, mesh.triangles, visual=visual, process=False)
+    return bytes(export_glb(trimesh.Scene(exported), tree_postprocessor=both_sides))
 
 
 def _split(mesh: TriangleMesh, texture: Texture) -> tuple[TriangleMesh, Float[np.ndarray, "V 2"]]:
@@ -166,15 +166,15 @@ def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     The mesh has vertex colours where every ``v`` has six numbers, the last three up to 1 or to 255. Beside it, for each
     triangle, the texture index (``vt``, counted from 1) of its first corner; None where corners have none.
     """
-    found: dict[str, list[str]] = {"v ": [], "f ": []}
+    rows: dict[str, list[str]] = {"v ": [], "f ": []}
     try:
         with path.open(encoding="utf-8", errors="replace") as lines:
             for line in lines:
-                if line[:2] in found:
-                    found[line[:2]].append(line[2:])
+                if line[:2] in rows:
+                    rows[line[:2]].append(line[2:])
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "an OBJ file") from error
-    vertices, faces = _numbers(path, found["v "]), found["f "]
+    vertices, faces = _numbers(path, rows["v "]), rows["f "]
     corners, textures = _corners(path, faces)
     corners = np.where(corners < 0, corners + len(vertices), corners - 1)
     if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):

@@ -42,7 +42,7 @@ class RayScene:
         return np.where(np.isfinite(parameter), triangle, -1), parameter, answer["primitive_uvs"].numpy()
 
     def blocked(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
-        """Whether something lies on each ray before its end, the last thousandth of it left out. [N]"""
+        """True where something lies on a ray before its end, the last thousandth of it left out. [N]"""
         rays = self._rays(origins, directions)
         return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=0.999).numpy())
 
@@ -118,19 +118,19 @@ class TriangleMesh:
 
     @cached_property
     def on_border(self) -> Bool[np.ndarray, "V"]:
-        """Whether vertices are on the border. [V]"""
-        found = np.zeros(len(self.vertices), bool)
-        found[self.border] = True
-        return found
+        """True for vertices on the border. [V]"""
+        on_border = np.zeros(len(self.vertices), bool)
+        on_border[self.border] = True
+        return on_border
 
     @cached_property
     def rays(self) -> RayScene:
         """Casts rays at the mesh and measures distances to it; made once."""
         return RayScene(self.to_open3d())
 
-    def part(self, kept: Bool[np.ndarray, "F"]) -> TriangleMesh:
+    def part(self, chosen: Bool[np.ndarray, "F"]) -> TriangleMesh:
         """The mesh of some triangles, without the vertices that no longer belong to any."""
-        used, corners = np.unique(self.triangles[kept], return_inverse=True)
+        used, corners = np.unique(self.triangles[chosen], return_inverse=True)
         colors = None if self.colors is None else self.colors[used]
         return TriangleMesh(self.vertices[used], corners.reshape(-1, 3), colors)
 
@@ -149,10 +149,10 @@ class TriangleMesh:
     def to_open3d(self) -> Any:
         """The mesh as an ``open3d.t.geometry.TriangleMesh``, for ray casting and measures."""
         open3d = import_open3d("casts rays at meshes")
-        made = open3d.t.geometry.TriangleMesh(
+        converted = open3d.t.geometry.TriangleMesh(
             open3d.core.Tensor(np.ascontiguousarray(self.vertices, np.float32)),
             open3d.core.Tensor(np.ascontiguousarray(self.triangles, np.int64)),
         )
         if self.colors is not None:
-            made.vertex.colors = open3d.core.Tensor(np.ascontiguousarray(self.colors))
-        return made
+            converted.vertex.colors = open3d.core.Tensor(np.ascontiguousarray(self.colors))
+        return converted

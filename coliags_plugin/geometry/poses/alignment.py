@@ -72,25 +72,25 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
 
 
 def nearest_in_time(
-    wanted: Float[np.ndarray, "N"], known: Float[np.ndarray, "M"], tolerance: float
+    times: Float[np.ndarray, "N"], others: Float[np.ndarray, "M"], tolerance: float
 ) -> Int[np.ndarray, "N"]:
     """Match timestamps, in any order, one to one, closest pairs first, as TUM's tools do.
 
-    Returns indices into ``known``, -1 without a match within the tolerance. [N]
+    Returns indices into ``others``, -1 without a match within the tolerance. [N]
     """
-    order = np.argsort(known, kind="stable")
-    low = np.searchsorted(known[order], wanted - tolerance, side="left")
-    high = np.searchsorted(known[order], wanted + tolerance, side="right")
-    first = np.repeat(np.arange(len(wanted)), high - low)
+    order = np.argsort(others, kind="stable")
+    low = np.searchsorted(others[order], times - tolerance, side="left")
+    high = np.searchsorted(others[order], times + tolerance, side="right")
+    first = np.repeat(np.arange(len(times)), high - low)
     ranges = [np.arange(0), *(np.arange(a, b) for a, b in zip(low, high, strict=True))]
     second = order[np.concatenate(ranges)]
-    partner = np.full(len(wanted), -1, np.int64)
-    taken = np.zeros(len(known), bool)
-    for pair in np.argsort(np.abs(wanted[first] - known[second]), kind="stable"):
+    partner = np.full(len(times), -1, np.int64)
+    is_matched = np.zeros(len(others), bool)
+    for pair in np.argsort(np.abs(times[first] - others[second]), kind="stable"):
         here, there = first[pair], second[pair]
-        if partner[here] < 0 and not taken[there]:
+        if partner[here] < 0 and not is_matched[there]:
             partner[here] = there
-            taken[there] = True
+            is_matched[there] = True
     return partner
 
 
@@ -185,9 +185,9 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
             "two cameras that move",
             "Align without `scale`",
         )
-    left, values, right = np.linalg.svd(target_centered.T @ centered / len(source))
-    sign = 1.0 if np.linalg.det(left) * np.linalg.det(right) > 0.0 else -1.0
-    rotation = left @ np.diag([1.0, 1.0, sign]) @ right
+    u, values, vt = np.linalg.svd(target_centered.T @ centered / len(source))
+    sign = 1.0 if np.linalg.det(u) * np.linalg.det(vt) > 0.0 else -1.0
+    rotation = u @ np.diag([1.0, 1.0, sign]) @ vt
     scale = float((values * (1.0, 1.0, sign)).sum() / (centered**2).sum(axis=1).mean()) if with_scale else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 

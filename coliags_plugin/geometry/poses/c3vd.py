@@ -95,7 +95,7 @@ def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None
 
 
 def recognise(path: Path) -> bool:
-    """Whether a file's first line holds sixteen numbers."""
+    """True if a file's first line holds sixteen numbers."""
     return count_first_numbers(path) == 16
 
 

@@ -390,8 +390,8 @@ def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: boo
     import pycolmap
 
     make_folder(folder)
-    seen = f"the COLMAP model written to {final_place(folder)} is incomplete"
-    incomplete = InputError(seen, "a disk with space left", "Free some, or choose another output")
+    message = f"the COLMAP model written to {final_place(folder)} is incomplete"
+    incomplete = InputError(message, "a disk with space left", "Free some, or choose another output")
     try:
         (model.write_text if text else model.write_binary)(str(folder))
         written = pycolmap.Reconstruction(str(folder))

@@ -107,7 +107,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def recognise(path: Path) -> bool:
-    """Whether a file is a ZIP archive, as NPZ files are."""
+    """True if a file is a ZIP archive, as NPZ files are."""
     return head(path).startswith(b"PK\x03\x04")
 
 

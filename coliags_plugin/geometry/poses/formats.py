@@ -42,8 +42,8 @@ class Format:
 
 def format_named(name: str) -> Format:
     """The format with a given name."""
-    known: Format = pose_formats.get(name)
-    return known
+    pose_format: Format = pose_formats.get(name)
+    return pose_format
 
 
 def format_of(path: Path, name: str | None = None) -> Format:
@@ -51,17 +51,19 @@ def format_of(path: Path, name: str | None = None) -> Format:
     if not path.exists():
         raise InputError(f"no file or folder {path}", "poses")
     if name is not None:
-        known = format_named(name)
-        if path.is_dir() and not known.folder:
-            raise InputError(f"{path} is a folder", f"the {known.name} file itself")
-        return known
-    for known in map(format_named, pose_formats):
-        if known.recognise is not None and known.recognise(path):
-            return known
+        candidate = format_named(name)
+        if path.is_dir() and not candidate.folder:
+            raise InputError(f"{path} is a folder", f"the {candidate.name} file itself")
+        return candidate
+    for candidate in map(format_named, pose_formats):
+        if candidate.recognise is not None and candidate.recognise(path):
+            return candidate
     if path.is_dir():
-        held = sorted(entry.name for entry in path.iterdir())
-        shown = f"{', '.join(held[:3])}{f' and {len(held) - 3} more' if len(held) > 3 else ''}" if held else "nothing"
-        raise InputError(f"{path} holds {shown}", "the folder of a COLMAP model, or a pose file inside a folder")
+        entries = sorted(entry.name for entry in path.iterdir())
+        shown = ", ".join(entries[:3]) + (f" and {len(entries) - 3} more" if len(entries) > 3 else "")
+        raise InputError(
+            f"{path} holds {shown or 'nothing'}", "the folder of a COLMAP model, or a pose file inside a folder"
+        )
     line, count = _first_row(path)
     raise unreadable(
         path,
@@ -74,17 +76,17 @@ def format_of(path: Path, name: str | None = None) -> Format:
 
 def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: bool = False) -> None:
     """Write a trajectory atomically; the parent folder is made."""
-    known = format_named(name)
-    if known.write is None:
+    target = format_named(name)
+    if target.write is None:
         writable = [other for other in pose_formats if format_named(other).write is not None]
         raise InputError(f"format '{name}' is read-only", f"one of {', '.join(writable)}")
-    if path.exists() and path.is_dir() != known.folder:
+    if path.exists() and path.is_dir() != target.folder:
         raise InputError(
             f"{path} is a {'folder' if path.is_dir() else 'file'}",
-            f"a new {'folder' if known.folder else 'file'}, as {name} poses are one",
+            f"a new {'folder' if target.folder else 'file'}, as {name} poses are one",
         )
     refuse_existing(path, overwrite, "a new path")
-    known.write(path, trajectory)
+    target.write(path, trajectory)
 
 
 #: What readers of poses expect.

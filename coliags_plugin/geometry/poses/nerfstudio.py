@@ -76,14 +76,16 @@ def write(path: Path, trajectory: Trajectory) -> None:
     if (pinhole := trajectory.intrinsics) is not None:
         numbers = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
         content = {"camera_model": "PINHOLE", **dict(zip(_PINHOLE, numbers, strict=True))}
-    given: Sequence[JsonObject] = trajectory.cameras or [{}] * len(trajectory)
+    cameras: Sequence[JsonObject] = trajectory.cameras or [{}] * len(trajectory)
     # nerfstudio reads the model of the file alone, and no distortion of frames where the file has any.
-    common = given[0].keys() if all(camera == given[0] for camera in given) else {"camera_model"}
-    content |= {key: given[0][key] for key in common if all(each.get(key) == given[0].get(key, ()) for each in given)}
+    common = cameras[0].keys() if all(camera == cameras[0] for camera in cameras) else {"camera_model"}
+    content |= {
+        key: cameras[0][key] for key in common if all(each.get(key) == cameras[0].get(key, ()) for each in cameras)
+    }
     opengl = trajectory.camera_to_world @ FLIP_Y_AND_Z
     content["frames"] = [
         {"file_path": name, "transform_matrix": matrix.tolist()} | {k: camera[k] for k in camera if k not in content}
-        for name, matrix, camera in zip(names, opengl, given, strict=True)
+        for name, matrix, camera in zip(names, opengl, cameras, strict=True)
     ]
     write_json(path, content)
 
@@ -117,7 +119,7 @@ def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world
 
 def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Intrinsics | None, str]:
     """The pinhole shared by all images; or None, and the reason."""
-    found: set[Intrinsics] = set()
+    pinholes: set[Intrinsics] = set()
     for frame in frames:
         # A frame's value overrides the file's.
         values = {
@@ -136,10 +138,10 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
             return None, f"no intrinsics: the file has no {', '.join(missing)}"
         fx, fy, cx, cy, width, height = (read_number(values, key, path) for key in _PINHOLE)
         with prefixed_errors(str(path)):
-            found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
-    if len(found) > 1:
-        return None, f"no common pinhole: the images have {len(found)} different cameras"
-    return found.pop(), ""
+            pinholes.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
+    if len(pinholes) > 1:
+        return None, f"no common pinhole: the images have {len(pinholes)} different cameras"
+    return pinholes.pop(), ""
 
 
 FORMAT = Format(

@@ -91,7 +91,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def recognise(path: Path) -> bool:
-    """Whether a file's first line, comments apart, holds eight numbers."""
+    """True if a file's first line, comments apart, holds eight numbers."""
     return count_first_numbers(path) == 8
 
 

@@ -64,9 +64,9 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
         depths_by_frame = [
             np.zeros(0)
-            if known is None
-            else _neighbourly(known.pixels.cpu().numpy(), known.depth.cpu().double().numpy())
-            for known in (frame.sparse_depth for frame in frames)
+            if sparse is None
+            else _neighbourly(sparse.pixels.cpu().numpy(), sparse.depth.cpu().double().numpy())
+            for sparse in (frame.sparse_depth for frame in frames)
         ]
         return _range_of(depths_by_frame, "points of the scene")
     depths_by_frame = [np.zeros(0)] * len(frames)
@@ -94,24 +94,24 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
     return _range_of(depths_by_frame, "points triangulated between frames")
 
 
-def triangulated_depths(first: Features, second: Features, one: Frame, other: Frame) -> Float[np.ndarray, "K"]:
+def triangulated_depths(first: Features, second: Features, frame: Frame, partner: Frame) -> Float[np.ndarray, "K"]:
     """z-depths, in the first frame, of its features with matches on their epipolar lines at a sufficient angle.
 
     NaN for all others.
     """
     depths = np.full(len(first), np.nan)
-    rotation, translation = Pose.of(one.camera).to(Pose.of(other.camera))
-    turn = np.degrees(np.arccos(np.clip(float(one.camera.optical_axis @ other.camera.optical_axis), -1.0, 1.0)))
+    rotation, translation = Pose.of(frame.camera).to(Pose.of(partner.camera))
+    turn = np.degrees(np.arccos(np.clip(float(frame.camera.optical_axis @ partner.camera.optical_axis), -1.0, 1.0)))
     if not np.linalg.norm(translation) > 0.0 or turn > MAX_TURN:
         return depths
     pairs = mutual_matches(first, second, _MAX_RATIO, _MAX_DISTANCE)
-    turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T
-    opposite = rays(second.pixels[pairs[:, 1]], other.camera)
+    turned = rays(first.pixels[pairs[:, 0]], frame.camera) @ rotation.T
+    opposite = rays(second.pixels[pairs[:, 1]], partner.camera)
     # Epipolar lines in either image; coefficients of x and y divided by the focal lengths give distances in pixels.
     lines, lines_back = np.cross(translation, turned), np.cross(opposite, translation) @ rotation
     slopes = (
         np.linalg.norm(line[:, :2] / (camera.fx, camera.fy), axis=1)
-        for line, camera in ((lines, other.camera), (lines_back, one.camera))
+        for line, camera in ((lines, partner.camera), (lines_back, frame.camera))
     )
     is_on_line = np.abs((opposite * lines).sum(axis=1)) <= _ERROR * np.hypot(*slopes)
     # Depth a of least distance between the lines a * turned + translation and b * opposite.
@@ -137,9 +137,9 @@ def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "K"]:
 
 def _neighbourly(pixels: Float[np.ndarray, "K 2"], depths: Float[np.ndarray, "K"]) -> Float[np.ndarray, "A"]:
     """Depths of one frame that are known, above 0, and not unlike their neighbours'."""
-    known = depths > 0.0
-    depths = depths[known]
-    return np.asarray(depths[~(difference_from_neighbours(pixels[known], np.log(depths)) > _UNLIKE)])
+    is_known = depths > 0.0
+    depths = depths[is_known]
+    return np.asarray(depths[~(difference_from_neighbours(pixels[is_known], np.log(depths)) > _UNLIKE)])
 
 
 def difference_from_neighbours(

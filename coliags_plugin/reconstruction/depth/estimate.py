@@ -144,25 +144,25 @@ class Estimation:
 
         @lru_cache(maxsize=self.held)
         def depth_map(index: int) -> WeightedDepth:
-            own = Swept(**self.work.load(swept, index))
-            return WeightedDepth(guides(index).pose, own.depth, sweep_weight(own))
+            swept_frame = Swept(**self.work.load(swept, index))
+            return WeightedDepth(guides(index).pose, swept_frame.depth, sweep_weight(swept_frame))
 
         def fused(index: int) -> Arrays:
-            own, guide = depth_map(index), guides(index)
-            result = fuse_frame(own, [depth_map(other) for other in neighbours[index]], self.settings.agreement)
+            weighted, guide = depth_map(index), guides(index)
+            result = fuse_frame(weighted, [depth_map(other) for other in neighbours[index]], self.settings.agreement)
             # Where this frame shows a highlight, others may see the surface.
-            support, known = result.votes, np.log(result.depth)
+            support, log_fused = result.votes, np.log(result.depth)
             prior = self.prior.log_depth(
-                self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
+                self.frames[index].to("cpu"), guide.usable, log_fused, data_weight(support), self.medians[index]
             )
-            rim = near_rim(known, 2 * sweep.radius)
+            rim = near_rim(log_fused, 2 * sweep.radius)
             prior = np.clip(prior, low, high)
             # Later sweeps have a surface, and small windows: their edges are where they belong.
             whole = sweep.reach is None
-            belief = first_belief(known, support, prior, rim) if whole else np.ones_like(support)
-            log_depth = np.clip(complete(known, support, belief, prior, guide.intensity), low, high)
+            belief = first_belief(log_fused, support, prior, rim) if whole else np.ones_like(support)
+            log_depth = np.clip(complete(log_fused, support, belief, prior, guide.intensity), low, high)
             confidence = depth_confidence(log_depth, support, result.spread, rim)
-            matched = float(own.weight[guide.usable].mean()) if guide.usable.any() else 0.0
+            matched = float(weighted.weight[guide.usable].mean()) if guide.usable.any() else 0.0
             distrust = ""
             if len(neighbours[index]) < FEWEST_NEIGHBOURS:
                 distrust = f"fewer than {FEWEST_NEIGHBOURS} other frames at a distance that gives depth"
@@ -260,10 +260,10 @@ def choose_neighbours(
         is_candidate = (axes @ axes[index] >= least_cosine) & (distance <= MAX_BASELINE)
         before, after = candidates[candidates < index][::-1], candidates[candidates > index]
         sides = [_first_beyond(distance, side, is_candidate, baselines) for side in (before, after)]
-        for own, other, side in ((0, 1, before), (1, 0, after)):
-            lacking = len(baselines) - len(sides[other])
+        for longer, shorter, side in ((0, 1, before), (1, 0, after)):
+            lacking = len(baselines) - len(sides[shorter])
             if lacking > 0:
-                sides[own] = _first_beyond(distance, side, is_candidate, [*baselines, *farther[:lacking]])
+                sides[longer] = _first_beyond(distance, side, is_candidate, [*baselines, *farther[:lacking]])
         neighbours.append(sorted({*sides[0], *sides[1]}))
     return neighbours
 

@@ -31,15 +31,15 @@ class LightPrior:
     the fit stays at the law of a lamp at the lens, intensity ~ 1 / depth^2 (docs/depth.md).
     """
 
-    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
+    def log_depth(self, frame: Frame, usable: Mask, log_known: Map, weight: Map, typical: float) -> Map:
         """Log of z-depth at every pixel of a frame, of the size of the maps or larger, fitted to its known depth.
 
-        ``usable``: neither masked nor near a highlight; ``known``: log of z-depth, anything where its ``weight``, 0 to
-        1, is 0; ``typical``: z-depth of a typical pixel, for a frame without known depth.
+        ``usable``: neither masked nor near a highlight; ``log_known``: log of z-depth, anything where its ``weight``, 0
+        to 1, is 0; ``typical``: z-depth of a typical pixel, for a frame without known depth.
         """
         import cv2
 
-        size = (known.shape[1], known.shape[0])
+        size = (log_known.shape[1], log_known.shape[0])
         image = cv2.resize(frame.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
         design = light_terms(image, usable, Pose.of(frame.camera, size))
         columns = design.reshape(-1, design.shape[-1])
@@ -48,13 +48,13 @@ class LightPrior:
         law[2] = -0.5
         lit = columns[usable.ravel()] if usable.any() else columns
         law[0] = np.log(typical) - law[2] * float(np.median(lit[:, 2]))
-        fitted = robust_fit(columns[chosen], known.ravel()[chosen], weight.ravel()[chosen], law, _LAW_WEIGHT)
+        fitted = robust_fit(columns[chosen], log_known.ravel()[chosen], weight.ravel()[chosen], law, _LAW_WEIGHT)
         # Beyond what the fit has seen, a polynomial runs away: hold its terms at the ends.
         if len(chosen) > 1000:
             low, high = np.percentile(columns[chosen], [0.05, 99.95], axis=0)
             slack = 0.15 * (high - low)
             columns = np.clip(columns, low - slack, high + slack)
-        return np.asarray((columns @ fitted).reshape(known.shape), np.float32)
+        return np.asarray((columns @ fitted).reshape(log_known.shape), np.float32)
 
     def described(self) -> str:
         """Name of the prior, by which work files of another one are told."""
@@ -118,16 +118,16 @@ class FilePrior:
             digest.update(name.encode() + path.read_bytes())
         return digest.hexdigest()
 
-    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
-        """See :meth:`LightPrior.log_depth`; unknown pixels of a map take the typical depth."""
+    def log_depth(self, frame: Frame, usable: Mask, log_known: Map, weight: Map, typical: float) -> Map:
+        """Log of z-depth as by :meth:`LightPrior.log_depth`; unknown pixels of a map take the typical depth."""
         import cv2
 
-        size = (known.shape[1], known.shape[0])
+        size = (log_known.shape[1], log_known.shape[0])
         stored = self._read(frame)
         values = np.asarray(cv2.resize(stored, size, interpolation=cv2.INTER_NEAREST), np.float64)
         there = np.isfinite(values) & (values > 0.0)
         chosen = (weight > 0.0) & usable & there
-        nothing = np.full(known.shape, np.log(typical), np.float32)
+        nothing = np.full(log_known.shape, np.log(typical), np.float32)
         if not there.any():
             return nothing
         if chosen.sum() < _FEWEST:
@@ -135,13 +135,13 @@ class FilePrior:
             return np.where(there, np.log(typical * np.where(there, values, scale) / scale), nothing).astype(np.float32)
         best, least = nothing, np.inf
         for power in (1.0, -1.0):
-            target = np.exp(power * known[chosen].astype(np.float64))
+            target = np.exp(power * log_known[chosen].astype(np.float64))
             columns = np.stack([np.ones(values.shape), np.where(there, values, 1.0)], axis=-1)
             fit = columns @ robust_fit(columns[chosen], target, weight[chosen], np.zeros(2), 1e-9)
             # A line may leave the positive depths: hold it at a tenth of the least that is known.
             fit = np.clip(fit, 0.1 * target.min(), 10.0 * target.max())
             log_depth = np.log(fit) / power
-            error = float(np.average(np.abs(log_depth[chosen] - known[chosen]), weights=weight[chosen]))
+            error = float(np.average(np.abs(log_depth[chosen] - log_known[chosen]), weights=weight[chosen]))
             if error < least:
                 best, least = np.where(there, log_depth, nothing).astype(np.float32), error
         return best
@@ -185,7 +185,7 @@ def robust_fit(
     if len(values) == 0:
         return default.copy()
     every = -(-len(values) // _MOST)
-    rows, wanted, trust = columns[::every], values[::every].astype(np.float64), weights[::every].astype(np.float64)
+    rows, targets, trust = columns[::every], values[::every].astype(np.float64), weights[::every].astype(np.float64)
     rows = rows.astype(np.float64)
     scale = np.maximum(rows.std(axis=0), 1e-3)
     scale[0] = 1.0
@@ -196,14 +196,14 @@ def robust_fit(
     start[0] = default[0] + default[1:] @ middle[1:]
     pull = np.full(len(start), default_weight)
     pull[0] = 1e-3 * default_weight  # the level follows the data at once
-    solution, left = start, wanted - standard @ start
+    solution, residuals = start, targets - standard @ start
     for _ in range(_ROUNDS):
-        spread = max(4.0 * float(np.median(np.abs(left - np.median(left)))), 1e-4)
-        centred = left - (np.median(left) if solution is start else 0.0)
+        spread = max(4.0 * float(np.median(np.abs(residuals - np.median(residuals)))), 1e-4)
+        centred = residuals - (np.median(residuals) if solution is start else 0.0)
         each = trust / (1.0 + (centred / spread) ** 2)
         normal = standard.T @ (each[:, None] * standard) + np.diag(pull)
-        solution = np.linalg.solve(normal, standard.T @ (each * wanted) + pull * start)
-        left = wanted - standard @ solution
+        solution = np.linalg.solve(normal, standard.T @ (each * targets) + pull * start)
+        residuals = targets - standard @ solution
     coefficients = solution / scale
     coefficients[0] = solution[0] - coefficients[1:] @ middle[1:]
     return np.asarray(coefficients)
@@ -236,8 +236,8 @@ def complete(log_known: Map, support: Map, belief: Map, log_prior: Map, intensit
     residual = np.where(data > 0.0, log_known - log_prior, 0.0).astype(np.float32)
     filled = log_prior + smooth(data * residual) / (smooth(data) + np.float32(_ZERO))
     position = np.clip((support - 0.2) / 0.8, 0.0, 1.0)
-    kept = position * position * (3.0 - 2.0 * position) * belief
-    return np.asarray(np.where(kept > 0.0, kept * log_known + (1.0 - kept) * filled, filled), np.float32)
+    share = position * position * (3.0 - 2.0 * position) * belief
+    return np.asarray(np.where(share > 0.0, share * log_known + (1.0 - share) * filled, filled), np.float32)
 
 
 def first_belief(log_known: Map, support: Map, log_prior: Map, rim: Mask) -> Map:

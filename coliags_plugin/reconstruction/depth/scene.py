@@ -113,9 +113,9 @@ def _range(
     if request.near_far is not None:
         return given_range(*request.near_far, len(frames))
     used = [frames[index] for index in sources]
-    kept = work.value("range", lambda: vars(find_range(used, request.settings.features, progress)))
-    medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(kept["medians"])))
-    return DepthRange(kept["near"], kept["far"], tuple(medians.tolist()))
+    stored = work.value("range", lambda: vars(find_range(used, request.settings.features, progress)))
+    medians = np.exp(np.interp(np.arange(len(frames)), sources, np.log(stored["medians"])))
+    return DepthRange(stored["near"], stored["far"], tuple(medians.tolist()))
 
 
 def _write(
@@ -145,22 +145,22 @@ def _write(
         logs = np.clip(np.log(depth[confidence >= _KNOWN]), *log_range)
         counts += np.histogram(logs, _BINS, (log_range[0], log_range[1]))[0]
     positions, colors = voxels.points()
-    known = int(counts.sum())
+    confident = int(counts.sum())
     if not len(positions):
         raise InputError(
-            f"no surface that {len(frames)} frames agree on: {100.0 * known / max(pixels, 1):.1f} % of the pixels have "
-            f"a confidence of {_KNOWN:g} or more",
+            f"no surface that {len(frames)} frames agree on: {100.0 * confident / max(pixels, 1):.1f} % of the pixels "
+            f"have a confidence of {_KNOWN:g} or more",
             "sharp frames of the same surface from different positions, with correct poses",
             "Check the poses (coliags data check), or the images: blurred or dark frames give no depth",
         )
     train = [frame.name for frame in scene.train]
     test = [frame.name for frame in scene.test_sets.get("test", ())]
-    own = scene.provenance.split_name == "own"
-    writer.finish(positions, colors, train, (train, test) if own else None)
+    has_own_split = scene.provenance.split_name == "own"
+    writer.finish(positions, colors, train, (train, test) if has_own_split else None)
     write_unit(folder, scene.provenance.unit)
-    bins = np.searchsorted(np.cumsum(counts), np.multiply(known, _SHARES))
+    bins = np.searchsorted(np.cumsum(counts), np.multiply(confident, _SHARES))
     near, far = np.exp(log_range[0] + (log_range[1] - log_range[0]) * (bins + 0.5) / _BINS)
-    share = f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
+    share = f"{100.0 * confident / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more"
     summary = (
         f"{len(frames)} frames, {share}, 98 % of these at depths of {near:.4g} to {far:.4g}; {len(positions)} points"
     )
@@ -199,13 +199,13 @@ class VoxelPoints:
         inside = ((cell >= 0) & (cell < _SPAN)).all(axis=1)
         keys = (cell[:, 0] * _SPAN + cell[:, 1]) * _SPAN + cell[:, 2]
         rows = np.concatenate([weight, weight * offset, weight * image[chosen]], axis=1)[inside]
-        own, cells = np.unique(keys[inside], return_inverse=True)
-        sums = np.stack([np.bincount(cells, column, len(own)) for column in rows.T], axis=1)
-        sums = np.hstack([sums, np.ones((len(own), 1))])
-        place = np.searchsorted(self._keys, own)
-        is_known = np.append(self._keys, -1)[place] == own
+        frame_keys, cells = np.unique(keys[inside], return_inverse=True)
+        sums = np.stack([np.bincount(cells, column, len(frame_keys)) for column in rows.T], axis=1)
+        sums = np.hstack([sums, np.ones((len(frame_keys), 1))])
+        place = np.searchsorted(self._keys, frame_keys)
+        is_known = np.append(self._keys, -1)[place] == frame_keys
         self._sums[place[is_known]] += sums[is_known]
-        self._keys = np.insert(self._keys, place[~is_known], own[~is_known])
+        self._keys = np.insert(self._keys, place[~is_known], frame_keys[~is_known])
         self._sums = np.insert(self._sums, place[~is_known], sums[~is_known], axis=0)
 
     def points(self) -> tuple[Float32[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:

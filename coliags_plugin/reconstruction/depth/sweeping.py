@@ -166,7 +166,7 @@ class Fused:
     spread: Map  # mean relative deviation within the group
 
 
-def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
+def fuse_frame(frame: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
     """Weighted median of the depths that a frame and its neighbours give to each pixel, within the densest group.
 
     A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
@@ -175,16 +175,16 @@ def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreemen
     from coliags_plugin.core.numba_kernels.lanes import WIDTH
     from coliags_plugin.reconstruction.depth.numba_kernels.kernels import reproject, vote
 
-    height, width = own.depth.shape
+    height, width = frame.depth.shape
     size = height * width
     rest = (0, -size % WIDTH)
-    depth, weight = np.pad(own.depth.ravel(), rest), np.pad(own.weight.ravel(), rest)
+    depth, weight = np.pad(frame.depth.ravel(), rest), np.pad(frame.weight.ravel(), rest)
     candidates = np.empty((len(neighbours), len(depth)), np.float32)
     trusts = np.empty_like(candidates)
     for index, other in enumerate(neighbours):
-        there, back = own.pose.homography(other.pose), own.pose.depth_from(other.pose)
-        found = candidates[index], trusts[index]
-        reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *found)
+        there, back = frame.pose.homography(other.pose), frame.pose.depth_from(other.pose)
+        outputs = candidates[index], trusts[index]
+        reproject(depth, width, other.depth, other.weight, *there, *back, _ITERATIONS, np.float32(_CONVERGED), *outputs)
     written = np.empty((3, len(depth)), np.float32)
     vote(depth, weight, candidates, trusts, np.float32(agreement), *written)
     return Fused(*written[:, :size].reshape(3, height, width))

@@ -35,7 +35,7 @@ class WorkFolder:
     path: Path
 
     def has(self, stage: str, index: int) -> bool:
-        """Whether a frame of a pass is there."""
+        """True if a frame of a pass is there."""
         return self._file(stage, index).is_file()
 
     def save(self, stage: str, index: int, arrays: Arrays) -> None:
@@ -48,7 +48,7 @@ class WorkFolder:
             return {name: stored[name] for name in stored.files}
 
     def is_done(self, stage: str) -> bool:
-        """Whether all frames of a pass were kept at one time."""
+        """True if all frames of a pass have been kept."""
         return (self.path / f"{stage}.done").is_file()
 
     def finish(self, stage: str, before: str | None) -> None:
@@ -77,17 +77,17 @@ def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
     path = out.parent / f".{out.name}.work"
     make_folder(path)
     with locked(path / "lock", out):
-        file, wanted = path / _REQUEST, json.loads(json.dumps(dict(request)))
-        kept = json.loads(file.read_text()) if file.is_file() else None
-        if kept is not None and kept != wanted:
+        file, described = path / _REQUEST, json.loads(json.dumps(dict(request)))
+        stored = json.loads(file.read_text()) if file.is_file() else None
+        if stored is not None and stored != described:
             log.warning("%s: work files of other data or options are removed", path)
-        if kept != wanted:
+        if stored != described:
             for old in path.iterdir():
                 if old.is_dir():
                     shutil.rmtree(old)
                 elif old.name != "lock":
                     old.unlink()
-            write_json(file, wanted)
+            write_json(file, described)
         else:
             log.info("resuming from the work files in %s", path)
         yield WorkFolder(path)

@@ -65,8 +65,8 @@ class Rays:
             parts.append((ids[number - 1], np.full(count, number), np.arange(count), here, centers, directions))
         every, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(every, kind="stable")
-        kept, tracks = np.unique(every[order], return_inverse=True)
-        return cls(kept, tracks, *(column[order] for column in columns))
+        tracked_ids, tracks = np.unique(every[order], return_inverse=True)
+        return cls(tracked_ids, tracks, *(column[order] for column in columns))
 
     @classmethod
     def of_points(cls, model: pycolmap.Reconstruction) -> Rays:
@@ -79,13 +79,13 @@ class Rays:
             pixels[number - 1] = [point.xy for point in observed]
         return cls.of(model, ids, pixels)
 
-    def only(self, kept: Bool[np.ndarray, "K"], fewest: int) -> Rays:
+    def only(self, is_kept: Bool[np.ndarray, "K"], fewest: int) -> Rays:
         """Some of the observations: of tracks that are left with ``fewest`` or more."""
-        lengths = np.bincount(self.tracks, kept, len(self.ids))
-        kept = kept & (lengths >= fewest)[self.tracks]
+        lengths = np.bincount(self.tracks, is_kept, len(self.ids))
+        is_kept = is_kept & (lengths >= fewest)[self.tracks]
         number = np.cumsum(lengths >= fewest) - 1
         rows = (self.images, self.rows, self.pixels, self.centers, self.directions)
-        return Rays(self.ids[lengths >= fewest], number[self.tracks[kept]], *(column[kept] for column in rows))
+        return Rays(self.ids[lengths >= fewest], number[self.tracks[is_kept]], *(column[is_kept] for column in rows))
 
     def at_least(self, fewest: int) -> Rays:
         """The tracks of ``fewest`` observations or more."""
@@ -147,8 +147,8 @@ class Rays:
             pose = image.cam_from_world().matrix()
             local = points[self.tracks[here]] @ pose[:, :3].T + pose[:, 3]
             front = local[:, 2] > 0.0
-            seen = np.asarray(image.camera.img_from_cam(local[front])).reshape(-1, 2)
-            errors[here[front]] = np.linalg.norm(seen - self.pixels[here[front]], axis=1)
+            projected = np.asarray(image.camera.img_from_cam(local[front])).reshape(-1, 2)
+            errors[here[front]] = np.linalg.norm(projected - self.pixels[here[front]], axis=1)
         return errors
 
     def _away(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K"]]:
@@ -206,10 +206,10 @@ def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray,
     points = rays.triangulated()
     fits: Bool[np.ndarray, "K"] = rays.errors(model, points) <= max_error
     lengths = np.bincount(rays.tracks, fits, len(rays.ids))
-    kept = (lengths >= 2) & (rays.angles(points) >= _LEAST_ANGLE)
+    is_kept = (lengths >= 2) & (rays.angles(points) >= _LEAST_ANGLE)
     black = np.zeros(3, np.uint8)
     starts = np.append(rays.starts, len(rays.tracks))
-    for index in np.flatnonzero(kept).tolist():
+    for index in np.flatnonzero(is_kept).tolist():
         track = pycolmap.Track()
         for row in range(starts[index], starts[index + 1]):
             if fits[row]:
@@ -235,8 +235,8 @@ def median_of_points(
     values: Float[np.ndarray, "K"], points: Int[np.ndarray, "K"], count: int
 ) -> Float[np.ndarray, "N"]:
     """Lower median of each point's observations that are not NaN; 0 for a point without any."""
-    known = ~np.isnan(values)
-    values, points = values[known], points[known]
+    is_known = ~np.isnan(values)
+    values, points = values[is_known], points[is_known]
     order = np.lexsort((values, points))
     counts = np.bincount(points, minlength=count)
     middle = np.cumsum(counts) - counts + np.maximum(counts - 1, 0) // 2
@@ -274,8 +274,8 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
         pairs = [(first, first + apart) for first in frames if first + apart in directions]
         values = []
         for first, second in pairs[:: 1 + len(pairs) // _MOST_PAIRS]:
-            one, other = shared_tracks(tracks[first], tracks[second]).T
-            value = _residual(directions[first][one], directions[second][other])
+            rows, partner_rows = shared_tracks(tracks[first], tracks[second]).T
+            value = _residual(directions[first][rows], directions[second][partner_rows])
             values += [] if value is None else [value]
         if len(values) >= _FEWEST_PAIRS:
             measured[apart] = float(np.median(values)) * camera.mean_focal_length()
@@ -302,14 +302,14 @@ def _residual(first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"])
     import cv2
 
     inside = (np.linalg.norm(first, axis=1) < _WIDEST) & (np.linalg.norm(second, axis=1) < _WIDEST)
-    one, other = (np.column_stack([points[inside], np.ones(inside.sum())]) for points in (first, second))
-    if len(one) < _FEWEST:
+    homogeneous, partners = (np.column_stack([points[inside], np.ones(inside.sum())]) for points in (first, second))
+    if len(homogeneous) < _FEWEST:
         return None
-    tested = np.arange(len(one)) % _TESTED == 0
-    fitted = one[~tested, :2], other[~tested, :2]
+    tested = np.arange(len(homogeneous)) % _TESTED == 0
+    fitted = homogeneous[~tested, :2], partners[~tested, :2]
     essential, _ = cv2.findEssentialMat(*fitted, np.eye(3), cv2.RANSAC, 0.999, _MAX_ERROR)
     if essential is None:
         return None
-    lines, back = one[tested] @ essential[:3].T, other[tested] @ essential[:3]
+    lines, back = homogeneous[tested] @ essential[:3].T, partners[tested] @ essential[:3]
     slopes = np.hypot(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
-    return float(np.median(np.abs((other[tested] * lines).sum(axis=1)) / np.maximum(slopes, 1e-12)))
+    return float(np.median(np.abs((partners[tested] * lines).sum(axis=1)) / np.maximum(slopes, 1e-12)))

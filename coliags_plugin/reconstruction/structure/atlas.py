@@ -72,7 +72,7 @@ class Link:
 
     @property
     def holds(self) -> bool:
-        """Whether enough points link the sides and, as far as can be measured, both have the same scale."""
+        """True if enough points link the sides and, as far as can be measured, both have the same scale."""
         if self.log_scale is None or self.uncertainty is None:
             return self.points >= _FEWEST_ALONE and (self.spanning or 0) >= _FEWEST_SPANNING
         return (
@@ -109,27 +109,27 @@ def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
     return [link for link in links if link.points < _STRONG_LINK or not link.holds]
 
 
-def contradictions(model: pycolmap.Reconstruction, known: Sequence[Link] = ()) -> list[Link]:
+def contradictions(model: pycolmap.Reconstruction, excluded: Sequence[Link] = ()) -> list[Link]:
     """Places at which many points link the sides of a model but get a much different depth from either of them.
 
     A part of the model is too large or too small there. Of neighbouring places the worst, and none near those that are
-    ``known``; image i has ID i + 1.
+    ``excluded``; image i has ID i + 1.
     """
     rays = Rays.of_points(model)
     first, last = rays.spans
-    found: list[Link] = []
+    links: list[Link] = []
     for after in (number - 1 for number in sorted(model.reg_image_ids())[:-1]):
         common = np.flatnonzero((first <= after + 1) & (last > after + 1))
         compared = np.isin(rays.tracks, common[:: 1 + len(common) // _COMPARED])
         link = replace(_measured(rays.only(compared, 2), after), points=len(common))
         if link.log_scale is None or abs(link.log_scale) < max(_OTHER_SIZE, _SURE * (link.uncertainty or 0.0)):
             continue
-        if any(abs(after - other.after) <= _ONE_PLACE for other in known):
+        if any(abs(after - other.after) <= _ONE_PLACE for other in excluded):
             continue
-        if found and after - found[-1].after <= _ONE_PLACE:
-            link = max(found.pop(), link, key=lambda one: abs(one.log_scale or 0.0))
-        found.append(link)
-    return found
+        if links and after - links[-1].after <= _ONE_PLACE:
+            link = max(links.pop(), link, key=lambda one: abs(one.log_scale or 0.0))
+        links.append(link)
+    return links
 
 
 def link_at(model: pycolmap.Reconstruction, after: int) -> Link:
@@ -176,9 +176,9 @@ def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.R
     import pycolmap
 
     part = pycolmap.Reconstruction(model)
-    kept = {frame + 1 for frame in frames}
+    numbers = {frame + 1 for frame in frames}
     for number in sorted(model.reg_image_ids()):
-        if number not in kept:
+        if number not in numbers:
             part.deregister_frame(part.images[number].frame_id)
     for point in [number for number, point in part.points3D.items() if point.track.length() < 2]:
         part.delete_point3D(point)
@@ -196,14 +196,14 @@ def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
         medians = {number: float(np.median(depth)) for number, depth in depths.items()}
         middle = float(np.median(list(medians.values()))) if medians else 0.0
         leaps = _leaps(model)
-        held = [
+        credible = [
             number
             for number, median in medians.items()
             if middle / _OTHER_SCALE <= median <= middle * _OTHER_SCALE and number not in leaps
         ]
-        if len(held) == model.num_reg_images():
+        if len(credible) == model.num_reg_images():
             return model
-        model = part_of(model, [number - 1 for number in held])
+        model = part_of(model, [number - 1 for number in credible])
 
 
 def _leaps(model: pycolmap.Reconstruction) -> set[int]:

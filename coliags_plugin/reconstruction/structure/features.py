@@ -98,9 +98,9 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
         height, width = gray.shape
         column = np.clip(points[:, 0].astype(np.int64), 0, width - 1)
         row = np.clip(points[:, 1].astype(np.int64), 0, height - 1)
-        kept = usable(image, mask, settings)[row, column]
+        is_usable = usable(image, mask, settings)[row, column]
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        return Features(points[kept], (vectors / np.maximum(lengths, 1e-12))[kept])
+        return Features(points[is_usable], (vectors / np.maximum(lengths, 1e-12))[is_usable])
 
     return extract
 

@@ -105,11 +105,11 @@ class Hypothesis:
 
     @property
     def is_lit_from_the_camera(self) -> bool:
-        """Whether nearer points are brighter."""
+        """True if nearer points are brighter."""
         return self.correlation is not None and self.correlation < 0.0
 
     def is_plausible(self, plausible: tuple[float, float]) -> bool:
-        """Whether the nominal fields of view are in a range, degrees."""
+        """True if the nominal fields of view are in a range, degrees."""
         return all(plausible[0] <= view <= plausible[1] for view in self.fields_of_view)
 
     def described(self) -> str:
@@ -127,16 +127,16 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
     """The :func:`best` model of plausible nominal field of view, degrees; all, the most likely first, are logged."""
     for hypothesis in hypotheses:
         log.info("%s", hypothesis.described())
-    left = [one for one in hypotheses if one.is_plausible(plausible)]
-    if not left:
+    candidates = [hypothesis for hypothesis in hypotheses if hypothesis.is_plausible(plausible)]
+    if not candidates:
         raise InputError(
-            f"implausible focal lengths ({'; '.join(one.described() for one in hypotheses)})",
+            f"implausible focal lengths ({'; '.join(hypothesis.described() for hypothesis in hypotheses)})",
             f"a nominal field of view of {plausible[0]:g} to {plausible[1]:g} degrees",
             "Give the camera's calibration (`camera` and `params`, or a known `camera`), fix the focal length at a "
             "multiple of the larger side (`camera.refine=false` and `camera.focal_factors=[0.6]`), or state the "
             "range (`camera.field_of_view=[20, 150]`)",
         )
-    return best(left)
+    return best(candidates)
 
 
 def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
@@ -145,14 +145,14 @@ def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
     Where errors hardly differ, the first (most likely) of each camera model is left, as focal length and distortion
     compensate each other; of these, that with the least distortion is taken, as a lens is near the law it was made for.
     """
-    left = _explaining(hypotheses)
-    left = [one for one in left if one.is_lit_from_the_camera] or left
-    exact = min(one.error for one in left)
+    candidates = _explaining(hypotheses)
+    candidates = [candidate for candidate in candidates if candidate.is_lit_from_the_camera] or candidates
+    exact = min(candidate.error for candidate in candidates)
     firsts: dict[str, Hypothesis] = {}
-    for one in left:
-        if one.error <= _SAME_ERROR * exact:
-            firsts.setdefault(one.camera_model, one)
-    return min(firsts.values(), key=lambda one: one.distortion)
+    for candidate in candidates:
+        if candidate.error <= _SAME_ERROR * exact:
+            firsts.setdefault(candidate.camera_model, candidate)
+    return min(firsts.values(), key=lambda candidate: candidate.distortion)
 
 
 def fitting_focal_lengths(
@@ -168,10 +168,10 @@ def fitting_focal_lengths(
 
 def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Models that explain the images as well as any."""
-    images = max((one.images for one in hypotheses), default=0)
-    left = [one for one in hypotheses if one.images >= _ENOUGH_IMAGES * images]
-    observations = max((one.observations for one in left), default=0)
-    return [one for one in left if one.observations >= _ENOUGH_OBSERVATIONS * observations]
+    images = max((hypothesis.images for hypothesis in hypotheses), default=0)
+    complete = [hypothesis for hypothesis in hypotheses if hypothesis.images >= _ENOUGH_IMAGES * images]
+    observations = max((hypothesis.observations for hypothesis in complete), default=0)
+    return [hypothesis for hypothesis in complete if hypothesis.observations >= _ENOUGH_OBSERVATIONS * observations]
 
 
 def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> pycolmap.Reconstruction:
@@ -182,28 +182,28 @@ def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> py
     """
     import pycolmap
 
-    made = pycolmap.Reconstruction(model)
-    numbers = sorted(made.reg_image_ids())
-    middle = made.images[numbers[len(numbers) // 2]]
+    reversal = pycolmap.Reconstruction(model)
+    numbers = sorted(reversal.reg_image_ids())
+    middle = reversal.images[numbers[len(numbers) // 2]]
     frame = middle.cam_from_world().matrix()
-    depths = depths_of(made)[middle.image_id][1]
+    depths = depths_of(reversal)[middle.image_id][1]
     median = float(np.median(depths[depths > 0.0])) if (depths > 0.0).any() else 1.0
-    for point in made.points3D.values():
+    for point in reversal.points3D.values():
         local = frame[:, :3] @ point.xyz + frame[:, 3]
         local[2] = max(local[2], _NEAREST * median)
         point.xyz = frame[:, :3].T @ (local * (median / local[2]) ** 2 - frame[:, 3])
     center = np.array([0.0, 0.0, median])
     for number in numbers:
-        pose = made.images[number].cam_from_world().matrix()
+        pose = reversal.images[number].cam_from_world().matrix()
         rotation = pose[:, :3] @ frame[:, :3].T
         translation = pose[:, 3] - rotation @ frame[:, 3]
         mirrored = _MIRROR @ rotation @ _MIRROR
         # The centre of the scene keeps its place in every image.
         translation = rotation @ center + translation - mirrored @ center
         matrix = np.concatenate([mirrored @ frame[:, :3], (mirrored @ frame[:, 3] + translation)[:, None]], axis=1)
-        made.frames[made.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(matrix)
-    bundle_adjust(made, refine_camera)
-    return made
+        reversal.frames[reversal.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(matrix)
+    bundle_adjust(reversal, refine_camera)
+    return reversal
 
 
 def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: bool) -> list[Hypothesis]:
@@ -327,8 +327,8 @@ def _test_error(
         with_camera(tried, video, settings, start)
         adjust(tried, video.track_ids)
         errors.append(held_out_error(tried, video.tracks, 0.0))
-    known = [error for error in errors if error is not None]
-    return float(np.exp(np.mean(np.log(known)))) if known else np.inf
+    measured = [error for error in errors if error is not None]
+    return float(np.exp(np.mean(np.log(measured)))) if measured else np.inf
 
 
 def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings, start: Start) -> None:

@@ -62,7 +62,7 @@ _SAME = 0.4
 
 
 def is_repeated(before: UInt8[np.ndarray, "H W 3"], after: UInt8[np.ndarray, "H W 3"]) -> bool:
-    """Whether an image shows the same as the one before, as in videos converted to a higher frame rate."""
+    """True if an image shows the same as the one before, as in videos converted to a higher frame rate."""
     import cv2
 
     return before.shape == after.shape and float(cv2.absdiff(before, after).mean()) <= _SAME

@@ -70,7 +70,7 @@ def join_models(
     """
     compare = _Comparison(video, settings, masks)
     parts = list(models)
-    left: list[tuple[range, range]] = []
+    unjoined: list[tuple[range, range]] = []
     cuts = {link.after for model in models for link in weak_links(model.model)}
     stretches = [
         stretch
@@ -79,28 +79,28 @@ def join_models(
     ]
     for number, earlier in enumerate(with_progress(stretches, "join models", progress)):
         for later in stretches[number + 1 : number + 1 + _AHEAD]:
-            one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
-            if one is other:
+            first, second = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
+            if first is second:
                 continue
-            sightings = compare.agreeing(one, earlier, other, later)
+            sightings = compare.agreeing(first, earlier, second, later)
             if not sightings:
                 continue
             extended, joined = _with_sightings(video, sightings), None
-            if len(one.frames) + len(other.frames) <= settings.tracks.longest_window:
-                joined = _joined(extended, one, other, sightings, earlier[-1], later[0])
+            if len(first.frames) + len(second.frames) <= settings.tracks.longest_window:
+                joined = _joined(extended, first, second, sightings, earlier[-1], later[0])
             log.info(
                 "frames %d and %d show the same wall: %d comparisons of frames agree; %s",
                 *(earlier[-1], later[0], len(sightings), "left apart" if joined is None else "joined"),
             )
             if joined is None:
-                left.append((earlier, later))
+                unjoined.append((earlier, later))
             else:
                 video = extended
-                parts = [joined, *(part for part in parts if part is not one and part is not other)]
+                parts = [joined, *(part for part in parts if part is not first and part is not second)]
     apart = {}
-    for earlier, later in left:  # between the models as they are now
-        one, other = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
-        if one is not other and (sightings := compare.agreeing(one, earlier, other, later)):
+    for earlier, later in unjoined:  # between the models as they are now
+        first, second = (next(part for part in parts if side[0] in part.frames) for side in (earlier, later))
+        if first is not second and (sightings := compare.agreeing(first, earlier, second, later)):
             again = _again(sightings, later[0])
             apart[earlier[-1]] = replace(again, similarity=tuple(map(tuple, sightings[0].similarity.matrix.tolist())))
     return video, parts, apart
@@ -164,26 +164,30 @@ class _Comparison:
 
         self.view = view
 
-    def agreeing(self, one: Hypothesis, earlier: range, other: Hypothesis, later: range) -> list[_Sighting]:
+    def agreeing(
+        self, first_model: Hypothesis, earlier: range, second_model: Hypothesis, later: range
+    ) -> list[_Sighting]:
         """Comparisons of the frames at the ends of two stretches that give one similarity, the most typical first.
 
         Empty if too little of it agrees.
         """
-        firsts = self._posed(one, [frame for frame in one.frames if frame in earlier][-_FRAMES:])
-        seconds = self._posed(other, [frame for frame in other.frames if frame in later][:_FRAMES])
+        firsts = self._posed(first_model, [frame for frame in first_model.frames if frame in earlier][-_FRAMES:])
+        seconds = self._posed(second_model, [frame for frame in second_model.frames if frame in later][:_FRAMES])
         sightings = []
         for first, second in product(firsts, seconds):
             for source, target in ((first, second), (second, first)):
-                seen = self._sighting(source, target, one if target is first else other, target is second)
-                if seen is not None:
-                    ids, pixels, similarity = seen
+                sighting = self._sighting(
+                    source, target, first_model if target is first else second_model, target is second
+                )
+                if sighting is not None:
+                    ids, pixels, similarity = sighting
                     frames = first.number, second.number
                     sightings.append(_Sighting(frames, target.number, ids, pixels, similarity))
         if not sightings:
             return []
-        kept = _same(sightings, seconds[0])
-        fewest = min(len({sighting.frames[side] for sighting in kept}) for side in (0, 1))
-        return kept if len(kept) >= _FEWEST_AGREEING and fewest >= _FEWEST_SIDE else []
+        agreeing = _same(sightings, seconds[0])
+        fewest = min(len({sighting.frames[side] for sighting in agreeing}) for side in (0, 1))
+        return agreeing if len(agreeing) >= _FEWEST_AGREEING and fewest >= _FEWEST_SIDE else []
 
     def _posed(self, part: Hypothesis, frames: Sequence[int]) -> list[_Posed]:
         """Frames of a model with its well-known points of tracks; those that see none are left out."""
@@ -192,10 +196,10 @@ class _Comparison:
         rays = rays.only(np.isin(rays.ids, np.concatenate([self.video.track_ids[i] for i in frames]))[rays.tracks], 3)
         points = rays.triangulated()
         errors = median_of_points(rays.errors(model, points), rays.tracks, len(rays.ids))
-        known = (rays.angles(points) >= _LEAST_ANGLE) & (errors < _LARGEST_ERROR)
+        is_precise = (rays.angles(points) >= _LEAST_ANGLE) & (errors < _LARGEST_ERROR)
         posed = []
         for frame in frames:
-            rows = np.flatnonzero((rays.images == frame + 1) & known[rays.tracks])
+            rows = np.flatnonzero((rays.images == frame + 1) & is_precise[rays.tracks])
             if len(rows):
                 view, tracks = self.view(frame), rays.tracks[rows]
                 view = view.with_points(rays.ids[tracks], view.from_image(rays.pixels[rows]))
@@ -209,7 +213,7 @@ class _Comparison:
         """Points of the source found in the target: tracks, pixels, and the similarity from later to earlier model."""
         import pycolmap
 
-        rows, moved = self.finder.found(source.view, target.view)
+        rows, moved = self.finder.find(source.view, target.view)
         if len(rows) < _FEWEST_FOUND:
             return None
         options = pycolmap.AbsolutePoseEstimationOptions()
@@ -217,10 +221,10 @@ class _Comparison:
         options.ransac.min_num_trials, options.ransac.max_num_trials = _TRIALS
         pixels, points = target.view.in_image(moved), source.points[rows]
         camera = next(iter(seen_by.model.cameras.values()))
-        found = pycolmap.estimate_and_refine_absolute_pose(pixels.astype(np.float64), points, camera, options)
-        if found is None or found["num_inliers"] < _FEWEST_FOUND:
+        estimate = pycolmap.estimate_and_refine_absolute_pose(pixels.astype(np.float64), points, camera, options)
+        if estimate is None or estimate["num_inliers"] < _FEWEST_FOUND:
             return None
-        pose, fits = found["cam_from_world"].matrix(), np.asarray(found["inlier_mask"])
+        pose, fits = estimate["cam_from_world"].matrix(), np.asarray(estimate["inlier_mask"])
         reach = _NEAR * max(target.view.detail.shape)
         apart, nearest = cKDTree(target.view.pixels).query(moved)
         compared = fits & (np.asarray(apart) < reach)
@@ -243,13 +247,13 @@ def _between(pose: Float[np.ndarray, "3 4"], same: Float[np.ndarray, "3 4"], fac
 
 def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
     """The largest set of sightings with nearly one similarity, its most typical first."""
-    one = [sighting.similarity for sighting in sightings]
-    scales = np.log([similarity.scale for similarity in one])
-    rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in one]))
-    places = np.array([similarity.points(camera.center[None])[0] for similarity in one])
+    similarities = [sighting.similarity for sighting in sightings]
+    scales = np.log([similarity.scale for similarity in similarities])
+    rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in similarities]))
+    places = np.array([similarity.points(camera.center[None])[0] for similarity in similarities])
     depth = float(np.median(camera.depths))
     sets = []
-    for index in range(len(one)):
+    for index in range(len(similarities)):
         agree = np.abs(scales - scales[index]) < _SAME_SCALE
         agree &= (rotations * rotations[index].inv()).magnitude() < np.radians(_SAME_ROTATION)
         agree &= np.linalg.norm(places - places[index], axis=1) < _SAME_PLACE * depth * np.exp(scales[index])
@@ -282,15 +286,15 @@ def _with_sightings(video: MatchedVideo, sightings: Sequence[_Sighting]) -> Matc
 
 
 def _joined(
-    video: MatchedVideo, one: Hypothesis, other: Hypothesis, sightings: Sequence[_Sighting], after: int, before: int
+    video: MatchedVideo, first: Hypothesis, second: Hypothesis, sightings: Sequence[_Sighting], after: int, before: int
 ) -> Hypothesis | None:
-    """Both models as one, in the frame of the larger; None if it is not as good as they are."""
+    """Two models made one, in the frame of the larger; None if it is not as good as they are."""
     import pycolmap
 
     change = pycolmap.Sim3d(sightings[0].similarity.matrix)
-    larger, smaller = one, other
-    if len(one.frames) < len(other.frames):
-        larger, smaller, change = other, one, change.inverse()
+    larger, smaller = first, second
+    if len(first.frames) < len(second.frames):
+        larger, smaller, change = second, first, change.inverse()
     moved = pycolmap.Reconstruction(smaller.model)
     moved.transform(change)
     model = pycolmap.Reconstruction()
@@ -299,25 +303,26 @@ def _joined(
     for part in (larger.model, moved):
         for number in sorted(part.reg_image_ids()):
             image = part.images[number]
-            made = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=number)
-            model.add_image_with_trivial_frame(made, image.cam_from_world())
+            posed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=number)
+            model.add_image_with_trivial_frame(posed, image.cam_from_world())
     for number in model.reg_image_ids():
         pixels = video.keypoints[number - 1][:, :2].astype(np.float64)
         model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
     result = adjusted(model, video)
-    kept = result.images >= (1.0 - _MOST_LOST) * (len(one.frames) + len(other.frames))
+    is_complete = result.images >= (1.0 - _MOST_LOST) * (len(first.frames) + len(second.frames))
     longest = rigid_frames(result.model, video.tracks)
-    held = kept and link_at(result.model, after).holds and (longest is None or result.images <= longest)
-    if not held or result.is_reversed or not result.is_lit_from_the_camera or _is_worse(result, (one, other), video):
+    is_held = is_complete and link_at(result.model, after).holds and (longest is None or result.images <= longest)
+    is_lit = result.is_lit_from_the_camera and not result.is_reversed
+    if not (is_held and is_lit) or _is_worse(result, (first, second), video):
         return None
-    return replace(result, joins={**one.joins, **other.joins, after: _again(sightings, before)})
+    return replace(result, joins={**first.joins, **second.joins, after: _again(sightings, before)})
 
 
 def _is_worse(joined: Hypothesis, parts: Sequence[Hypothesis], video: MatchedVideo) -> bool:
-    """Whether a joined model has a larger error of held-out tracks than its parts, or one that is unknown."""
+    """True if a joined model has a larger error of held-out tracks than its parts, or one that is unknown."""
     error = held_out_error(joined.model, video.tracks)
     before = [held_out_error(part.model, video.tracks) for part in parts]
-    known = [one for one in before if one is not None]
-    if error is None or len(known) < len(before):
+    measured = [part_error for part_error in before if part_error is not None]
+    if error is None or len(measured) < len(before):
         return True
-    return error > _MORE + _WORSE * float(np.average(known, weights=[len(part.frames) for part in parts]))
+    return error > _MORE + _WORSE * float(np.average(measured, weights=[len(part.frames) for part in parts]))

@@ -192,6 +192,6 @@ def brightness_correlation(
             depth.append(logs[1] - logs[1].mean())
     if not light:
         return None
-    one, other = np.concatenate(light), np.concatenate(depth)
-    size = float(np.sqrt((one**2).sum() * (other**2).sum()))
-    return float(one @ other) / size if size > 0.0 else None
+    lights, depths = np.concatenate(light), np.concatenate(depth)
+    size = float(np.sqrt((lights**2).sum() * (depths**2).sum()))
+    return float(lights @ depths) / size if size > 0.0 else None

@@ -33,20 +33,20 @@ def mutual_matches(first: Features, second: Features, max_ratio: float, max_dist
     nearest = similarity.argmax(axis=1)
     best = similarity[np.arange(len(first)), nearest]
     mutual = best == similarity.max(axis=0)[nearest]
-    one = _best(nearest[mutual], best[mutual], len(second))
-    one = np.sort(np.flatnonzero(mutual)[one[one >= 0]])
-    other, similarity, best = nearest[one], similarity[one], best[one]
+    rows = _best(nearest[mutual], best[mutual], len(second))
+    rows = np.sort(np.flatnonzero(mutual)[rows[rows >= 0]])
+    partners, similarity, best = nearest[rows], similarity[rows], best[rows]
     # Duplicates of the best match, from neighbouring octaves, are excluded from the second-best.
     tree = cKDTree(second.keypoints[:, :2])
     duplicates = tree.query_pairs(_DUPLICATE_DISTANCE, output_type="ndarray").astype(np.int64)
-    similarity[np.arange(len(one)), other] = -1.0
+    similarity[np.arange(len(rows)), partners] = -1.0
     for of, duplicate in ((0, 1), (1, 0)):
-        row, which = _joined(other, duplicates[:, of])
+        row, which = _joined(partners, duplicates[:, of])
         similarity[row, duplicates[which, duplicate]] = -1.0
     products = best, similarity.max(axis=1, initial=-1.0)
     distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in products)
-    kept = (distance < max_distance) & (distance < max_ratio * second_best)
-    return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
+    is_match = (distance < max_distance) & (distance < max_ratio * second_best)
+    return np.stack([rows[is_match], partners[is_match]], axis=1).astype(np.uint32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def rays(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, 
 
 
 def have_positive_depths(turned: np.ndarray, other: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Whether the lines ``a * turned + translation`` and ``b * other`` are closest at positive a and b. [K]"""
+    """True where the lines ``a * turned + translation`` and ``b * other`` are closest at positive a and b. [K]"""
     aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (other, other), (turned, other)))
     at, bt = turned @ translation, other @ translation
     # The common denominator aa * bb - ab^2 is not negative.
@@ -155,8 +155,10 @@ def epipolar_inliers(
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.max_error, options.ransac.random_seed = max_error, 0
     matches = np.repeat(np.arange(len(first), dtype=np.uint32)[:, None], 2, axis=1)
-    one, other = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
-    geometry = pycolmap.estimate_calibrated_two_view_geometry(camera, one, camera, other, matches, options)
+    pixels_first, pixels_second = (np.asarray(pixels, np.float64) + 0.5 for pixels in (first, second))
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, pixels_first, camera, pixels_second, matches, options
+    )
     inliers[np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
     return inliers
 
@@ -179,7 +181,7 @@ def alike_pairs(
     count = len(features)
     if count <= settings.exhaustive_up_to:
         return list(combinations(range(count), 2))
-    largest = [_largest(one) for one in features]
+    largest = [_largest(image_features) for image_features in features]
 
     def alikeness(first: int, second: int) -> int:
         return len(mutual_matches(largest[first], largest[second], settings.max_ratio, settings.max_distance))

@@ -106,8 +106,8 @@ def track_points(
     for stretch in with_progress(stretches, "track backwards", progress):
         backward = PointTracker(settings, next_id)
         for index in reversed(stretch):
-            found = backward.advance(read_image(images[index]), mask_of(images[index], masks))
-            points[index] = points[index].with_points(found)
+            backward_points = backward.advance(read_image(images[index]), mask_of(images[index], masks))
+            points[index] = points[index].with_points(backward_points)
         next_id = backward.next_id
     return points
 
@@ -144,9 +144,9 @@ class View:
         """Pixels of the whole image, centres at integers + 0.5, in the view."""
         return (pixels / self.stretch - 0.5).astype(np.float32)
 
-    def only(self, kept: Int64[np.ndarray, "N"] | Bool[np.ndarray, "K"]) -> View:
+    def only(self, rows: Int64[np.ndarray, "N"] | Bool[np.ndarray, "K"]) -> View:
         """The view with some of its points, in the order given."""
-        return replace(self, ids=self.ids[kept], pixels=self.pixels[kept])
+        return replace(self, ids=self.ids[rows], pixels=self.pixels[rows])
 
     def with_points(self, ids: Int64[np.ndarray, "N"], pixels: Float32[np.ndarray, "N 2"]) -> View:
         """The view with further points."""
@@ -177,7 +177,7 @@ class PointFinder:
         none = np.empty(0, np.int64), np.empty((0, 2), np.float32)
         return View(*wall_textures(small, mask), *none, stretch, sharpness(gray), fineness(gray))
 
-    def found(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
+    def find(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
         """Indices of the points of one view that are found in another one, and where."""
         if not len(before.ids):
             return np.empty(0, np.int64), np.empty((0, 2), np.float32)
@@ -191,9 +191,9 @@ class PointFinder:
                 break
             candidate, returned = _there_and_back(before.detail, after.detail, start, guess)
             column, row = np.clip(np.rint(candidate), 0, np.array(after.detail.shape[::-1]) - 1).astype(np.int64).T
-            found = np.linalg.norm(returned - start, axis=1) < _MAX_RETURN
+            is_back = np.linalg.norm(returned - start, axis=1) < _MAX_RETURN
             correlation = correlation_at(before.detail, after.detail, start, candidate)
-            score = np.where(found & after.usable[row, column], correlation, -1.0)
+            score = np.where(is_back & after.usable[row, column], correlation, -1.0)
             better = score > scores[rows]
             moved[rows[better]], scores[rows[better]] = candidate[better], score[better]
         alike = np.flatnonzero(scores > _MIN_CORRELATION)
@@ -215,12 +215,12 @@ class PointTracker:
         view = self.finder.view(image, mask)
         shift = 0.0
         if self.last is not None:
-            kept, moved = self._followed(self.last, view)
-            if len(kept):
-                lengths = np.linalg.norm(moved - self.last.pixels[kept], axis=1)
+            rows, moved = self._followed(self.last, view)
+            if len(rows):
+                lengths = np.linalg.norm(moved - self.last.pixels[rows], axis=1)
                 shift = float(np.median(lengths)) / max(view.detail.shape)
-            view = view.with_points(self.last.ids[kept], moved)
-            self._bridge_later(self.last, len(kept))
+            view = view.with_points(self.last.ids[rows], moved)
+            self._bridge_later(self.last, len(rows))
             view = self._bridged(view)
         view = _without_collisions(view)
         followed = len(view.ids)
@@ -237,7 +237,7 @@ class PointTracker:
         All or none: half of those that come back, and 20 at least, have to satisfy one epipolar geometry. Where both
         views of a patient showed the same wall, 23 or more did; between unrelated views at most 17, by chance.
         """
-        alike, moved = self.finder.found(before, after)
+        alike, moved = self.finder.find(before, after)
         consistent = epipolar_inliers(before.pixels[alike], moved, after.detail.shape, _MAX_ERROR)
         if consistent.sum() < max(_FEWEST, _LEAST_SHARE * len(alike)):
             return alike[:0], moved[:0]
@@ -257,8 +257,8 @@ class PointTracker:
                 continue
             lost = ~np.isin(bridge.ids, view.ids)
             before = bridge.only(lost)
-            kept, moved = self._followed(before, view)
-            view = view.with_points(before.ids[kept], moved)
+            rows, moved = self._followed(before, view)
+            view = view.with_points(before.ids[rows], moved)
         return view
 
     def _with_corners(self, view: View) -> View:
@@ -300,13 +300,13 @@ def _there_and_back(
     ends = []
     status = np.ones(len(pixels), bool)
     start = pixels
-    for index, (one, other) in enumerate(((before, after), (after, before))):
+    for index, (source, target) in enumerate(((before, after), (after, before))):
         guess = None
         if flows is not None:
             guess = start + _sampled(flows[index], start)
             options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
-        end, known, _ = cv2.calcOpticalFlowPyrLK(one, other, start, guess, **options)
-        status &= known.ravel() > 0
+        end, tracked, _ = cv2.calcOpticalFlowPyrLK(source, target, start, guess, **options)
+        status &= tracked.ravel() > 0
         ends.append(end)
         start = end
     limit = np.array(after.shape[::-1], np.float32) - 6.0

@@ -69,7 +69,7 @@ class Reconstruction:
 
     @property
     def median_depth(self) -> float:
-        """See :func:`median_depth`."""
+        """Median z-depth of the model's points over all observations, in the model's unit."""
         return median_depth(self.model)
 
     def summary(self) -> str:
@@ -181,8 +181,8 @@ def _models(video: MatchedVideo, settings: SfmSettings, progress: Progress | Non
                 _take_cameras(model, models[0])
         return [adjusted(model, video) for model in with_progress(models, "adjust models", progress)]
     refined = is_refined(settings.camera)
-    known = has_known_camera(settings.camera) and not refined
-    largest = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
+    is_fixed = has_known_camera(settings.camera) and not refined
+    largest = choose(both_signs(models[0], video, refined), (0.0, 180.0) if is_fixed else settings.camera.field_of_view)
     hypotheses = [largest]
     for model in models[1:]:
         has_its_cameras = set(model.cameras) <= set(largest.model.cameras)
@@ -216,7 +216,7 @@ def _atlas(
     progress: Progress | None = None,
 ) -> Atlas:
     """The models, those of tracks split where their sides do not hold together, and joined where they show the same."""
-    kept: list[Hypothesis] = []
+    hypotheses: list[Hypothesis] = []
     refused: list[Link] = []
     for hypothesis in chosen:
         broken: list[Link] = []
@@ -226,61 +226,62 @@ def _atlas(
         refused += broken
         frames = np.array(hypothesis.frames)
         for part in np.split(frames, np.searchsorted(frames, [link.after for link in broken], side="right")):
-            one = hypothesis
+            piece = hypothesis
             if broken and len(part) >= settings.min_model_size:
-                one = adjusted(part_of(hypothesis.model, part.tolist()), video)
-            if min(one.images, len(part)) >= settings.min_model_size:
-                pieces, moving = _rigid_stretches(one, video)
-                kept += pieces
+                piece = adjusted(part_of(hypothesis.model, part.tolist()), video)
+            if min(piece.images, len(part)) >= settings.min_model_size:
+                pieces, moving = _rigid_stretches(piece, video)
+                hypotheses += pieces
                 refused += moving
     apart: dict[int, Again] = {}
     if video.tracks:
-        video, kept, apart = join_models(video, kept, settings, masks, progress)
-    refused = [link for link in refused if not any(link.after in one.joins for one in kept)]  # not joined again
-    found = [_result(video, one, _links(one) if video.tracks else ()) for one in kept]
-    found.sort(key=lambda one: -len(one.registered))
-    posed = {index for one in found for index in one.registered}
+        video, hypotheses, apart = join_models(video, hypotheses, settings, masks, progress)
+    joined_again = {after for hypothesis in hypotheses for after in hypothesis.joins}
+    refused = [link for link in refused if link.after not in joined_again]
+    models = [_result(video, model, _links(model) if video.tracks else ()) for model in hypotheses]
+    models.sort(key=lambda model: -len(model.registered))
+    posed = {index for model in models for index in model.registered}
     lost = {index: _reason(video, index) for index in range(len(video.images)) if index not in posed}
-    for model, reason in [(model, _refusal(video, model, found[0])) for model in found]:
+    for model, reason in [(model, _refusal(video, model, models[0])) for model in models]:
         if reason is not None:
-            found.remove(model)
+            models.remove(model)
             lost |= dict.fromkeys(model.registered, reason)
     lost = dict(sorted(lost.items()))
     if lost:
         names = [video.images[index].name for index in lost]
         shown = ", ".join([*names[:10], *(["..."] if len(names) > 10 else [])])
         log.warning("%d of %d images have no pose: %s", len(lost), len(video.images), shown)
-    if len(found) > 1:
-        sizes = ", ".join(str(len(one.registered)) for one in found)
-        log.warning("%d models have %s images: what lies between them is not known", len(found), sizes)
-    atlas = Atlas(video.images, tuple(found), lost)
+    if len(models) > 1:
+        sizes = ", ".join(str(len(model.registered)) for model in models)
+        log.warning("%d models have %s images: what lies between them is not known", len(models), sizes)
+    atlas = Atlas(video.images, tuple(models), lost)
     refused += _gaps(video, atlas.submaps(), [link.after for link in refused])
     refused = [replace(link, again=apart.get(link.after)) for link in refused]
     return replace(atlas, refused=tuple(sorted(refused, key=lambda link: link.after)))
 
 
-def _rigid_stretches(one: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothesis], list[Link]]:
+def _rigid_stretches(hypothesis: Hypothesis, video: MatchedVideo) -> tuple[list[Hypothesis], list[Link]]:
     """Split a model into stretches no longer than its scene is rigid (:func:`rigid_frames`), and link these."""
-    longest = rigid_frames(one.model, video.tracks) if video.tracks else None
-    count = 1 if longest is None else min(-(-one.images // longest), one.images // _SHORT)
+    longest = rigid_frames(hypothesis.model, video.tracks) if video.tracks else None
+    count = 1 if longest is None else min(-(-hypothesis.images // longest), hypothesis.images // _SHORT)
     if longest is None or count < 2:
-        return [one], []
-    frames = one.frames
-    centers = np.array([one.model.images[frame + 1].projection_center() for frame in frames])
-    places = _far_apart(centers, count, _LEAST_EXTENT * median_depth(one.model))
+        return [hypothesis], []
+    frames = hypothesis.frames
+    centers = np.array([hypothesis.model.images[frame + 1].projection_center() for frame in frames])
+    places = _far_apart(centers, count, _LEAST_EXTENT * median_depth(hypothesis.model))
     if not places:
-        return [one], []
+        return [hypothesis], []
     stretches = [stretch.tolist() for stretch in np.split(frames, places)]
     log.warning(
         "images %s to %s: what is seen moves, as rigid for %d frames: split in %d models",
         *(video.images[frames[0]].name, video.images[frames[-1]].name, longest, len(stretches)),
     )
-    links = [replace(link_at(one.model, stretch[-1]), moves=True) for stretch in stretches[:-1]]
-    return [adjusted(part_of(one.model, stretch), video) for stretch in stretches], links
+    links = [replace(link_at(hypothesis.model, stretch[-1]), moves=True) for stretch in stretches[:-1]]
+    return [adjusted(part_of(hypothesis.model, stretch), video) for stretch in stretches], links
 
 
 def _far_apart(centers: Float[np.ndarray, "N 3"], count: int, least: float) -> list[int]:
-    """Where to split a path into so many stretches, or fewer, as each has an extent of ``least`` or more."""
+    """Places that split a path into ``count`` stretches, or fewer, as each has an extent of ``least`` or more."""
     places, extent = [0], 0.0
     for index, center in enumerate(centers):
         start = places[-1]
@@ -303,35 +304,36 @@ def _apart(links: Sequence[Link], least: int) -> list[Link]:
     return [min(group, key=lambda link: link.points) for group in groups]
 
 
-def _links(one: Hypothesis) -> tuple[Link, ...]:
+def _links(hypothesis: Hypothesis) -> tuple[Link, ...]:
     """Weak places of a model that hold, and those at which it was joined."""
-    model = one.model
+    model = hypothesis.model
     weak = {link.after: link for link in weak_links(model) if link.holds}
-    joined = {after: replace(link_at(model, after), again=again) for after, again in one.joins.items()}
+    joined = {after: replace(link_at(model, after), again=again) for after, again in hypothesis.joins.items()}
     return tuple(link for _, link in sorted({**weak, **joined}.items()))
 
 
-def _refusal(video: MatchedVideo, one: Reconstruction, largest: Reconstruction) -> str | None:
+def _refusal(video: MatchedVideo, candidate: Reconstruction, largest: Reconstruction) -> str | None:
     """Why a model of tracks is not believed: all is blurred, or it is short and held-out tracks contradict it."""
     if not video.tracks:
         return None
-    if np.median([video.tracks[index].fineness for index in one.registered]) < _LEAST_FINENESS:
+    if np.median([video.tracks[index].fineness for index in candidate.registered]) < _LEAST_FINENESS:
         return "blurred, as most images of its model"
-    if len(one.registered) >= _SHORT or one.test_error is None or largest.test_error is None:
+    if len(candidate.registered) >= _SHORT or candidate.test_error is None or largest.test_error is None:
         return None
-    if one.test_error > _WORSE * largest.test_error:
-        return f"its model of {len(one.registered)} images is {one.test_error:.1f} px from points that are followed"
+    if candidate.test_error > _WORSE * largest.test_error:
+        count, error = len(candidate.registered), candidate.test_error
+        return f"its model of {count} images is {error:.1f} px from points that are followed"
     return None
 
 
-def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], known: Sequence[int]) -> list[Link]:
+def _gaps(video: MatchedVideo, submaps: Sequence[tuple[int, range]], refused: Sequence[int]) -> list[Link]:
     """Places between models at which mapping has found no link, with the number of tracks seen from both sides."""
     gaps = []
     for (model, before), (other, after) in pairwise(submaps):
-        is_known = any(before[-1] <= place < after[0] for place in known)
+        is_known = any(before[-1] <= place < after[0] for place in refused)
         if model != other and not is_known and video.tracks:
-            one, two = (np.concatenate([video.tracks[i].ids for i in span]) for span in (before, after))
-            gaps.append(Link(before[-1], len(np.intersect1d(one, two)), None, None))
+            ids_before, ids_after = (np.concatenate([video.tracks[i].ids for i in span]) for span in (before, after))
+            gaps.append(Link(before[-1], len(np.intersect1d(ids_before, ids_after)), None, None))
     return gaps
 
 

@@ -201,20 +201,20 @@ def candidate_cameras(settings: CameraSettings, tracked: bool) -> tuple[list[Sta
 
 
 def has_known_camera(settings: CameraSettings) -> bool:
-    """Whether parameters are given or calibrated."""
+    """True if parameters are given or calibrated."""
     return settings.params is not None or settings.model in CALIBRATED
 
 
 def is_refined(settings: CameraSettings) -> bool:
-    """Whether focal length and distortion are refined."""
+    """True if focal length and distortion are refined."""
     return not has_known_camera(settings) if settings.refine is None else settings.refine
 
 
-def camera_of_lens(whole: Lens, said: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and parameters of a lens, scaled to images of its whole frame; ``said`` names it in errors."""
+def camera_of_lens(whole: Lens, origin: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a lens, scaled to images of its whole frame; ``origin`` names it in errors."""
     if abs((width / height) / (whole.width / whole.height) - 1.0) > _ASPECT_TOLERANCE:
         raise InputError(
-            f"{said}, and images of {width} x {height}",
+            f"{origin}, and images of {width} x {height}",
             f"the whole frame, {whole.width} x {whole.height} or scaled from it",
             "For cropped images, subtract the crop's corner from the principal point and pass `camera=OPENCV_FISHEYE` "
             "and `params`",
@@ -233,9 +233,11 @@ def starting_cameras(
     """One camera per image size, in order of first appearance; ``images`` are the files, for errors."""
     import pycolmap
 
-    known = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
-    if start.model not in known | set(CALIBRATED):
-        raise InputError(f"camera model {start.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(known))}")
+    colmap_models = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
+    if start.model not in colmap_models | set(CALIBRATED):
+        raise InputError(
+            f"camera model {start.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(colmap_models))}"
+        )
     if start.model in CALIBRATED and settings.params is not None:
         raise InputError(f"`params`, and `camera={start.model}`", "`params` with a model of COLMAP", "Drop `params`")
     cameras = []

@@ -81,9 +81,9 @@ def correlation_at(
         reach: Half side of the squares, pixels.
     """
     patches = [_patches(texture, at, reach) for texture, at in ((first, pixels), (second, moved))]
-    one, other = (patch - patch.mean(axis=1, keepdims=True) for patch in patches)
-    power = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
-    return np.asarray((one * other).sum(axis=1) / np.maximum(power, 1e-3))
+    centred, partners = (patch - patch.mean(axis=1, keepdims=True) for patch in patches)
+    power = np.sqrt((centred**2).sum(axis=1) * (partners**2).sum(axis=1))
+    return np.asarray((centred * partners).sum(axis=1) / np.maximum(power, 1e-3))
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
@@ -112,7 +112,7 @@ def fineness(gray: UInt8[np.ndarray, "h w"]) -> float:
     counted = ~dilated((gray >= _HIGHLIGHT) | (gray < _BLACK), _COARSE_MARGIN)
     log = np.log(gray.astype(np.float32) + _DARK_OFFSET)
     smoothed = (cv2.GaussianBlur(log, (0, 0), sigma) for sigma in (2.0, 4.0))
-    fine, coarse = (np.square(cv2.Laplacian(one, cv2.CV_32F)[counted]).sum() for one in smoothed)
+    fine, coarse = (np.square(cv2.Laplacian(smooth, cv2.CV_32F)[counted]).sum() for smooth in smoothed)
     return float(np.sqrt(fine / coarse)) if coarse > 0.0 else float("inf")
 
 

@@ -61,13 +61,13 @@ class MatchedVideo:
         """
         step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
-        kept = list(range(first, len(self.images), step))[:count]
-        row_of = {index: row for row, index in enumerate(kept)}
-        pick = itemgetter(*kept)  # of two or more, so that it gives tuples
+        chosen = list(range(first, len(self.images), step))[:count]
+        row_of = {index: row for row, index in enumerate(chosen)}
+        pick = itemgetter(*chosen)  # of two or more, so that it gives tuples
         matches = {
-            (row_of[one], row_of[other]): pairs
-            for (one, other), pairs in self.matches.items()
-            if one in row_of and other in row_of
+            (row_of[first_image], row_of[second_image]): pairs
+            for (first_image, second_image), pairs in self.matches.items()
+            if first_image in row_of and second_image in row_of
         }
         return MatchedVideo(
             pick(self.images), pick(self.names), pick(self.sizes), pick(self.keypoints), pick(self.brightness), matches
@@ -103,17 +103,17 @@ def cut_where_lost(followed: Sequence[float], longest: int) -> list[range]:
 
     ``followed`` says of each frame how much of that it shows.
     """
-    counts, done, left = np.asarray(followed), list[range](), [range(len(followed))]
-    while left:
-        window = left.pop()
+    counts, windows, uncut = np.asarray(followed), list[range](), [range(len(followed))]
+    while uncut:
+        window = uncut.pop()
         if len(window) <= longest:
-            done.append(window)
+            windows.append(window)
             continue
         # In the middle half, so that stretches are not shorter than a quarter of the longest.
         start, stop = window.start + len(window) // 4, window.start + 3 * len(window) // 4
         cut = start + int(np.argmin(counts[start:stop]))
-        left += [range(window.start, cut), range(cut, window.stop)]
-    return sorted(done, key=lambda window: window.start)
+        uncut += [range(window.start, cut), range(cut, window.stop)]
+    return sorted(windows, key=lambda window: window.start)
 
 
 def read_video(
@@ -145,8 +145,8 @@ def read_video(
         log.info("points cannot be followed from image to image: features are matched instead")
     if len(some) < len(images):
         log.info("features of %d of %d images are matched", len(some), len(images))
-    taken, own = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
-    video = _with_features(taken, own, settings, lambda row: features_of(some[row]), progress)
+    sharp_images, sharp_sizes = tuple(images[index] for index in some), tuple(sizes[index] for index in some)
+    video = _with_features(sharp_images, sharp_sizes, settings, lambda row: features_of(some[row]), progress)
     return _in_picture(video, picture)
 
 
@@ -183,15 +183,17 @@ _FEWEST_FRAMES, _FOLLOWED = 8, 60
 def _needs_tracks(
     sizes: Sequence[tuple[int, int]], images: Sequence[int], settings: SfmSettings, features_of: _FeaturesOf
 ) -> bool:
-    """Whether points are to be tracked: as the settings say, or where neighbours have few features in common."""
+    """True if points are to be tracked: as the settings say, or where neighbours have few features in common."""
     if settings.matching != "auto" or len(sizes) < _FEWEST_FRAMES or len(set(sizes)) > 1:
         return settings.matching == "tracks"
     strong = []
     for first in np.unique(np.linspace(0, len(sizes) - 2, _COMPARED).round().astype(int)).tolist():
         pair = [features_of(images[row])[0] for row in (first, first + 1)]
         matches = mutual_matches(pair[0], pair[1], settings.max_ratio, settings.max_distance)
-        one, other = (features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True))
-        inliers = epipolar_inliers(one, other, sizes[first][::-1], settings.max_error)
+        pixels_first, pixels_second = (
+            features.pixels[rows] - 0.5 for features, rows in zip(pair, matches.T, strict=True)
+        )
+        inliers = epipolar_inliers(pixels_first, pixels_second, sizes[first][::-1], settings.max_error)
         strong.append(int(inliers.sum()) >= _PLENTY)
     log.info("%d of %d pairs of neighbouring images have plenty of features in common", sum(strong), len(strong))
     return float(np.mean(strong)) < _MOST
@@ -201,7 +203,7 @@ def _looked_at(
     images: Sequence[Path], masks: Masks
 ) -> tuple[tuple[Path, ...], tuple[tuple[int, int], ...], Picture | None]:
     """Images without those that repeat the one before, their widths and heights, and the lens's picture in them."""
-    kept, sizes, repeated = list[Path](), list[tuple[int, int]](), list[str]()
+    distinct, sizes, repeated = list[Path](), list[tuple[int, int]](), list[str]()
     last, shown = None, None
     tell_of_alpha(images[0].parent, [has_alpha(path) for path in images])
     for path in images:
@@ -215,7 +217,7 @@ def _looked_at(
         if last is not None and is_repeated(last, image):
             repeated.append(path.name)
             continue
-        kept.append(path)
+        distinct.append(path)
         sizes.append((width, height))
         last = image
         if mask is not None and (shown is None or shown.shape == mask.shape):
@@ -223,14 +225,14 @@ def _looked_at(
     if repeated:
         named = ", ".join([*repeated[:10], *(["..."] if len(repeated) > 10 else [])])
         log.warning("%d of %d images repeat the one before and are left out: %s", len(repeated), len(images), named)
-    if len(kept) < 2:
+    if len(distinct) < 2:
         raise InputError(
             f"all {len(images)} images show the same",
             "images from different camera positions",
             "Give another part of the video",
         )
     picture = None if last is None or shown is None or len(set(sizes)) > 1 else Picture.in_mask(shown, last)
-    return tuple(kept), tuple(sizes), picture
+    return tuple(distinct), tuple(sizes), picture
 
 
 def _named(images: Sequence[Path]) -> tuple[str, ...]:
@@ -254,7 +256,7 @@ def _with_features(
         (first, second): mutual_matches(features[first], features[second], settings.max_ratio, settings.max_distance)
         for first, second in with_progress(pairs, "match features", progress)
     }
-    keypoints = tuple(one.keypoints for one in features)
+    keypoints = tuple(image_features.keypoints for image_features in features)
     return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches)
 
 
@@ -273,9 +275,9 @@ def _tracked(
     matches = {}
     for first in range(len(ids)):
         for second in (first + apart for apart in _APART if first + apart < len(ids)):
-            _, one, other = np.intersect1d(ids[first], ids[second], assume_unique=True, return_indices=True)
-            if len(one) >= _FEWEST_COMMON:
-                matches[first, second] = np.stack([one, other], axis=1).astype(np.uint32)
+            _, rows, partner_rows = np.intersect1d(ids[first], ids[second], assume_unique=True, return_indices=True)
+            if len(rows) >= _FEWEST_COMMON:
+                matches[first, second] = np.stack([rows, partner_rows], axis=1).astype(np.uint32)
     keypoints = tuple(frame.pixels[rows] for frame, rows in zip(points, used, strict=True))
     brightness = tuple(frame.brightness[rows].astype(np.float64) for frame, rows in zip(points, used, strict=True))
     return MatchedVideo(images, _named(images), sizes, keypoints, brightness, matches, tuple(points), tuple(ids))

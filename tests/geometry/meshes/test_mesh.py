@@ -55,9 +55,9 @@ def test_a_part_keeps_places_and_colours_of_its_triangles_only(two_triangles):
 
 
 def test_open3d_gets_the_same_mesh(two_triangles):
-    made = two_triangles.to_open3d()
-    assert made.get_surface_area() == pytest.approx(7.0)
-    assert made.vertex.positions.numpy() == pytest.approx(two_triangles.vertices)
+    converted = two_triangles.to_open3d()
+    assert converted.get_surface_area() == pytest.approx(7.0)
+    assert converted.vertex.positions.numpy() == pytest.approx(two_triangles.vertices)
 
 
 def squares(*edges: float) -> TriangleMesh:
@@ -114,11 +114,11 @@ def test_others_find_the_colours_of_a_texture(mesh, suffix, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == files
     read = trimesh.load_mesh(tmp_path / f"mesh.{suffix}", process=False)
     material = read.visual.material
-    found = np.asarray((material.baseColorTexture if suffix == "glb" else material.image).convert("RGB"))
-    assert np.array_equal(found, image)
+    texture_image = np.asarray((material.baseColorTexture if suffix == "glb" else material.image).convert("RGB"))
+    assert np.array_equal(texture_image, image)
     assert read.vertices[read.faces] == pytest.approx(mesh.vertices[mesh.triangles], abs=1e-5)
     u, v = np.moveaxis(read.visual.uv[read.faces], -1, 0)
-    colors = found[(20 * (1.0 - v)).astype(int), (30 * u).astype(int)]
+    colors = texture_image[(20 * (1.0 - v)).astype(int), (30 * u).astype(int)]
     assert np.array_equal(colors, image[row, column])
     assert read_mesh(tmp_path / f"mesh.{suffix}").colors is None
 
@@ -144,8 +144,8 @@ def test_colours_of_glb_of_every_type(kind, top, tmp_path):
     import trimesh
 
     stored = (np.array([[1.0, 0.0, 0.2]] * 3) * top).astype(kind)  # 0.2 of linear light is 124 in sRGB
-    made = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False, vertex_attributes={"_OLOR_0": stored})
-    (tmp_path / "m.glb").write_bytes(made.export(file_type="glb").replace(b"_OLOR_0", b"COLOR_0"))
+    exported = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False, vertex_attributes={"_OLOR_0": stored})
+    (tmp_path / "m.glb").write_bytes(exported.export(file_type="glb").replace(b"_OLOR_0", b"COLOR_0"))
     assert read_mesh(tmp_path / "m.glb").colors.tolist() == [[255, 0, 124]] * 3
 
 
@@ -259,11 +259,11 @@ def test_a_shifted_plane():
 
 
 def test_missing_surface_costs_recall_and_invented_surface_precision():
-    left = plane().part(plane().centers[:, 0] < 0)
-    missing = compare_meshes(left, true(plane()), COUNT).scores[1]
+    half = plane().part(plane().centers[:, 0] < 0)
+    missing = compare_meshes(half, true(plane()), COUNT).scores[1]
     # What lies within 1 mm of the edge at x = 0 still counts.
     assert (missing.precision, missing.recall) == (1.0, pytest.approx(21 / 40, abs=1e-3))
-    invented = compare_meshes(plane(), true(left), COUNT).scores[1]
+    invented = compare_meshes(plane(), true(half), COUNT).scores[1]
     assert (invented.precision, invented.recall) == (pytest.approx(21 / 40, abs=1e-3), 1.0)
     assert invented.f == pytest.approx(2 * invented.precision / (1 + invented.precision))
 

@@ -44,11 +44,11 @@ def aligned(estimate, reference, **options):
 def test_a_known_motion_is_recovered(trajectory, seed, scale, with_scale):
     transform, scale = some_transform(seed), scale if with_scale else 1.0
     target = scale * trajectory.centers @ transform[:3, :3].T + transform[:3, 3]
-    found = umeyama(trajectory.centers, target, with_scale)
+    fit = umeyama(trajectory.centers, target, with_scale)
     size = max(1.0, float(np.abs(target).max()))
-    np.testing.assert_allclose(found.points(trajectory.centers), target, rtol=0, atol=1e-9 * size)
-    assert found.scale == pytest.approx(scale, rel=1e-7)
-    np.testing.assert_allclose(found.rotation, transform[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(fit.points(trajectory.centers), target, rtol=0, atol=1e-9 * size)
+    assert fit.scale == pytest.approx(scale, rel=1e-7)
+    np.testing.assert_allclose(fit.rotation, transform[:3, :3], atol=1e-6)
 
 
 @given(seed=SEEDS, count=st.integers(4, 20))
@@ -56,10 +56,10 @@ def test_a_known_motion_is_recovered(trajectory, seed, scale, with_scale):
 def test_rotation_is_scipys(seed, count):
     rng = np.random.default_rng(seed)
     source, target = rng.normal(size=(2, count, 3))
-    found = umeyama(source, target)
+    fit = umeyama(source, target)
     expected, _ = Rotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
-    np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-6)
-    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(fit.rotation, expected.as_matrix(), atol=1e-6)
+    assert np.linalg.det(fit.rotation) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
@@ -111,12 +111,12 @@ def test_errors_by_their_definitions(delta):
     transform[:3, :3], transform[:3, 3] = result.transform.rotation, result.transform.translation
     translations, angles, positions = [], [], []
     for index in range(12):
-        true, found = reference.camera_to_world[index], estimate.camera_to_world[index]
-        absolute = np.linalg.inv(true) @ transform @ found
+        true, estimated = reference.camera_to_world[index], estimate.camera_to_world[index]
+        absolute = np.linalg.inv(true) @ transform @ estimated
         positions.append(np.linalg.norm(absolute[:3, 3]))
         if index + delta < 12:
             after, found_after = reference.camera_to_world[index + delta], estimate.camera_to_world[index + delta]
-            error = np.linalg.inv(np.linalg.inv(true) @ after) @ (np.linalg.inv(found) @ found_after)
+            error = np.linalg.inv(np.linalg.inv(true) @ after) @ (np.linalg.inv(estimated) @ found_after)
             translations.append(np.linalg.norm(error[:3, 3]))
             angles.append(np.rad2deg(np.arccos((np.trace(error[:3, :3]) - 1) / 2)))
     np.testing.assert_allclose(result.position_errors, positions)
@@ -133,11 +133,11 @@ def test_a_step_that_is_not_there(delta):
 
 def test_figures_are_json():
     result = aligned(shaken(winding(), 1), winding(), with_scale=True)
-    told = json.loads(json.dumps(result.to_json("mm"), allow_nan=False))
-    assert told["ate"]["rmse"] == result.ate.rmse
-    assert told["alignment"] == "Sim(3)"
-    assert told["frames"]["position_error"] == result.position_errors.tolist()
-    assert told["ate_share_of_path"] == pytest.approx(told["ate"]["rmse"] / winding().steps.sum())
+    report = json.loads(json.dumps(result.to_json("mm"), allow_nan=False))
+    assert report["ate"]["rmse"] == result.ate.rmse
+    assert report["alignment"] == "Sim(3)"
+    assert report["frames"]["position_error"] == result.position_errors.tolist()
+    assert report["ate_share_of_path"] == pytest.approx(report["ate"]["rmse"] / winding().steps.sum())
 
 
 def named(names, **options):

@@ -44,10 +44,10 @@ def test_pycolmap_reads_what_is_written(model):
     import pycolmap
 
     path, trajectory = model
-    found = by_pycolmap(path)
-    assert set(found) == set(NAMES)
+    poses = by_pycolmap(path)
+    assert set(poses) == set(NAMES)
     for name, expected in zip(NAMES, trajectory.camera_to_world, strict=True):
-        np.testing.assert_allclose(found[name], expected, atol=1e-10)
+        np.testing.assert_allclose(poses[name], expected, atol=1e-10)
     (camera,) = pycolmap.Reconstruction(str(path)).cameras.values()
     assert (camera.model_name, camera.width, camera.height) == ("PINHOLE", 64, 48)
     np.testing.assert_array_equal(camera.params, [61.0, 55.0, 33.5, 21.5])
@@ -210,10 +210,10 @@ def test_a_real_model_read_as_pycolmap_reads_it(shared_data, tmp_path, folder):
 
     source = shared_data / "colmap_23img" / folder
     read = colmap.read(source)
-    found = by_pycolmap(source)
-    assert read.names == tuple(sorted(found))
+    poses = by_pycolmap(source)
+    assert read.names == tuple(sorted(poses))
     assert len(read) == 23
-    np.testing.assert_allclose(read.camera_to_world, [found[name] for name in read.names], atol=1e-12)
+    np.testing.assert_allclose(read.camera_to_world, [poses[name] for name in read.names], atol=1e-12)
     assert "no common pinhole" in read.remarks[0]
     # The same model as text, observations and all.
     pycolmap.Reconstruction(str(source)).write_text(str(tmp_path))

@@ -22,12 +22,12 @@ WRITABLE = [name for name in pose_formats if format_named(name).write is not Non
 
 def same_poses(read: Trajectory, wrote: Trajectory, name: str) -> None:
     """Equal up to what the format loses: digits, and EndoGSLAM's the world."""
-    expected, found = wrote.camera_to_world, read.camera_to_world
+    expected, poses = wrote.camera_to_world, read.camera_to_world
     if name == "endogslam":
-        expected, found = (inverse(side[:1]) @ side for side in (expected, found))
+        expected, poses = (inverse(side[:1]) @ side for side in (expected, poses))
     scale = max(1.0, float(np.abs(expected).max()))
     tolerance = 1e-5 if name == "endogslam" else 1e-10  # its files are float32
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * scale)
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=tolerance * scale)
 
 
 @pytest.mark.parametrize("name", WRITABLE)
@@ -148,7 +148,7 @@ def test_trajectories_are_checked_and_summed_up():
     turned, endless = poses.copy(), poses.copy()
     turned[1, :3] *= -1.0
     endless[2, 0, 3] = np.nan
-    for made, options, message in (
+    for matrices, options, message in (
         (poses[:0], {}, r"poses of the shape \[0, 4, 4\]"),
         (poses[:, :3], {}, r"\[3, 3, 4\]"),
         (turned, {}, "pose 1: a left-handed transform"),
@@ -157,7 +157,7 @@ def test_trajectories_are_checked_and_summed_up():
         (poses, {"timestamps": np.array([0.0, 1.0, np.inf])}, "timestamps"),
     ):
         with pytest.raises(InputError, match=message):
-            Trajectory(made, **options)
+            Trajectory(matrices, **options)
     with pytest.raises(InputError, match="focal lengths and size positive"):
         Intrinsics(0.0, 1.0, 1.0, 1.0, 4, 4)
     poses = np.tile(np.eye(4), (5, 1, 1))
@@ -177,9 +177,9 @@ def test_transforms_json_is_json(tmp_path):
 def test_every_format_is_in_the_documentation():
     page = Path(__file__).parents[3].joinpath("docs/poses.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "| `" in f" {line}"]
-    told = {row[0].strip("`"): row for row in rows if row[0].strip("`") in pose_formats and len(row) > 5}
-    assert sorted(told) == list(pose_formats)
-    for name, row in told.items():
+    documented = {row[0].strip("`"): row for row in rows if row[0].strip("`") in pose_formats and len(row) > 5}
+    assert sorted(documented) == list(pose_formats)
+    for name, row in documented.items():
         assert ("mm" == row[4]) == (format_named(name).unit == "mm")
         assert {word for word in row[5].split(", ") if word} == format_named(name).keeps
         assert ("only read" in row[2]) == (format_named(name).write is None)

@@ -242,8 +242,8 @@ def test_intrinsics(tmp_path, content, frame, expected, remark):
         assert read.intrinsics is None
         assert remark in read.remarks[-1]
     else:
-        found = read.intrinsics
-        numbers = (found.fx, found.fy, found.cx, found.cy, found.width, found.height)
+        k = read.intrinsics
+        numbers = (k.fx, k.fy, k.cx, k.cy, k.width, k.height)
         np.testing.assert_allclose(numbers, expected)
         assert not read.remarks
 

@@ -78,14 +78,14 @@ def test_the_data_check_trusts_the_estimate_and_contradicts_other_poses(estimate
 
 def test_a_wall(wall, estimated):
     errors, sure = [], []
-    for one, other in zip(frames_of(estimated), frames_of(wall), strict=True):
-        assert one.name == other.name
-        np.testing.assert_array_equal(one.image, other.image)
-        np.testing.assert_allclose(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5)
-        np.testing.assert_allclose(one.camera.intrinsics_matrix, other.camera.intrinsics_matrix, atol=1e-4)
-        assert np.isfinite(one.depth).all()
-        errors.append(np.abs(one.depth.numpy() / wall_depth(other.camera) - 1.0))
-        sure.append(confidence_of(estimated, one.name))
+    for frame, true_frame in zip(frames_of(estimated), frames_of(wall), strict=True):
+        assert frame.name == true_frame.name
+        np.testing.assert_array_equal(frame.image, true_frame.image)
+        np.testing.assert_allclose(frame.camera.camera_to_world, true_frame.camera.camera_to_world, atol=1e-5)
+        np.testing.assert_allclose(frame.camera.intrinsics_matrix, true_frame.camera.intrinsics_matrix, atol=1e-4)
+        assert np.isfinite(frame.depth).all()
+        errors.append(np.abs(frame.depth.numpy() / wall_depth(true_frame.camera) - 1.0))
+        sure.append(confidence_of(estimated, frame.name))
     error, confidence = np.stack(errors), np.stack(sure)
     assert np.median(error) < 0.01
     assert np.percentile(error[confidence > 0.8], 90) < 0.03
@@ -112,10 +112,12 @@ def test_the_depth_of_training_frames_does_not_depend_on_the_images_of_test_fram
     before, after = map(contents, outs)
     test = {frame.name for frame in open_scene(wall).test_sets["test"]}
     assert len(test) == 2
-    made = [path for path in before if path.parent.name in ("depth", "confidence") and path.stem not in test]
-    assert len(made) == 2 * (COUNT - len(test))
+    training_files = [path for path in before if path.parent.name in ("depth", "confidence") and path.stem not in test]
+    assert len(training_files) == 2 * (COUNT - len(test))
     assert all(before[Path("images") / f"{name}.png"] != after[Path("images") / f"{name}.png"] for name in test)
-    changed = [path for path in [*made, Path("points.ply"), Path("transforms.json")] if before[path] != after[path]]
+    changed = [
+        path for path in [*training_files, Path("points.ply"), Path("transforms.json")] if before[path] != after[path]
+    ]
     assert bool(changed) == (split == "all-train")
 
 
@@ -159,8 +161,8 @@ def test_what_is_printed(wall, tmp_path, capsys):
     options = (*OPTIONS, "--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
     assert run("depth", "estimate", wall, "--output", out, *options) == 0
     summary, written, command = capsys.readouterr().out.splitlines()
-    told = re.fullmatch(r"6 frames, .+, 98 % of these at depths of (.+) to (.+); \d+ points", summary)
-    near, far = map(float, told.groups())
+    groups = re.fullmatch(r"6 frames, .+, 98 % of these at depths of (.+) to (.+); \d+ points", summary)
+    near, far = map(float, groups.groups())
     depths = np.concatenate([frame.depth[frame.depth_confidence >= 0.5] for frame in open_scene(out).video])
     assert [near, far] == pytest.approx(np.percentile(depths, [1.0, 99.0]), rel=2e-3)
     assert written == f"written: {out}"
@@ -294,16 +296,18 @@ def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, caplo
     frames = wall_frames(sideways(COUNT))
     nothing = write_frames(tmp_path / "nothing", noisy(frames, level), depth=False)
     assert "the depth range is unknown" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS)
-    told = ("--near", 20, "--far", 80)
-    assert "no surface that 9 frames agree on" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS, *told)
+    near_far = ("--near", 20, "--far", 80)
+    assert "no surface that 9 frames agree on" in refused(
+        capsys, nothing, "--output", tmp_path / "a", *OPTIONS, *near_far
+    )
     some = write_frames(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]], depth=False)
-    assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *told) == 0
-    found = frames_of(tmp_path / "b")
-    reason = f"mean weight of their own matches below 0.1: {found[4].name}"
+    assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *near_far) == 0
+    frames_out = frames_of(tmp_path / "b")
+    reason = f"mean weight of their own matches below 0.1: {frames_out[4].name}"
     assert f"1 of 9 frames have depth of confidence 0, {reason}" in caplog.messages
-    assert confidence_of(tmp_path / "b", found[4].name).max() == 0.0
-    assert np.isfinite(found[4].depth.numpy()).all()
-    assert (confidence_of(tmp_path / "b", found[2].name) > 0.8).mean() > 0.5
+    assert confidence_of(tmp_path / "b", frames_out[4].name).max() == 0.0
+    assert np.isfinite(frames_out[4].depth.numpy()).all()
+    assert (confidence_of(tmp_path / "b", frames_out[2].name) > 0.8).mean() > 0.5
 
 
 def test_a_prior_by_another(wall, tmp_path):

@@ -43,19 +43,19 @@ FEATURES = FeatureSettings(highlight_level=256)
 
 def test_features_give_the_range_in_any_unit():
     frames = wall_frames(sideways(8))
-    found = find_range(frames, FEATURES)
+    depth_range = find_range(frames, FEATURES)
     depths = [wall_depth(frame.camera) for frame in frames]
-    assert 0.4 * min(map(np.min, depths)) < found.near < min(map(np.min, depths))
-    assert max(map(np.max, depths)) < found.far < 3.0 * max(map(np.max, depths))
-    np.testing.assert_allclose(found.medians, [np.median(depth) for depth in depths], rtol=0.08)
+    assert 0.4 * min(map(np.min, depths)) < depth_range.near < min(map(np.min, depths))
+    assert max(map(np.max, depths)) < depth_range.far < 3.0 * max(map(np.max, depths))
+    np.testing.assert_allclose(depth_range.medians, [np.median(depth) for depth in depths], rtol=0.08)
     scaled = []
     for frame in frames:
         pose = frame.camera.camera_to_world.clone()
         pose[:3, 3] *= 1e-3
         scaled.append(dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, camera_to_world=pose)))
     smaller = find_range(scaled, FEATURES)
-    assert smaller.near == pytest.approx(1e-3 * found.near, rel=1e-6)
-    assert smaller.far == pytest.approx(1e-3 * found.far, rel=1e-6)
+    assert smaller.near == pytest.approx(1e-3 * depth_range.near, rel=1e-6)
+    assert smaller.far == pytest.approx(1e-3 * depth_range.far, rel=1e-6)
 
 
 def test_sparse_depth_of_the_scene_counts():
@@ -64,10 +64,10 @@ def test_sparse_depth_of_the_scene_counts():
     frames = [
         dataclasses.replace(frame, sparse_depth=SparseDepth(pixels, depths)) for frame in wall_frames(sideways(4, 0.0))
     ]
-    found = find_range(frames, FEATURES)
-    assert found.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
-    assert found.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
-    np.testing.assert_allclose(found.medians, 40.0, rtol=1e-5)
+    depth_range = find_range(frames, FEATURES)
+    assert depth_range.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
+    assert depth_range.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
+    np.testing.assert_allclose(depth_range.medians, 40.0, rtol=1e-5)
 
 
 def test_given_ranges_and_frames_without_features():
@@ -108,8 +108,8 @@ HALVES = [0.5 * k for k in range(12)]
     ],
 )
 def test_the_first_frame_beyond_each_baseline_on_either_side(distances, sources, expected):
-    found = chosen([float(distance) for distance in distances], sources=sources)
-    assert {frame: found[frame] for frame in expected} == expected
+    neighbours = chosen([float(distance) for distance in distances], sources=sources)
+    assert {frame: neighbours[frame] for frame in expected} == expected
 
 
 def test_a_pause_changes_no_distance():
@@ -145,17 +145,17 @@ def test_a_robust_fit_ignores_a_third_of_outliers():
     columns = np.stack([np.ones(900), rng.normal(size=900), rng.normal(size=900)], axis=1)
     values = columns @ [1.0, 2.0, -3.0]
     values[::3] += rng.uniform(20, 30, 300)
-    found = robust_fit(columns, values, np.ones(900), np.zeros(3), 1e-6)
-    np.testing.assert_allclose(found, [1.0, 2.0, -3.0], atol=0.05)
+    coefficients = robust_fit(columns, values, np.ones(900), np.zeros(3), 1e-6)
+    np.testing.assert_allclose(coefficients, [1.0, 2.0, -3.0], atol=0.05)
     np.testing.assert_array_equal(robust_fit(columns[:0], values[:0], values[:0], np.arange(3.0), 1.0), [0.0, 1.0, 2.0])
 
 
 def test_brightness_gives_depth():
     frame, depth = lit_frame()
-    known = np.log(depth).astype(np.float32)
+    log_depth = np.log(depth).astype(np.float32)
     half = FLOAT.copy()
     half[:, ::2] = 0.0
-    prior = np.exp(LightPrior().log_depth(frame, ALL, known, half, 40.0))
+    prior = np.exp(LightPrior().log_depth(frame, ALL, log_depth, half, 40.0))
     assert np.abs(prior / depth - 1.0)[5:-5, 5:-5].max() < 0.03
     # Without known depth the law of a lamp at the lens holds.
     prior = np.exp(LightPrior().log_depth(frame, ALL, NOWHERE, NOWHERE, float(np.median(depth))))
@@ -166,18 +166,18 @@ def test_completion_keeps_what_is_known_and_shifts_the_prior_to_it():
     truth = np.log(np.linspace(30.0, 40.0, 96, dtype=np.float32))[None].repeat(80, axis=0)
     support = 5.0 * FLOAT
     support[20:60, 30:60] = 0.0
-    known = np.where(support > 0.0, truth, np.float32(9.9))
-    found = complete(known, support, FLOAT, truth - np.float32(0.3), NOWHERE)
-    np.testing.assert_array_equal(found[support > 0.0], truth[support > 0.0])
-    np.testing.assert_allclose(found, truth, atol=0.01)
+    log_known = np.where(support > 0.0, truth, np.float32(9.9))
+    completed = complete(log_known, support, FLOAT, truth - np.float32(0.3), NOWHERE)
+    np.testing.assert_array_equal(completed[support > 0.0], truth[support > 0.0])
+    np.testing.assert_allclose(completed, truth, atol=0.01)
 
 
 def test_a_swept_surface_is_smooth_up_to_the_edges_of_the_image():
     columns = np.arange(96, dtype=np.float32)[None].repeat(80, axis=0)
     truth = np.where(columns < 48, 20.0, 60.0) * np.exp(0.002 * columns)
     rough = truth * np.exp(np.random.default_rng(0).normal(0.0, 0.02, truth.shape))
-    found = smooth_surface(rough.astype(np.float32), np.where(columns < 48, 0.5, -0.5).astype(np.float32))
-    error = np.abs(np.log(found / truth))
+    smooth = smooth_surface(rough.astype(np.float32), np.where(columns < 48, 0.5, -0.5).astype(np.float32))
+    error = np.abs(np.log(smooth / truth))
     assert np.median(error) < 0.005
     assert error[:, 47:49].max() < 0.05
     # Depth of half the size is brought to the image's.
@@ -241,15 +241,15 @@ def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
     half = FLOAT.copy()
     half[:, 48:] = 0.0
     prior = FilePrior.of(tmp_path, [frame])
-    found = np.exp(prior.log_depth(frame, ALL, np.log(depth).astype(np.float32), half, 40.0))
-    np.testing.assert_allclose(found, depth, rtol=2e-3)
+    fitted = np.exp(prior.log_depth(frame, ALL, np.log(depth).astype(np.float32), half, 40.0))
+    np.testing.assert_allclose(fitted, depth, rtol=2e-3)
     # Without known depth the scale is a guess.
     guess = np.exp(prior.log_depth(frame, ALL, NOWHERE, NOWHERE, 40.0))
     assert np.median(guess) == pytest.approx(40.0, rel=1e-3)
     if suffix == "npy":  # a larger map of the same aspect is taken
         np.save(tmp_path / "lit.npy", np.kron(values, np.ones((2, 2))))
-        found = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
-        np.testing.assert_allclose(np.exp(found), depth, rtol=1e-3)
+        fitted = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
+        np.testing.assert_allclose(np.exp(fitted), depth, rtol=1e-3)
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path):
@@ -273,9 +273,9 @@ def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
     clean = difference_from_neighbours(pixels, log_depth)
     np.testing.assert_array_equal(clean, 0.0)
     log_depth[40] += 0.7
-    found = difference_from_neighbours(pixels, log_depth)
-    assert found[40] == pytest.approx(0.7)
-    np.testing.assert_array_equal(np.delete(found, 40), 0.0)
+    differences = difference_from_neighbours(pixels, log_depth)
+    assert differences[40] == pytest.approx(0.7)
+    np.testing.assert_array_equal(np.delete(differences, 40), 0.0)
     assert np.isnan(difference_from_neighbours(pixels[:8], log_depth[:8])).all()
 
 
@@ -299,7 +299,7 @@ def test_costs_are_correlations_of_windows():
     mask = ones.astype(np.uint8)
     mask[6, 20] = 0
     # Pixels between four of which the first or the last is masked are not known.
-    known = (mask[:-1, :-1] & mask[1:, 1:]).astype(bool)
+    is_known = (mask[:-1, :-1] & mask[1:, 1:]).astype(bool)
     depths = np.array([1.0, 2.0], np.float32)
     sweep(ones, depths, reference, ones, other[None], mask[None], turn, shift, 1, 0.01, 1.0, cost)
     for y in (3, 6, 8):
@@ -307,7 +307,7 @@ def test_costs_are_correlations_of_windows():
             window = (slice(y - 1, y + 2), slice(x - 1, x + 2))
             for d, disparity in enumerate((2, 1)):
                 moved = (slice(y - 1, y + 2), slice(x - 1 + disparity, x + 2 + disparity))
-                there = known[moved]
+                there = is_known[moved]
                 correlation = zncc(reference[window][there], other[moved][there], 0.01)
                 assert cost[y, x, d] == pytest.approx(1.0 - correlation, abs=1e-5)
 
@@ -315,14 +315,14 @@ def test_costs_are_correlations_of_windows():
 def test_of_several_neighbours_the_best_count():
     rng = np.random.default_rng(1)
     reference, wrong = rng.normal(size=(2, 10, 10)).astype(np.float32)
-    ones, one = np.ones((10, 10), np.float32), np.ones(1, np.float32)
+    ones, factor = np.ones((10, 10), np.float32), np.ones(1, np.float32)
     turns, shifts = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)), np.zeros((2, 3), np.float32)
     cost = np.empty((10, 10, 1), np.float32)
     images, masks = np.stack([wrong, reference]), np.ones((2, 10, 10), np.uint8)
-    sweep(ones, one, reference, ones, images, masks, turns, shifts, 2, 1e-6, 0.5, cost)
+    sweep(ones, factor, reference, ones, images, masks, turns, shifts, 2, 1e-6, 0.5, cost)
     np.testing.assert_allclose(cost[3:7, 3:7, 0], 0.0, atol=1e-4)
     masks[:] = 0
-    sweep(ones, one, reference, ones, images, masks, turns, shifts, 2, 1e-6, 0.5, cost)
+    sweep(ones, factor, reference, ones, images, masks, turns, shifts, 2, 1e-6, 0.5, cost)
     assert (cost == 1.0).all()
 
 
@@ -394,29 +394,29 @@ def test_a_plane_seen_by_cameras_at_known_places():
     factors = ratios(sweep, (20.0, 80.0))
     assert factors[0] == 1.0
     assert factors[-1] == pytest.approx(4.0)
-    found, truth = swept(sweep, lambda truth: np.full(truth.shape, 20.0))
-    error = np.abs(found.depth / truth - 1.0)[INNER]
+    result, truth = swept(sweep, lambda truth: np.full(truth.shape, 20.0))
+    error = np.abs(result.depth / truth - 1.0)[INNER]
     assert np.median(error) < 0.01
     assert np.percentile(error, 90) < 0.03
-    assert np.median(found.match[INNER]) > 0.98
+    assert np.median(result.match[INNER]) > 0.98
 
 
 def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
     """A smoothness that holds to the shape of the swept surface would keep part of its error: far lumens too near."""
     across = np.linspace(-0.06, 0.06, 96)
-    found, truth = swept(SWEEPS[-1], lambda truth: truth * np.exp(across)[None])
-    error = np.log(found.depth / truth)[INNER]
+    result, truth = swept(SWEEPS[-1], lambda truth: truth * np.exp(across)[None])
+    error = np.log(result.depth / truth)[INNER]
     assert np.median(np.abs(error)) < 0.004
     trend = np.polyfit(np.broadcast_to(across, truth.shape)[INNER].ravel(), error.ravel(), 1)[0]
     assert abs(trend) < 0.1
 
 
-def voted(own, candidates, weights=None, tolerance=0.02):
+def voted(depth, candidates, weights=None, tolerance=0.02):
     candidates = np.repeat(np.array(candidates, np.float32)[:, None], 16, axis=1)
     weights = np.ones_like(candidates) if weights is None else np.repeat(np.float32(weights)[:, None], 16, axis=1)
     out = np.empty((3, 16), np.float32)
-    one = np.ones(16, np.float32)
-    vote(one * np.float32(own), one, candidates, weights, np.float32(tolerance), *out)
+    unit = np.ones(16, np.float32)
+    vote(unit * np.float32(depth), unit, candidates, weights, np.float32(tolerance), *out)
     return [float(values[0]) for values in out]
 
 

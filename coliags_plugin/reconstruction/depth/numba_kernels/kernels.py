@@ -37,7 +37,7 @@ def reproject(
     reprojected: Array,  # written: z-depth in the reference; NaN where the rays do not meet; as ``depth``
     trust: Array,  # written: weight of the neighbour's pixel; as ``depth``
 ) -> None:
-    """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess."""
+    """Intersect the rays of a camera with the depth map of another, by fixed-point iteration from a first guess."""
     rows, columns = other.shape
     values = np.zeros(4 * other.size, np.float32)
     corners(other, values, 0)
@@ -91,7 +91,7 @@ def reproject(
 @kernel
 def vote(
     depth: Array,  # the frame's own z-depth; float32 [P], P a multiple of sixteen
-    own: Array,  # its weight; float32 [P]
+    own_weight: Array,  # its weight; float32 [P]
     candidates: Array,  # z-depths by the neighbours; NaN where there is none; float32 [N, P]
     trusts: Array,  # their weights; float32 [N, P]
     tolerance: np.float32,  # relative difference from the median of one that agrees; the group is twice as wide
@@ -110,7 +110,7 @@ def vote(
             if n < len(candidates):
                 value, weight = vec.load(candidates[n], at), vec.load(trusts[n], at)
             else:
-                value, weight = vec.load(depth, at), vec.load(own, at)
+                value, weight = vec.load(depth, at), vec.load(own_weight, at)
             counts = vec.both(vec.greater(value, 0.0), vec.greater(weight, 0.0))
             value, weight = vec.select(counts, value, np.inf), vec.select(counts, weight, 0.0)
             for k in range(0, n * vec.WIDTH, vec.WIDTH):
@@ -138,7 +138,7 @@ def vote(
         for k in range(0, count, vec.WIDTH):
             grouped = vec.at_most(_distance(vec.load(values, k), centre), wide)
             inside = vec.add(inside, vec.select(grouped, vec.load(weights, k), 0.0))
-        reached, middle, found = vec.splat(0.0), centre, vec.splat(0.0)
+        reached, middle, is_found = vec.splat(0.0), centre, vec.splat(0.0)
         for k in range(0, count, vec.WIDTH):  # the median, between two values where the weight is halved between them
             value, following = vec.load(values, k), vec.load(values, k + vec.WIDTH)
             grouped = vec.at_most(_distance(value, centre), wide)
@@ -147,8 +147,8 @@ def vote(
                 vec.at_most(_distance(following, centre), wide), vec.at_most(reached, vec.mul(inside, 0.500001))
             )
             value = vec.select(halved, vec.mul(vec.add(value, following), 0.5), value)
-            half = vec.both(vec.less(found, 1.0), vec.both(grouped, vec.at_least(reached, vec.mul(inside, 0.5))))
-            middle, found = vec.select(half, value, middle), vec.select(half, 1.0, found)
+            half = vec.both(vec.less(is_found, 1.0), vec.both(grouped, vec.at_least(reached, vec.mul(inside, 0.5))))
+            middle, is_found = vec.select(half, value, middle), vec.select(half, 1.0, is_found)
         agree = away = vec.splat(0.0)
         for k in range(0, count, vec.WIDTH):
             value, weight = vec.load(values, k), vec.load(weights, k)
@@ -156,10 +156,10 @@ def vote(
             agree = vec.add(agree, vec.select(vec.at_most(difference, tolerance), weight, 0.0))
             grouped = vec.at_most(_distance(value, centre), wide)
             away = vec.add(away, vec.select(grouped, vec.mul(weight, difference), 0.0))
-        known = vec.greater(total, 0.0)
-        vec.store(fused, at, vec.select(known, middle, vec.load(depth, at)))
-        vec.store(votes, at, vec.select(known, agree, 0.0))
-        vec.store(spread, at, vec.select(known, vec.div(away, inside), 1.0))
+        has_weight = vec.greater(total, 0.0)
+        vec.store(fused, at, vec.select(has_weight, middle, vec.load(depth, at)))
+        vec.store(votes, at, vec.select(has_weight, agree, 0.0))
+        vec.store(spread, at, vec.select(has_weight, vec.div(away, inside), 1.0))
 
 
 @inline
@@ -229,23 +229,23 @@ def _warp(
             scale = vec.div(1.0, pz)
             u = vec.fma(vec.fma(vec.fma(cx, turn[0, 0], ax), z, shift[0]), scale, -0.5)
             v = vec.fma(vec.fma(vec.fma(cx, turn[1, 0], ay), z, shift[1]), scale, -0.5)
-            seen = vec.both(vec.greater(pz, vec.mul(z, 1e-3)), vec.greater(vec.load(usable, at), 0.0))
-            seen = vec.both(seen, vec.both(vec.at_least(u, 0.0), vec.less(u, columns - 1)))
-            seen = vec.both(seen, vec.both(vec.at_least(v, 0.0), vec.less(v, rows - 1)))
-            if vec.bits(seen) == 0:
+            in_view = vec.both(vec.greater(pz, vec.mul(z, 1e-3)), vec.greater(vec.load(usable, at), 0.0))
+            in_view = vec.both(in_view, vec.both(vec.at_least(u, 0.0), vec.less(u, columns - 1)))
+            in_view = vec.both(in_view, vec.both(vec.at_least(v, 0.0), vec.less(v, rows - 1)))
+            if vec.bits(in_view) == 0:
                 vec.store(warped, at, 0.0)
                 vec.store(visible, at, 0.0)
                 continue
-            u, v = vec.select(seen, u, 0.0), vec.select(seen, v, 0.0)
+            u, v = vec.select(in_view, u, 0.0), vec.select(in_view, v, 0.0)
             i, j = vec.floor(u), vec.floor(v)
             fx, fy = vec.sub(u, i), vec.sub(v, j)
             place = vec.fma(j, columns, i)
             corner, right, below, across = vec.gather_fours(values, start, place)
-            seen = vec.both(seen, vec.at_least(corner, corner))
+            in_view = vec.both(in_view, vec.at_least(corner, corner))
             top = vec.fma(fx, vec.sub(right, corner), corner)
             bottom = vec.fma(fx, vec.sub(across, below), below)
-            vec.store(warped, at, vec.select(seen, vec.fma(fy, vec.sub(bottom, top), top), 0.0))
-            vec.store(visible, at, vec.select(seen, 1.0, 0.0))
+            vec.store(warped, at, vec.select(in_view, vec.fma(fy, vec.sub(bottom, top), top), 0.0))
+            vec.store(visible, at, vec.select(in_view, 1.0, 0.0))
 
 
 @part
@@ -294,26 +294,26 @@ def _correlate(
 
 
 @part
-def _mean_of_best(scores: Array, count: int, size: int, at: int, taken: Array, lowest: Array) -> vec.Vector:
+def _mean_of_best(scores: Array, count: int, size: int, at: int, counted_of: Array, lowest: Array) -> vec.Vector:
     """One minus the mean of the best of sixteen pixels' scores; 1 where too few are known.
 
-    ``taken``: how many of so many count, 0 for too few. ``lowest`` is for those that do not, the least first.
+    ``counted_of``: how many of so many count, 0 for too few. ``lowest`` is for those that do not, the least first.
     """
     for k in range(0, len(lowest), vec.WIDTH):
         vec.store(lowest, k, np.inf)
-    total = known = vec.splat(0.0)
+    total = scored = vec.splat(0.0)
     for n in range(count):
         score = vec.load(scores, n * size + at)
         there = vec.at_least(score, score)
-        total, known = vec.add(total, vec.select(there, score, 0.0)), vec.add(known, vec.select(there, 1.0, 0.0))
+        total, scored = vec.add(total, vec.select(there, score, 0.0)), vec.add(scored, vec.select(there, 1.0, 0.0))
         score = vec.select(there, score, np.inf)
         for k in range(0, len(lowest), vec.WIDTH):
             other = vec.load(lowest, k)
             vec.store(lowest, k, vec.smaller(score, other))
             score = vec.larger(score, other)
-    counted = vec.gather(taken, 0, known)
+    counted = vec.gather(counted_of, 0, scored)
     for k in range(0, len(lowest), vec.WIDTH):
-        left_out = vec.greater(vec.sub(known, counted), k // vec.WIDTH)
+        left_out = vec.greater(vec.sub(scored, counted), k // vec.WIDTH)
         total = vec.sub(total, vec.select(left_out, vec.load(lowest, k), 0.0))
     cost = vec.larger(0.0, vec.sub(1.0, vec.div(total, counted)))
     return vec.select(vec.greater(counted, 0.0), cost, 1.0)
@@ -340,26 +340,26 @@ def sweep(
     shape = rows, columns
     wide = (width + vec.WIDTH - 1) // vec.WIDTH * vec.WIDTH
     row, size = wide + 2 * _MARGIN, height * wide
-    surface, own, counts = _framed(base, radius, row), _framed(reference, radius, row), _framed(usable, radius, row)
+    surface, guide, counts = _framed(base, radius, row), _framed(reference, radius, row), _framed(usable, radius, row)
     values = _masked_corners(images, masks)
-    warped, visible = np.zeros_like(own), np.zeros_like(own)
+    warped, visible = np.zeros_like(guide), np.zeros_like(guide)
     lines = np.empty(6 * row, np.float32)
     scores = np.empty(count * size, np.float32)
     costs = np.empty(len(ratios) * size, np.float32)
     fewest = min(count, max(2, (count + 3) // 4))
-    taken = np.zeros(count + 1, np.float32)
+    counted_of = np.zeros(count + 1, np.float32)
     left_out = 0
-    for known in range(fewest, count + 1):
-        taken[known] = np.ceil(share * known)
-        left_out = max(left_out, known - int(taken[known]))
+    for scored in range(fewest, count + 1):
+        counted_of[scored] = np.ceil(share * scored)
+        left_out = max(left_out, scored - int(counted_of[scored]))
     lowest = np.empty(left_out * vec.WIDTH, np.float32)
     for d in range(len(ratios)):
         for n in range(count):
             start = 4 * n * rows * columns
             _warp(surface, ratios[d], counts, radius, row, values, start, shape, turns[n], shifts[n], warped, visible)
-            _correlate(own, warped, visible, radius, row, floor, lines, scores, n * size)
+            _correlate(guide, warped, visible, radius, row, floor, lines, scores, n * size)
         for at in range(0, size, vec.WIDTH):
-            vec.store(costs, d * size + at, _mean_of_best(scores, count, size, at, taken, lowest))
+            vec.store(costs, d * size + at, _mean_of_best(scores, count, size, at, counted_of, lowest))
     for y in range(height):
         for x in range(width):
             for d in range(len(ratios)):
