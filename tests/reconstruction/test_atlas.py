@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import pairwise
 from types import SimpleNamespace
 
 import cv2
@@ -23,7 +22,6 @@ from coliags_plugin.reconstruction.structure.adjustment import (
     held_out_error,
     rigid_frames,
     rigidity,
-    widest_between,
 )
 from coliags_plugin.reconstruction.structure.atlas import Link, contradictions, held_part, part_of, weak_links
 from coliags_plugin.reconstruction.structure.colmap_scene import draw_ribbon, write_sfm_scene
@@ -31,7 +29,7 @@ from coliags_plugin.reconstruction.structure.features import quiet_colmap
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis
 from coliags_plugin.reconstruction.structure.image_files import list_images
 from coliags_plugin.reconstruction.structure.joining import join_models, stretches_of
-from coliags_plugin.reconstruction.structure.sfm import Atlas, _apart, reconstruct
+from coliags_plugin.reconstruction.structure.sfm import Atlas, reconstruct
 from coliags_plugin.reconstruction.structure.sfm_settings import (
     CameraSettings,
     SfmSettings,
@@ -149,6 +147,11 @@ def test_rays_of_exact_observations_meet_in_the_points():
     expected = np.array([model.points3D[number].xyz for number in rays.ids])
     np.testing.assert_allclose(points, expected, atol=1e-4)
     np.testing.assert_allclose(rays.errors(model, points), 0.0, atol=1e-3)
+    first = rays.tracks == 0
+    lines = points[0] - rays.centers[first]
+    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    widest = np.degrees(np.arccos((lines @ lines.T).min()))
+    assert widest <= rays.angles(points)[0] <= 1.5 * widest
     few = rays.only(rays.images <= 2, 2)
     assert set(few.images) == {1, 2}
     np.testing.assert_array_equal(few.sums(np.ones(len(few.tracks))), 2)
@@ -246,7 +249,7 @@ def test_the_atlas_is_written(tracked, tmp_path):
 
 
 def ribbon_colors(images, models, lost):
-    """Of every frame."""
+    """Colour of the ribbon at every frame."""
     row = draw_ribbon(Atlas(images, models, lost))[75, 20:1180]
     return [tuple(row[int((frame + 0.2) * 1160 / len(images))].tolist()) for frame in range(len(images))]
 
@@ -286,32 +289,8 @@ def test_sides_that_give_points_another_depth_contradict_each_other():
     assert contradictions(model, [Link(GAP, 9, None, None)]) == []
 
 
-def test_places_next_to_each_other_are_one():
-    links = [Link(after, points, None, None) for after, points in ((9, 40), (2, 30), (4, 20), (6, 25), (12, 8))]
-    assert [link.after for link in _apart(links, 3)] == [4, 9, 12]
-    assert [link.after for link in _apart(links, 1)] == [2, 4, 6, 9, 12]
-    assert _apart([], 3) == []
-
-
-def test_a_wall_that_moves_is_split_into_stretches_of_which_each_can_give_depth():
-    steps = np.concatenate([np.full(30, 1.0), np.full(20, 0.0), np.full(30, 1.0)])
-    centers = np.stack([np.cumsum(steps), np.zeros(80), np.zeros(80)], axis=1)
-    assert sfm._far_apart(centers, 4, 5.0) == [20, 40, 60]
-    assert sfm._far_apart(centers, 5, 18.0) == [19, 58]
-    assert sfm._far_apart(centers, 5, 50.0) == []
-    ends = [0, *sfm._far_apart(centers, 6, 12.0), 80]
-    assert all(np.ptp(centers[first:last, 0]) >= 12.0 for first, last in pairwise(ends))
-
-
-def test_the_angle_between_two_rays():
-    rays = np.array([[2.0, 0.0, 30.0], [-2.0, 0.0, 30.0], [0.0, 0.0, 1.0]])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angles = widest_between(rays, np.array([0, 0, 1]), 2)
-    np.testing.assert_allclose(angles, [np.degrees(2.0 * np.arctan(2.0 / 30.0)), 0.0], atol=1e-9)
-
-
 def measured(noise=0.0, speed=0.0):
-    """Of points seen with noise, px, each moving through the image in a direction of its own, px a frame."""
+    """Rigidity of points seen with noise, px, each moving through the image in a direction of its own, px a frame."""
     model, observed = seen_points()
     rng = np.random.default_rng(0)
     motion = speed * rng.normal(0.0, 1.0, (len(model.points3D) + 1, 2))
@@ -322,23 +301,15 @@ def measured(noise=0.0, speed=0.0):
     return rigidity(model, tracks)
 
 
-def test_a_model_without_images_has_no_limit():
-    assert rigid_frames(pycolmap.Reconstruction(), []) is None
-
-
-def test_a_rigid_scene_is_one_to_the_noise():
+def test_the_residual_of_a_rigid_motion_is_that_of_noise_or_grows_with_time():
     assert set(measured()) == {1, 2}  # farther apart too few points are common
     assert max(measured().values()) < 1e-3
-    noisy = measured(noise=0.5)
+    noisy, moving = measured(noise=0.5), measured(speed=1.0)
     # Both ends of a track are noisy, and a part of the distance to the line is fitted: 0.67 times the deviation.
     assert noisy[1] == pytest.approx(0.34, rel=0.4)
     assert noisy[2] == pytest.approx(noisy[1], rel=0.5)
-
-
-def test_a_moving_scene_is_farther_off_the_longer_it_moves():
-    moving = measured(speed=1.0)
-    assert moving[1] > 0.3
-    assert moving[2] > 1.4 * moving[1]
+    assert moving[1] > 0.3 and moving[2] > 1.4 * moving[1]
+    assert rigid_frames(pycolmap.Reconstruction(), []) is None
 
 
 @pytest.mark.parametrize(

@@ -216,7 +216,7 @@ def test_long_videos_are_cut_where_few_points_are_followed():
 
 
 def test_fineness_is_that_of_a_known_blur():
-    """Of white noise blurred by s, Laplacians smoothed by t have a power in proportion to (s^2 + t^2)^-3."""
+    """In white noise blurred by s, Laplacians smoothed by t have a power in proportion to (s^2 + t^2)^-3."""
     noise = np.random.default_rng(0).normal(0.0, 1.0, (384, 384)).astype(np.float32)
     for blur in (2.0, 3.0, 6.0):
         image = cv2.GaussianBlur(noise, (0, 0), blur)

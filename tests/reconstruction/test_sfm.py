@@ -252,7 +252,7 @@ def test_images_that_repeat_are_left_out_and_named(largest, tube, tmp_path, capl
 
 @pytest.mark.thorough
 def test_black_surroundings_move_the_cameras_centre(largest, tube, tmp_path):
-    """Of an unknown camera: the same path as of the picture alone."""
+    """An unknown camera has the same path as in the picture alone."""
     settings = SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factors=(0.63,), refine=False))
     alone = reconstruct(list_images(tube), settings).largest
     shown = np.zeros((150, 260), bool)
@@ -273,7 +273,7 @@ def test_black_surroundings_move_the_cameras_centre(largest, tube, tmp_path):
     ("match", "model", "params"),
     [
         ("camera model PINHOLES. Expected one of .*OPENCV_FISHEYE", "PINHOLES", None),
-        ("--params, and --camera c3vd", "c3vd", (1.0,)),
+        ("`params`, and `camera=c3vd`", "c3vd", (1.0,)),
         ("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", "PINHOLE", (1.0,)),
     ],
 )

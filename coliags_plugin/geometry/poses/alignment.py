@@ -216,39 +216,17 @@ class Alignment:
     matches: FrameMatches  # matched frames; ``first`` is the estimate's
     transform: Similarity  # from the estimate's world to the reference's, by the positions
     with_scale: bool  # whether the scale was estimated
-    estimate: Float[np.ndarray, "M 4 4"]  # after alignment, camera-to-world
-    reference: Float[np.ndarray, "M 4 4"]  # camera-to-world
     delta: int  # matched frames between the two poses of a relative error
-    position_errors: Float[np.ndarray, "M"]  # distance of the centres, units of the reference as all lengths here
-    # RPE, P = M - delta.
-    relative_translation_errors: Float[np.ndarray, "P"]
-    relative_rotation_errors_deg: Float[np.ndarray, "P"]
-
-    @property
-    def ate(self) -> ErrorStatistics:
-        """Absolute trajectory error, units of the reference."""
-        return ErrorStatistics.of(self.position_errors)
-
-    @property
-    def path_length(self) -> float:
-        """Length of the reference's path over the matched frames, units of the reference."""
-        return float(np.linalg.norm(np.diff(self.reference[:, :3, 3], axis=0), axis=1).sum())
+    path_length: float  # of the reference over the matched frames, units of the reference as all lengths here
+    position_errors: Float[np.ndarray, "M"]  # distances of the centres after alignment
+    ate: ErrorStatistics  # absolute trajectory error: of the position errors
+    rpe_translation: ErrorStatistics  # translation part of the relative pose error
+    rpe_rotation_deg: ErrorStatistics  # rotation part of the relative pose error, degrees
 
     @property
     def ate_share(self) -> float | None:
         """RMSE of the absolute trajectory error relative to the length of the path; None where there is no path."""
-        length = self.path_length
-        return self.ate.rmse / length if length > 0.0 else None
-
-    @property
-    def rpe_translation(self) -> ErrorStatistics:
-        """Translation part of the relative pose error, units of the reference."""
-        return ErrorStatistics.of(self.relative_translation_errors)
-
-    @property
-    def rpe_rotation_deg(self) -> ErrorStatistics:
-        """Rotation part of the relative pose error, degrees."""
-        return ErrorStatistics.of(self.relative_rotation_errors_deg)
+        return self.ate.rmse / self.path_length if self.path_length > 0.0 else None
 
     def to_json(self, unit: str) -> dict[str, Any]:
         """All results as JSON values; ``unit`` names the reference's unit of length."""
@@ -293,16 +271,17 @@ def align(
     aligned = rigid(transform.rotation @ estimated[:, :3, :3], transform.points(estimated[:, :3, 3]))
     # Relative motions in the camera frame: world frames cancel, the scale does not.
     difference = inverse(_motion(true, delta)) @ _motion(aligned, delta)
+    errors = np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1)
     return Alignment(
-        matches=matches,
-        transform=transform,
-        with_scale=with_scale,
-        estimate=aligned,
-        reference=true,
-        delta=delta,
-        position_errors=np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1),
-        relative_translation_errors=np.linalg.norm(difference[:, :3, 3], axis=1),
-        relative_rotation_errors_deg=rotation_angles_deg(difference[:, :3, :3]),
+        matches,
+        transform,
+        with_scale,
+        delta,
+        path_length=float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()),
+        position_errors=errors,
+        ate=ErrorStatistics.of(errors),
+        rpe_translation=ErrorStatistics.of(np.linalg.norm(difference[:, :3, 3], axis=1)),
+        rpe_rotation_deg=ErrorStatistics.of(rotation_angles_deg(difference[:, :3, :3])),
     )
 
 

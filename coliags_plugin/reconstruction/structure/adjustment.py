@@ -35,7 +35,7 @@ _STEPS, _ADJUSTMENT_STEPS = 8, 30
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Observations of N tracks in the frames of a model, sorted by track, as rays."""
+    """Viewing rays of the observations of N tracks in the posed frames of a model, sorted by track."""
 
     ids: Int64[np.ndarray, "N"]  # of the tracks
     tracks: Int[np.ndarray, "K"]  # which of the tracks
@@ -80,7 +80,7 @@ class Rays:
         return cls.of(model, ids, pixels)
 
     def only(self, is_kept: Bool[np.ndarray, "K"], fewest: int) -> Rays:
-        """Some of the observations: of tracks that are left with ``fewest`` or more."""
+        """Subset of the observations, of tracks that keep ``fewest`` or more."""
         lengths = np.bincount(self.tracks, is_kept, len(self.ids))
         is_kept = is_kept & (lengths >= fewest)[self.tracks]
         number = np.cumsum(lengths >= fewest) - 1
@@ -135,12 +135,20 @@ class Rays:
         return points
 
     def angles(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-        """Upper bound of the widest angle between the lines from a point to its cameras, degrees."""
-        with np.errstate(invalid="ignore"):  # NaN points
-            return widest_between(self._away(points)[0], self.tracks, len(self.ids))
+        """Upper bound of the widest angle between the lines from a point to its cameras, degrees.
+
+        It is twice the largest angle to their mean; NaN at a NaN point.
+        """
+        mean, widest = np.zeros((len(self.ids), 3)), np.zeros(len(self.ids))
+        with np.errstate(invalid="ignore"):
+            away, _ = self._away(points)
+            np.add.at(mean, self.tracks, away)
+            mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+            np.maximum.at(widest, self.tracks, np.linalg.norm(np.cross(away, mean[self.tracks]), axis=1))
+            return np.asarray(np.degrees(2.0 * np.arcsin(np.minimum(widest, 1.0))))
 
     def errors(self, model: pycolmap.Reconstruction, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:
-        """Distances of the observations from where the model sees the points, pixels; infinite behind the camera."""
+        """Reprojection errors of the observations, pixels; infinite behind the camera."""
         errors = np.full(len(self.tracks), np.inf)
         for number in np.unique(self.images).tolist():
             here, image = np.flatnonzero(self.images == number), model.images[number]
@@ -165,7 +173,7 @@ def _solved(matrices: Float[np.ndarray, "N 3 3"], vectors: Float[np.ndarray, "N 
 def held_out_error(
     model: pycolmap.Reconstruction, tracks: Sequence[FramePoints], least_angle: float = _LEAST_TEST_ANGLE
 ) -> float | None:
-    """Median distance of tracks that mapping has not used from where the model sees them, pixels; None without any.
+    """Median reprojection error of tracks that mapping has not used, pixels; None without any.
 
     Each is triangulated from three or more frames of the model; its error is the median over these. Those at rays
     within ``least_angle``, degrees, do not count.
@@ -194,7 +202,7 @@ def adjust(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]]
 
 
 def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray, "P"]], max_error: float) -> None:
-    """Replace the points of a model by those of all tracks that two or more frames see within an error, pixels."""
+    """Replace a model's points by triangulated tracks with two or more observations within ``max_error``, pixels."""
     import pycolmap
 
     for number in list(model.points3D):
@@ -215,20 +223,6 @@ def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray,
             if fits[row]:
                 track.add_element(int(rays.images[row]), int(rays.rows[row]))
         model.add_point3D(points[index], track, black)
-
-
-def widest_between(rays: Float[np.ndarray, "K 3"], points: Int[np.ndarray, "K"], count: int) -> Float[np.ndarray, "N"]:
-    """Upper bound of the widest angle between each point's rays, degrees: twice the largest angle to their mean.
-
-    ``rays`` have unit length; ``points`` are those that they belong to, of ``count``. NaN for a point with NaN rays.
-    """
-    mean = np.zeros((count, 3))
-    np.add.at(mean, points, rays)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    sines = np.linalg.norm(np.cross(rays, mean[points]), axis=1)
-    widest = np.zeros(count)
-    np.maximum.at(widest, points, sines)
-    return np.degrees(2.0 * np.arcsin(np.minimum(widest, 1.0)))
 
 
 def median_of_points(
@@ -283,7 +277,7 @@ def rigidity(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> d
 
 
 def rigid_frames(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) -> int | None:
-    """Maximum number of frames of a model for its scene to count as rigid; None: no limit by its :func:`rigidity`.
+    """Largest number of consecutive frames for which a model's scene counts as rigid; None: no limit.
 
     No frame is farther from the middle one than residuals take to reach three times that of neighbours and 0.007 of
     the focal length.
@@ -298,7 +292,7 @@ def rigid_frames(model: pycolmap.Reconstruction, tracks: Sequence[FramePoints]) 
 
 
 def _residual(first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"]) -> float | None:
-    """Median distance of tracks from the epipolar geometry of others, tangents; None for too few."""
+    """Median epipolar distance of a third of the tracks from the geometry of the others, tangents; None for too few."""
     import cv2
 
     inside = (np.linalg.norm(first, axis=1) < _WIDEST) & (np.linalg.norm(second, axis=1) < _WIDEST)

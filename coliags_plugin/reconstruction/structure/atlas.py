@@ -81,7 +81,7 @@ class Link:
 
     @property
     def reason(self) -> str:
-        """Why it holds, or not, in words."""
+        """Reason for holding or not, as a sentence."""
         if self.moves:
             return f"what is seen moves too far for one rigid model; {self.points} points are seen from both sides"
         if self.again is not None:
@@ -99,7 +99,7 @@ class Link:
 
 
 def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
-    """Places of a model, image i having ID i + 1, at which few points are seen from both sides.
+    """Places of a model at which few points are observed on both sides; image i has ID i + 1.
 
     And those that do not hold, though many points are seen from both sides, as few of these are seen for long.
     """
@@ -110,7 +110,7 @@ def weak_links(model: pycolmap.Reconstruction) -> list[Link]:
 
 
 def contradictions(model: pycolmap.Reconstruction, excluded: Sequence[Link] = ()) -> list[Link]:
-    """Places at which many points link the sides of a model but get a much different depth from either of them.
+    """Places at which many points link the sides of a model, but triangulate to very different depths from either side.
 
     A part of the model is too large or too small there. Of neighbouring places the worst, and none near those that are
     ``excluded``; image i has ID i + 1.
@@ -133,13 +133,13 @@ def contradictions(model: pycolmap.Reconstruction, excluded: Sequence[Link] = ()
 
 
 def link_at(model: pycolmap.Reconstruction, after: int) -> Link:
-    """The place of a model after one of its frames, image i having ID i + 1."""
+    """Link of a model after one of its frames; image i has ID i + 1."""
     frames = np.array(sorted(model.reg_image_ids()), np.int64) - 1
     return _link(Rays.of_points(model), frames, after, always_measured=True)
 
 
 def _link(rays: Rays, frames: Int64[np.ndarray, "M"], after: int, always_measured: bool = False) -> Link:
-    """The link after one of a model's frames, its scales compared where few points carry it, or always."""
+    """Link after one of a model's frames; scales are compared where few points carry it, or always."""
     first, last = rays.spans
     common, place = (first <= after + 1) & (last > after + 1), int(np.searchsorted(frames, after))
     far = frames[max(0, place + 1 - _REACH)], frames[min(len(frames) - 1, place + _REACH)]
@@ -151,7 +151,7 @@ def _link(rays: Rays, frames: Int64[np.ndarray, "M"], after: int, always_measure
 
 
 def _measured(rays: Rays, after: int) -> Link:
-    """The link by points seen from both sides, with the ratio of their depths triangulated from either side alone."""
+    """Link with the ratio of the depths to which common points triangulate from either side alone."""
     is_before = rays.images - 1 <= after
     if not len(rays.ids):
         return Link(after, 0, None, None)
@@ -172,7 +172,7 @@ def _measured(rays: Rays, after: int) -> Link:
 
 
 def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.Reconstruction:
-    """The model with some of its frames alone, image i having ID i + 1, and with the points that two of them see."""
+    """Copy of a model with some of its frames and the points that two of these observe; image i has ID i + 1."""
     import pycolmap
 
     part = pycolmap.Reconstruction(model)
@@ -186,7 +186,7 @@ def part_of(model: pycolmap.Reconstruction, frames: Sequence[int]) -> pycolmap.R
 
 
 def held_part(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The model without images whose poses are not believed; itself if there are none. Image i has ID i + 1.
+    """Model without images of implausible pose, itself if there are none; image i has ID i + 1.
 
     These see too few of its points, or points at a depth that is another by orders: a part whose scale nothing holds;
     or they are turned far from those before and after them, which agree.

@@ -49,7 +49,7 @@ _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model after bundle adjustment, and what tells it from others."""
+    """A bundle-adjusted model, and what it is compared with others by."""
 
     model: pycolmap.Reconstruction
     correlation: float | None  # of log brightness with log depth; None: unknown
@@ -113,7 +113,7 @@ class Hypothesis:
         return all(plausible[0] <= view <= plausible[1] for view in self.fields_of_view)
 
     def described(self) -> str:
-        """Camera, counts, error and light in words."""
+        """Description of camera, counts, error and light, for logs and errors."""
         light = "unknown" if self.correlation is None else f"{self.correlation:.2f}"
         return (
             f"{self.camera_model}, focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees), "
@@ -124,7 +124,7 @@ class Hypothesis:
 
 
 def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> Hypothesis:
-    """The :func:`best` model of plausible nominal field of view, degrees; all, the most likely first, are logged."""
+    """Choose the :func:`best` model of plausible nominal field of view, degrees, and log all of them."""
     for hypothesis in hypotheses:
         log.info("%s", hypothesis.described())
     candidates = [hypothesis for hypothesis in hypotheses if hypothesis.is_plausible(plausible)]
@@ -140,7 +140,7 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
 
 
 def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
-    """The best of models, at least one: explaining the images as well as any; lit from the camera; exact; undistorted.
+    """Choose a model by completeness, then light from the camera, then reprojection error, then least distortion.
 
     Where errors hardly differ, the first (most likely) of each camera model is left, as focal length and distortion
     compensate each other; of these, that with the least distortion is taken, as a lens is near the law it was made for.
@@ -158,7 +158,7 @@ def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
 def fitting_focal_lengths(
     hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]
 ) -> list[float]:
-    """Focal lengths, pixels, of the chosen model and of others, as plausible and lit, that fit nearly as well."""
+    """Focal lengths, pixels, of the chosen model and of plausible rivals with nearly the same reprojection error."""
     rivals = _explaining([hypothesis for hypothesis in hypotheses if hypothesis.is_plausible(plausible)])
     if chosen.is_lit_from_the_camera:
         rivals = [rival for rival in rivals if rival.is_lit_from_the_camera]
@@ -167,7 +167,7 @@ def fitting_focal_lengths(
 
 
 def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Models that explain the images as well as any."""
+    """Models with nearly the most registered images and observations."""
     images = max((hypothesis.images for hypothesis in hypotheses), default=0)
     complete = [hypothesis for hypothesis in hypotheses if hypothesis.images >= _ENOUGH_IMAGES * images]
     observations = max((hypothesis.observations for hypothesis in complete), default=0)
@@ -226,7 +226,7 @@ def find_camera(
     models: Sequence[pycolmap.Reconstruction] = (),
     progress: Progress | None = None,
 ) -> Start:
-    """Camera model and focal length of a video: those to map its features with, or of its tracks' ``models``.
+    """Estimate the camera model and focal length of a video, from its features or from ``models`` of its tracks.
 
     First lenses of one focal length are tried, then the other focal lengths with the best lens.
     """
@@ -254,7 +254,7 @@ def find_camera(
 
 
 def _trial_on_features(video: MatchedVideo, settings: SfmSettings) -> _Trial:
-    """Trial of cameras by the models that the middle of a video has with them, bundle-adjusted (:func:`choose`).
+    """Make the trial of cameras on features: the middle of the video is mapped with each, and :func:`choose` decides.
 
     Where no model is plausible, the first camera is the best.
     """
@@ -287,7 +287,7 @@ _MOVED = 0.0015
 
 
 def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings) -> _Trial:
-    """Trial of cameras by held-out tracks of the middle of the largest models; of equal ones the first is the best."""
+    """Make the trial of cameras on tracks, by held-out ones in the middle of the largest models; ties: the first."""
     large = [model for model in models[:_TRIED_MODELS] if model.num_reg_images() >= _FEWEST_TRIED] or models[:1]
     parts = [_middle_of(model, video, settings.search_images) for model in large]
     errors: dict[Start, float] = {}
@@ -307,7 +307,7 @@ def _trial_on_tracks(models: Sequence[pycolmap.Reconstruction], video: MatchedVi
 
 
 def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) -> pycolmap.Reconstruction:
-    """The model with at most ``count`` images around its middle, of those before which the camera has moved."""
+    """Part of a model: at most ``count`` images around its middle, of those before which the camera has moved."""
     every = [number - 1 for number in sorted(model.reg_image_ids())]
     frames = [frame for frame in every if video.tracks[frame].shift >= _MOVED]
     frames = frames if len(frames) >= _FEWEST_TRIED else every
@@ -318,7 +318,7 @@ def _middle_of(model: pycolmap.Reconstruction, video: MatchedVideo, count: int) 
 def _test_error(
     parts: Sequence[pycolmap.Reconstruction], video: MatchedVideo, settings: SfmSettings, start: Start
 ) -> float:
-    """Geometric mean over the models of the error of held-out tracks with a camera, pixels; infinite if unknown."""
+    """Geometric mean over models of the held-out error with a camera, pixels; infinite if unknown."""
     import pycolmap
 
     errors = []
@@ -339,7 +339,7 @@ def with_camera(model: pycolmap.Reconstruction, video: MatchedVideo, settings: S
 
 
 def adjusted(model: pycolmap.Reconstruction, video: MatchedVideo) -> Hypothesis:
-    """The model adjusted by all tracks, reversed in depth if the lamp tells so, without images that few points hold."""
+    """Adjust a model by all its tracks, reverse its depth if the lamp tells so, and drop images of implausible pose."""
     adjust(model, video.track_ids)
     chosen = best(both_signs(model, video, refined=False))
     if chosen.is_reversed:

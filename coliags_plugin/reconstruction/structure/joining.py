@@ -107,7 +107,7 @@ def join_models(
 
 
 def stretches_of(models: Sequence[Sequence[int]], cuts: Set[int]) -> list[range]:
-    """Stretches of a video in which all frames with a pose are of one model, and that no cut, after a frame, divides.
+    """Stretches of a video whose posed frames are of one model, divided after the frames in ``cuts``.
 
     Models are given by their frames.
     """
@@ -152,7 +152,7 @@ class _Sighting:
 
 
 class _Comparison:
-    """Compares frames of models of a video."""
+    """Comparison of frames of different models of a video."""
 
     def __init__(self, video: MatchedVideo, settings: SfmSettings, masks: Masks) -> None:
         self.video, self.seed = video, settings.seed
@@ -167,7 +167,7 @@ class _Comparison:
     def agreeing(
         self, first_model: Hypothesis, earlier: range, second_model: Hypothesis, later: range
     ) -> list[_Sighting]:
-        """Comparisons of the frames at the ends of two stretches that give one similarity, the most typical first.
+        """Sightings between the ends of two stretches that agree on a similarity, the most typical first.
 
         Empty if too little of it agrees.
         """
@@ -210,7 +210,7 @@ class _Comparison:
     def _sighting(
         self, source: _Posed, target: _Posed, seen_by: Hypothesis, forwards: bool
     ) -> tuple[Int64[np.ndarray, "K"], Float32[np.ndarray, "K 2"], Similarity] | None:
-        """Points of the source found in the target: tracks, pixels, and the similarity from later to earlier model."""
+        """Find a frame's points in another model's frame; tracks, pixels, and the similarity from later to earlier."""
         import pycolmap
 
         rows, moved = self.finder.find(source.view, target.view)
@@ -240,13 +240,13 @@ class _Comparison:
 
 
 def _between(pose: Float[np.ndarray, "3 4"], same: Float[np.ndarray, "3 4"], factor: float) -> Similarity:
-    """The similarity from the second to the first world, by one camera's pose in both and the ratio of lengths."""
+    """Similarity from the second to the first world, from a camera's pose in both and the ratio of lengths."""
     rotation = pose[:, :3].T @ same[:, :3]
     return Similarity(factor, rotation, pose[:, :3].T @ (factor * same[:, 3] - pose[:, 3]))
 
 
 def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
-    """The largest set of sightings with nearly one similarity, its most typical first."""
+    """Largest set of sightings that agree on a similarity, the most typical first."""
     similarities = [sighting.similarity for sighting in sightings]
     scales = np.log([similarity.scale for similarity in similarities])
     rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in similarities]))
@@ -265,13 +265,13 @@ def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
 
 
 def _again(sightings: Sequence[_Sighting], before: int) -> Again:
-    """The record of a join: number of agreeing comparisons, and the spread of their scales."""
+    """Record of a join, with the spread of the scales of its comparisons."""
     scales = np.log([sighting.similarity.scale for sighting in sightings])
     return Again(before, len(sightings), round(float(scales.std()), 4))
 
 
 def _with_sightings(video: MatchedVideo, sightings: Sequence[_Sighting]) -> MatchedVideo:
-    """The video with the points that were found again among those of its frames."""
+    """Video with the observations of sightings added to its frames."""
     keypoints, brightness, track_ids = list(video.keypoints), list(video.brightness), list(video.track_ids)
     for sighting in sightings:
         frame = sighting.seen_in

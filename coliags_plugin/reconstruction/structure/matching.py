@@ -58,7 +58,7 @@ class Pose:
 
     @classmethod
     def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
-        """The camera, of an image of another width and height if they are given."""
+        """Pose of a camera, with intrinsics for an image of another width and height if they are given."""
         intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
         return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
 
@@ -81,13 +81,13 @@ class Pose:
         return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
 
     def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
-        """A and b with which pixel p at z-depth z lies at A (p, 1) z + b in another view, homogeneous."""
+        """A and b that map pixel p at z-depth z to the homogeneous pixel A (p, 1) z + b of another view."""
         rotation, translation = self.to(other)
         turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
         return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
 
     def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
-        """The a and b with which pixel p of another view at z-depth z has z-depth a . (p, 1) z + b here."""
+        """Vector a and number b that map pixel p of another view at z-depth z to z-depth a . (p, 1) z + b here."""
         rotation, translation = other.to(self)
         return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
 
@@ -117,7 +117,7 @@ def _best(groups: Int[np.ndarray, "K"], similarity: Float[np.ndarray, "K"], coun
 
 
 def _joined(values: Int[np.ndarray, "A"], others: Int[np.ndarray, "B"]) -> tuple[np.ndarray, np.ndarray]:
-    """All index pairs at which the two arrays hold the same number, as in a join. [P], [P]"""
+    """Index pairs of equal numbers in two arrays, as in a database join. [P], [P]"""
     order = np.argsort(others, kind="stable")
     start, end = (np.searchsorted(others[order], values, side=side) for side in ("left", "right"))
     counts = end - start
@@ -135,7 +135,7 @@ _FEWEST_MATCHES = 20
 def epipolar_inliers(
     first: Float[np.ndarray, "K 2"], second: Float[np.ndarray, "K 2"], shape: tuple[int, ...], max_error: float
 ) -> Bool[np.ndarray, "K"]:
-    """Matches that satisfy one essential matrix of a typical endoscope; none where there are fewer than 20. [K]
+    """True for inliers of an essential matrix with a typical endoscope's camera; none of fewer than 20 matches. [K]
 
     Args:
         first: Column and row, pixel centres at integers.

@@ -25,7 +25,7 @@ from coliags_plugin.reconstruction.structure.texture import correlation_at, fine
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """Points that are followed, in one frame.
+    """Tracked points of one frame.
 
     Attributes:
         ids: Numbers of the tracks, ascending. [K]
@@ -66,7 +66,7 @@ def track_between(
     masks: Sequence[Bool[np.ndarray, "H W"] | None],
     settings: TrackSettings | None = None,
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]:
-    """Pixels, in the first and in the last of consecutive RGB images of one size, of points followed through all.
+    """Track points through consecutive RGB images of one size; their pixels in the first and in the last.
 
     Masks are False where a pixel is ignored; pixel centres are at integers + 0.5. Points that are lost on the way are
     not searched for again.
@@ -83,7 +83,7 @@ def track_between(
 def track_points(
     images: Sequence[Path], settings: TrackSettings, masks: Masks = None, progress: Progress | None = None
 ) -> list[FramePoints]:
-    """Follow points through the frames of a video, of one size and in order; a few frames are held at a time.
+    """Track points through the frames of a video, of one size and in order, holding a few frames at a time.
 
     Around frames in which most points are lost, corners are also followed backwards: what is seen well after a fast
     turn is often found in the blurred frames before it.
@@ -113,7 +113,7 @@ def track_points(
 
 
 def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
-    """Stretches of frames around those in which few points survive."""
+    """Stretches of frames around those in which few tracks survive."""
     near = np.zeros(len(followed), bool)
     for index, count in enumerate(followed):
         if index and count < settings.bridge_below:
@@ -124,7 +124,7 @@ def _around(followed: Sequence[int], settings: TrackSettings) -> list[range]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Textures of one reduced image, the points in it (pixel centres at integers), and frames since it was seen."""
+    """A reduced image prepared for tracking, with points in it (pixel centres at integers)."""
 
     detail: UInt8[np.ndarray, "h w"]
     folds: UInt8[np.ndarray, "h w"]
@@ -154,7 +154,7 @@ class View:
 
 
 class PointFinder:
-    """Finds the points of one image in another, by the likeness of their surroundings alone."""
+    """Search for the points of one image in another, by correlation of their surroundings alone."""
 
     def __init__(self, settings: TrackSettings) -> None:
         import cv2
@@ -178,7 +178,7 @@ class PointFinder:
         return View(*wall_textures(small, mask), *none, stretch, sharpness(gray), fineness(gray))
 
     def find(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
-        """Indices of the points of one view that are found in another one, and where."""
+        """Rows and new pixels of the points of one view that another shows, by correlation alone."""
         if not len(before.ids):
             return np.empty(0, np.int64), np.empty((0, 2), np.float32)
         flows = self.flow.calc(before.folds, after.folds, None), self.flow.calc(after.folds, before.folds, None)
@@ -201,7 +201,7 @@ class PointFinder:
 
 
 class PointTracker:
-    """State between frames: the last view, and views before frames in which most points were lost."""
+    """Point tracker with the last view, and the views before frames in which most points were lost."""
 
     def __init__(self, settings: TrackSettings, first_id: int = 0) -> None:
         self.settings = settings
@@ -232,7 +232,7 @@ class PointTracker:
         return FramePoints(view.ids[order], pixels, brightness, followed, shift, view.sharpness, view.fineness)
 
     def _followed(self, before: View, after: View) -> tuple[Int64[np.ndarray, "N"], Float32[np.ndarray, "N 2"]]:
-        """Indices of the points of one view that are found in another one, and where.
+        """Rows and new pixels of the points of one view that another shows, with the epipolar check.
 
         All or none: half of those that come back, and 20 at least, have to satisfy one epipolar geometry. Where both
         views of a patient showed the same wall, 23 or more did; between unrelated views at most 17, by chance.
@@ -280,7 +280,7 @@ class PointTracker:
 
 
 def _without_collisions(view: View) -> View:
-    """The view without points that have met an older one."""
+    """View without points that have met an older track."""
     order = np.argsort(view.ids)
     cells = np.floor(view.pixels[order] / 4.0).astype(np.int64)
     _, first = np.unique(cells[:, 1] * 100_000 + cells[:, 0], return_index=True)
@@ -293,7 +293,7 @@ def _there_and_back(
     pixels: Float32[np.ndarray, "K 2"],
     flows: tuple[Float32[np.ndarray, "h w 2"], Float32[np.ndarray, "h w 2"]] | None,
 ) -> tuple[Float32[np.ndarray, "K 2"], Float32[np.ndarray, "K 2"]]:
-    """Points followed by Lucas-Kanade, from dense flow or from coarse to fine; and followed back, infinity if lost."""
+    """Track points by Lucas-Kanade, from dense flow or coarse to fine, and back again; infinity if lost."""
     import cv2
 
     options: dict[str, Any] = {"winSize": (21, 21), "criteria": (3, 20, 0.02), "maxLevel": 3 if flows is None else 1}

@@ -297,7 +297,7 @@ def test_sides_do_not_matter_for_angles():
 
 
 def test_open3d_agrees():
-    """Its point-to-point measures of dense samples are ours, up to the spacing of the samples."""
+    """Open3d's point-to-point measures of dense samples are ours, up to the spacing of the samples."""
     generator = np.random.default_rng(5)
     mesh = sphere(20.0)
     rough = replace(mesh, vertices=mesh.vertices + generator.normal(0, 0.5, mesh.vertices.shape).astype(np.float32))

@@ -20,14 +20,14 @@ SCALES = st.floats(0.01, 100.0)
 
 
 def moved(trajectory, transform, scale=1.0):
-    """The same cameras in another world."""
+    """A copy of a trajectory in another world."""
     poses = transform @ trajectory.camera_to_world
     poses[:, :3, 3] = scale * (transform[:3, :3] @ trajectory.centers.T).T + transform[:3, 3]
     return Trajectory(poses)
 
 
 def shaken(trajectory, seed, size=0.5):
-    """The same cameras, each a little off."""
+    """A copy of a trajectory with noise on each pose."""
     rng = np.random.default_rng(seed)
     poses = trajectory.camera_to_world.copy()
     poses[:, :3, 3] += rng.normal(0.0, size, (len(poses), 3))
@@ -120,9 +120,14 @@ def test_errors_by_their_definitions(delta):
             translations.append(np.linalg.norm(error[:3, 3]))
             angles.append(np.rad2deg(np.arccos((np.trace(error[:3, :3]) - 1) / 2)))
     np.testing.assert_allclose(result.position_errors, positions)
-    np.testing.assert_allclose(result.relative_translation_errors, translations)
-    np.testing.assert_allclose(result.relative_rotation_errors_deg, angles, rtol=1e-6)
-    assert result.ate.rmse == pytest.approx(np.sqrt(np.mean(np.square(positions))))
+    for errors, spread in (
+        (positions, result.ate),
+        (translations, result.rpe_translation),
+        (angles, result.rpe_rotation_deg),
+    ):
+        rmse = np.sqrt(np.mean(np.square(errors)))
+        expected = [rmse, np.mean(errors), np.median(errors), np.max(errors)]
+        assert list(vars(spread).values()) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("delta", [0, -1, 12, 100])

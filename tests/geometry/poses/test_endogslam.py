@@ -18,7 +18,7 @@ FRAMES, GAUSSIANS = 5, 7
 
 
 def params(**changes):
-    """What EndoGSLAM writes, with other values or without some keys (None)."""
+    """Arrays as EndoGSLAM writes them, with other values or without some keys (None)."""
     rng = np.random.default_rng(3)
     arrays = {
         "means3D": rng.normal(size=(GAUSSIANS, 3)),
@@ -103,9 +103,6 @@ def test_one_message_names_every_fault(tmp_path):
         "org_width holds <U4, not numbers",
     ):
         assert fault in str(caught.value)
-
-
-def test_no_poses_at_all(tmp_path):
     nothing = {"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0))}
     with pytest.raises(InputError, match="no frames"):
         endogslam.read_params(saved(tmp_path / "params.npz", **nothing, gt_w2c_all_frames=np.ones((0, 4, 4))))

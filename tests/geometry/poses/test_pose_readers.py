@@ -27,12 +27,6 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 HALF = np.sqrt(0.5)
 
 
-def test_quaternions_are_w_first():
-    found = rotations_from_wxyz(np.array([[HALF, 0, 0, HALF]]), str, unit=True)
-    np.testing.assert_allclose(found[0], QUARTER, atol=1e-15)
-    np.testing.assert_allclose(wxyz_from_rotations(QUARTER[None]), [[HALF, 0, 0, HALF]], atol=1e-15)
-
-
 @given(st.lists(st.floats(-10, 10), min_size=4, max_size=4))
 @settings(max_examples=50, deadline=None)
 def test_quaternions_by_the_formula(numbers):
@@ -246,14 +240,12 @@ def test_intrinsics(tmp_path, content, frame, expected, remark):
         numbers = (k.fx, k.fy, k.cx, k.cy, k.width, k.height)
         np.testing.assert_allclose(numbers, expected)
         assert not read.remarks
-
-
-def test_different_cameras_are_no_common_intrinsics(tmp_path):
-    path = transforms(tmp_path / "t.json", [some_transform(0)] * 2, **PINHOLE)
-    content = json.loads(path.read_text())
-    content["frames"][1]["fl_x"] = 99.0
-    path.write_text(json.dumps(content))
-    assert nerfstudio.read(path).remarks == ("no common pinhole: the images have 2 different cameras",)
+    if content is PINHOLE:
+        changed = json.loads((tmp_path / "t.json").read_text())
+        changed["frames"][1]["fl_x"] = 99.0
+        (tmp_path / "t.json").write_text(json.dumps(changed))
+        several = nerfstudio.read(tmp_path / "t.json").remarks
+        assert several == ("no common pinhole: the images have 2 different cameras",)
 
 
 def frames(matrix, **content):

@@ -45,7 +45,7 @@ def estimated(wall, tmp_path_factory):
 
 
 def refused(capsys, *argv):
-    """What a command that must fail says, in one line."""
+    """Message, in one line, of a command that must fail."""
     return " ".join(commands.refused(capsys, "depth", "estimate", *argv).split())
 
 

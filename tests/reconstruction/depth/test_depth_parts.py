@@ -112,14 +112,11 @@ def test_the_first_frame_beyond_each_baseline_on_either_side(distances, sources,
     assert {frame: neighbours[frame] for frame in expected} == expected
 
 
-def test_a_pause_changes_no_distance():
+def test_a_pause_changes_no_distance_and_frames_turned_away_are_no_neighbours():
     moving = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     paused = moving[:3] + [3.0] * 50 + moving[4:]
     for index in (3, 30, 52):
         assert [paused[other] for other in chosen(paused)[index]] == [1.0, 2.0, 4.0, 5.0]
-
-
-def test_frames_turned_away_are_no_neighbours():
     axes = np.tile([0.0, 0.0, 1.0], (5, 1))
     axes[3] = [1.0, 0.0, 0.0]
     assert 3 not in chosen([1.0 * k for k in range(5)], axes=axes)[1]
@@ -279,11 +276,8 @@ def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
     assert np.isnan(difference_from_neighbours(pixels[:8], log_depth[:8])).all()
 
 
-NO_HIGHLIGHTS = FeatureSettings(highlight_level=256)
-
-
 def zncc(first, second, floor):
-    """Of two windows, by the definition."""
+    """Zero-mean normalised cross-correlation of two windows, by its definition."""
     a, b = first - first.mean(), second - second.mean()
     return (a * b).mean() / np.sqrt(((a**2).mean() + floor) * ((b**2).mean() + floor))
 
@@ -382,7 +376,7 @@ INNER = (slice(12, -12), slice(16, -16))
 def swept(sweep, base_of):
     """The middle one of five frames swept from a surface that is made of its true depth, and that depth."""
     frames = wall_frames(sideways(5))
-    guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
+    guides = [guide_of(frame, 1, FEATURES) for frame in frames]
     truth = wall_depth(frames[2].camera)
     factors, base = ratios(sweep, (20.0, 80.0)), base_of(truth).astype(np.float32)
     others = [guides[k] for k in (0, 1, 3, 4)]
