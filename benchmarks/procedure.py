@@ -44,9 +44,9 @@ from coliags_plugin.geometry.poses.alignment import Similarity
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_images, read_points
 from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.pipeline.contents import SegmentContents, SubmapContents, read_contents
-from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import Record
+from coliags_plugin.pipeline.steps import Submap
 from coliags_plugin.reporting.video import write_video
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.visibility import CoverageView, Level

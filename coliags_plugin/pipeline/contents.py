@@ -17,10 +17,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.datamanagers.colmap import AtlasJoin, AtlasRecord, read_atlas
 from coliags_plugin.datamanagers.scene_settings import Unit
-from coliags_plugin.pipeline.context import Submap
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
+from coliags_plugin.pipeline.steps import Submap
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
 _FRAME_NAME = re.compile(r"frame_(\d+)")

@@ -16,7 +16,7 @@ from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents
-from coliags_plugin.pipeline.context import Submap
+from coliags_plugin.pipeline.steps import Submap
 
 #: Name of the record of an export, and version of its schema.
 MANIFEST, _FORMAT = "manifest.json", 1

@@ -153,14 +153,7 @@ def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
-def motion(
-    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
-) -> float:
-    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few."""
-    return motion_and_survival(before, after, mask)[0]
-
-
-def motion_and_survival(
+def corner_motion(
     before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> tuple[float, float]:
     """Median displacement of corners as a share of the larger side, infinity for too few, and the share followed.

@@ -20,7 +20,7 @@ from coliags_plugin.pipeline.frame_selection import (
     RESTING,
     THINNED,
     blurred_frames,
-    motion,
+    corner_motion,
     reduced,
     sharpest_frames,
 )
@@ -46,6 +46,7 @@ class KeptFrame(_Part):
     frame: int  # number in the video
     name: FrameName
     blurred: bool  # of use for poses alone
+    sharpness: float = 0.0
 
 
 class DroppedFrame(_Part):
@@ -53,13 +54,20 @@ class DroppedFrame(_Part):
 
     frame: int
     why: str
+    sharpness: float = 0.0
 
 
 class FramesRecord(_Part):
-    """Content of ``frames.json``, as far as it is read again."""
+    """Content of ``frames.json``."""
 
     kept: list[KeptFrame]
-    dropped: list[DroppedFrame]
+    dropped: list[DroppedFrame]  # but those that were thinned out
+    source: str = ""  # name of the video
+    frames: int = 0  # that it has
+    every: int = 1
+    deinterlaced: bool = False
+    size: list[int] = []  # width and height, pixels
+    masked: float | None = None  # share of the image; None: there is no mask
 
     @classmethod
     def read(cls, folder: Path) -> FramesRecord | None:
@@ -80,23 +88,21 @@ def write_frames(
     By a survey of these frames, whose mask is used unless one is given. Replaces the folder; returns a summary of one
     line.
     """
-    given = None if mask is None else read_mask(mask, colored=True)
-    sharpnesses, size, total = survey.sharpness.tolist(), survey.size, len(survey)
-    if given is not None and given.shape != size:
+    used = survey.mask if mask is None else read_mask(mask, colored=True)
+    sharpnesses, (height, width), total = survey.sharpness.tolist(), survey.size, len(survey)
+    if used is not None and used.shape != survey.size:
         raise InputError(
-            f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
-            "a mask of the frames' size",
+            f"{mask} is {used.shape[1]} x {used.shape[0]}, the frames {width} x {height}", "a mask of the frames' size"
         )
-    used = survey.mask if given is None else given
     chosen, dropped = sharpest_frames(sharpnesses, settings, survey.times)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
-        kept, last, left = [], None, set(chosen)
+        kept, last, left = list[tuple[int, str]](), None, set(chosen)
         for index, (name, image) in enumerate(watched(source, "write frames", progress)):
             if index not in left:
                 continue
             gray = reduced(image)
-            if last is not None and motion(last, gray, used) < settings.least_motion:
+            if last is not None and corner_motion(last, gray, used)[0] < settings.least_motion:
                 dropped[index] = RESTING
                 continue
             last = gray
@@ -113,34 +119,28 @@ def write_frames(
             )
         if used is not None:
             write_mask(scratch / MASK, used)
-        write_json(
-            scratch / RECORD,
-            {
-                "source": source.path.name,
-                "frames": total,
-                "every": settings.every,
-                "deinterlaced": bool(source.span.deinterlace),
-                "size": [size[1], size[0]],
-                "masked": None if used is None else round(float(1.0 - used.mean()), 4),
-                "kept": [
-                    {
-                        "frame": source.span.first + index,
-                        "name": name,
-                        "sharpness": sharpnesses[index],
-                        "blurred": index in blurred,
-                    }
-                    for index, name in kept
-                ],
-                "dropped": [
-                    {"frame": source.span.first + index, "why": why, "sharpness": sharpnesses[index]}
-                    for index, why in sorted(dropped.items())
-                    if why != THINNED
-                ],
-            },
+        first, masked = source.span.first, None if used is None else round(float(1.0 - used.mean()), 4)
+        record = FramesRecord(
+            kept=[
+                KeptFrame(frame=first + index, name=name, blurred=index in blurred, sharpness=sharpnesses[index])
+                for index, name in kept
+            ],
+            dropped=[
+                DroppedFrame(frame=first + index, why=why, sharpness=sharpnesses[index])
+                for index, why in sorted(dropped.items())
+                if why != THINNED
+            ],
+            source=source.path.name,
+            frames=total,
+            every=settings.every,
+            deinterlaced=bool(source.span.deinterlace),
+            size=[width, height],
+            masked=masked,
         )
+        write_json(scratch / RECORD, record.model_dump(mode="json"))
     outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
     fields = ", deinterlaced" if source.span.deinterlace else ""
-    return f"{len(kept)} of {total} frames, {size[1]} x {size[0]} px{fields}{f'; {why}' if why else ''}{outside}"
+    return f"{len(kept)} of {total} frames, {width} x {height} px{fields}{f'; {why}' if why else ''}{outside}"
 
 
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:

@@ -25,7 +25,6 @@ from coliags_plugin.core.jobs import locked
 from coliags_plugin.engine.task_queue import Job, JobQueue
 from coliags_plugin.engine.tasks import Ending, ExecutionOptions, Executor, Task, run_worker
 from coliags_plugin.geometry.poses.colmap import model_suffix, read_cameras, read_images
-from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import (
     LOCK_SECONDS,
@@ -35,7 +34,7 @@ from coliags_plugin.pipeline.stages import (
     run_stages,
     worker_lock,
 )
-from coliags_plugin.pipeline.steps import stages_of
+from coliags_plugin.pipeline.steps import StageContext, stages_of
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, has_known_camera
 from coliags_plugin.reporting.numbers import duration
 

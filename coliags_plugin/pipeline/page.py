@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -74,6 +75,7 @@ _MAP = (
     "line joins two whose place and scale to each other are known, a dashed one says why they are not. Sub-maps with "
     "the same letter are in one frame of reference."
 )
+_NO_SUBMAP = Paragraph("No sub-map was reconstructed.", hint=False)
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
@@ -92,13 +94,13 @@ def write_page(out: Path, record: Record | None = None, scene: Path | None = Non
         InputError: ``out`` is of no reconstruction, or its record is damaged; or the page cannot be written.
     """
     contents = read_contents(out, record, scene)
-    states, groups = FrameStates(contents), _groups(contents)
+    states = FrameStates(contents)
     sections = [
         Section("Scenes", list(_scenes(contents))),
-        Section("Map of the sub-maps", list(_map(contents, groups))),
+        Section("Map of the sub-maps", list(_map(contents, states))),
         Section("Depth and light", list(_pictures(contents))),
         *_views(contents),
-        Section("Sub-maps", list(_table(contents))),
+        Section("Sub-maps", [submap_table(contents) if contents.submaps else _NO_SUBMAP]),
     ]
     if contents.has_frames:
         sections.insert(0, Section("Time line", [Paragraph(_TIMELINE), timeline(contents, states)]))
@@ -181,23 +183,31 @@ def _enumerated(items: Sequence[str]) -> str:
     return f"{', '.join(items[:_NAMED])}{rest}"
 
 
-def _map(contents: Contents, groups: Mapping[ModelKey, str]) -> Iterator[Block]:
+def _map(contents: Contents, states: FrameStates) -> Iterator[Block]:
     """The sub-maps one after the other, connected where they are joined, and the joins in a table."""
     submaps = [submap for submap in contents.submaps if submap.names]
     if len(submaps) > 1:
-        colors = styles(contents)
-        blocks = [
-            {
-                "name": submap.name,
-                "group": groups.get(submap.key, ""),
-                "style": colors[submap.name],
-                "share": round((submap.last - submap.first + 1) / contents.video.frames, 5),
-                "image": picture_near(contents, *2 * [[*submap.names][len(submap.names) // 2]]),
-                "texts": list(_texts_of(contents, submap)),
-                "link": submap_between(contents, submaps[index - 1], submap) if index else None,
-            }
-            for index, submap in enumerate(submaps)
-        ]
+        colors, groups, blocks = styles(contents), _groups(contents), list[dict[str, Any]]()
+        for before, submap in zip([None, *submaps], submaps, strict=False):
+            middle = list(submap.names)[len(submap.names) // 2]
+            texts = [
+                clock_span(contents, submap.first, submap.last),
+                counted(len(submap.names), "frame"),
+                _area_of(submap),
+                f"{_seen_of(submap)} seen" if "seen" in submap.figures else "",
+                "too few frames" if not submap.stages else "failed" if submap.failure else "",
+            ]
+            blocks.append(
+                {
+                    "name": submap.name,
+                    "group": groups.get(submap.key, ""),
+                    "style": colors[submap.name],
+                    "share": round((submap.last - submap.first + 1) / contents.video.frames, 5),
+                    "image": picture_near(contents, middle, middle),
+                    "texts": list(filter(None, texts)),
+                    "link": None if before is None else submap_between(contents, states, before, submap),
+                }
+            )
         yield Paragraph(_MAP)
         yield Template("submaps.html", {"blocks": blocks})
     if contents.joins:
@@ -221,14 +231,6 @@ def _map(contents: Contents, groups: Mapping[ModelKey, str]) -> Iterator[Block]:
             Column("Why apart", words=True),
         ]
         yield Folded("Joins of segments", [_table_of(columns, rows, "joins")], is_open=len(rows) <= _NAMED)
-
-
-def _texts_of(contents: Contents, submap: SubmapContents) -> Iterator[str]:
-    """Short texts below the name of a sub-map."""
-    yield from filter(None, (clock_span(contents, submap.first, submap.last), counted(len(submap.names), "frame")))
-    yield from filter(None, (_area_of(submap), f"{_seen_of(submap)} seen" if "seen" in submap.figures else None))
-    if not submap.stages or submap.failure:
-        yield "failed" if submap.failure else "too few frames"
 
 
 def _groups(contents: Contents) -> dict[ModelKey, str]:
@@ -312,19 +314,8 @@ def _views(contents: Contents) -> list[Section]:
     return section
 
 
-def _table(contents: Contents) -> Iterator[Block]:
-    """Figures of the reconstructed sub-maps."""
-    submaps = [submap for submap in contents.submaps if submap.stages]
-    if not submaps:
-        yield Paragraph("No sub-map was reconstructed.", hint=False)
-        return
-    yield submap_table(contents)
-    if few := len(contents.submaps) - len(submaps):
-        yield Paragraph(f"{counted(few, 'model')} with poses have too few frames to be reconstructed.")
-
-
 def submap_table(contents: Contents) -> Table:
-    """Table of the figures of the reconstructed sub-maps, and of their means."""
+    """Table of the figures of the sub-maps, and of their means."""
     columns = [
         Column("submap", "Sub-map", words=True),
         Column("frames", "Frames"),
@@ -341,16 +332,17 @@ def submap_table(contents: Contents) -> Table:
         Column("steps", "Steps"),
         Column("time", "Time"),
     ]
-    submaps, groups = [submap for submap in contents.submaps if submap.stages], _groups(contents)
+    submaps, groups = contents.submaps, _groups(contents)
     rows: list[dict[str, Value | TableCell]] = [
         {
-            **{key: submap.figures.get(key) for key in ("frames", "held_out", "steps")},
+            **{key: submap.figures.get(key) for key in ("held_out", "steps")},
+            "frames": submap.figures.get("frames", len(submap.names)),
             "submap": submap.name,
             "span": span_text(contents, submap.first, submap.last).removeprefix("frames ") if submap.names else None,
             "group": groups.get(submap.key),
             "area": _area_of(submap),
             "seen": _seen_of(submap),
-            "time": duration(sum(stage.seconds for stage in submap.stages.values())),
+            "time": duration(sum(stage.seconds for stage in submap.stages.values())) if submap.stages else None,
         }
         for submap in submaps
     ]
@@ -364,8 +356,8 @@ def submap_table(contents: Contents) -> Table:
         for row, cell in zip(rows, ranked_cells(values, unit, None), strict=True):
             row[key] = cell
     for row, submap in zip(rows, submaps, strict=False):
-        if submap.failure:
-            row["psnr"] = replace(as_cell(row["psnr"]), note=submap.failure)
+        if note := submap.failure or ("" if submap.stages else "too few frames to be reconstructed"):
+            row["psnr"] = replace(as_cell(row["psnr"]), note=note)
     there = {key for row in rows for key, value in row.items() if as_cell(value).text}
     shown = [column for column in columns if column.key not in _WHERE_KNOWN or column.key in there]
     return Table("", shown, rows, name="submaps")
@@ -393,7 +385,7 @@ def _table_of(columns: Sequence[Column], rows: Iterable[Sequence[Value | TableCe
 
 def _without_pose(contents: Contents, states: FrameStates) -> Iterator[Block]:
     """Reasons by how many frames they concern, and the stretches."""
-    reasons = [(state, count) for state, count in states.counts.most_common() if state.style is None]
+    reasons = states.reasons(contents.video.first, contents.video.stop).most_common()
     if not reasons:
         yield Paragraph("Every frame has a pose.", hint=False)
         return

@@ -19,7 +19,6 @@ from coliags_plugin.engine.data_formats import find_format, recognised
 from coliags_plugin.engine.task_queue import make_executor
 from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.pipeline.contents import figures_as
-from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import FrameSource, Span, chosen_frames, frame_source, opened_recording
 from coliags_plugin.pipeline.jobs import StageJobs, Workers
 from coliags_plugin.pipeline.joins import find_joins
@@ -35,7 +34,7 @@ from coliags_plugin.pipeline.stages import (
     run_stages,
     wait_for_workers,
 )
-from coliags_plugin.pipeline.steps import identity_of, stages_of
+from coliags_plugin.pipeline.steps import StageContext, identity_of, stages_of
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, survey_and_cut
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reporting.numbers import counted, duration, file_size

@@ -16,7 +16,7 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.jobs import Progress
-from coliags_plugin.pipeline.frame_selection import lens_mask, motion_and_survival, overlays, reduced
+from coliags_plugin.pipeline.frame_selection import corner_motion, lens_mask, overlays, reduced
 from coliags_plugin.pipeline.frame_sources import FrameSource, watched
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.stages import MADE
@@ -145,7 +145,7 @@ def survey_video(source: FrameSource, progress: Progress | None = None) -> Surve
     for _, image in watched(source, "look at frames", progress):
         whole.add(image)
         gray = reduced(image)
-        moved, share = (np.inf, 0.0) if last is None else motion_and_survival(last, gray)
+        moved, share = (np.inf, 0.0) if last is None else corner_motion(last, gray)
         motions.append(moved)
         followed.append(share)
         last = gray

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ _COLUMNS, _BINS, _PICTURES = 2000, 600, 24
 _WIDTH = 144
 #: Steps of the time axis, seconds, and most of its ticks.
 _STEPS, _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200), 9
+_NO_COMMON = "no frame has a pose in both"
 #: Percentile of a curve at which its axis ends.
 _TOP = 99.0
 #: Titles of the survey's arrays, with units.
@@ -46,8 +47,7 @@ class State:
     style: int | None = None  # colour index of a sub-map; None: no pose
 
 
-@dataclass(frozen=True)
-class Stretch:
+class Stretch(NamedTuple):
     """Frames that follow each other and share a state."""
 
     first: int
@@ -95,10 +95,11 @@ class FrameStates:
         states = list(self._states)
         return [states[code] for code in self._codes]
 
-    @property
-    def counts(self) -> Counter[State]:
-        """Number of frames of each state."""
-        return Counter(self.of_frames)
+    def reasons(self, first: int, stop: int) -> Counter[State]:
+        """Number of frames in each state without a pose, of the frames from ``first`` up to ``stop``."""
+        states, place = list(self._states), self._place(first, max(first, stop) - 1)
+        counts = {states[code]: count for code, count in Counter(self._codes[place].tolist()).items()}
+        return Counter({state: count for state, count in counts.items() if state.style is None})
 
     def stretches(self, columns: int | None = None) -> Iterator[Stretch]:
         """Runs of one state, along the video; with the commonest state in each of so many columns of a long one."""
@@ -143,16 +144,10 @@ def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | No
     for segment in contents.segments:
         near = min(segment.used, key=lambda frame: abs(frame - middle), default=None)
         if near is not None and first <= near <= last:
-            return _small_picture(segment.images / segment.used[near])
+            with suppress(InputError, OSError, ValueError):
+                return EncodedImage.jpeg(read_rgb(segment.images / segment.used[near]), 80, _WIDTH)
+            return None
     return None
-
-
-def _small_picture(file: Path) -> EncodedImage | None:
-    """An image reduced to the width of a picture, as JPEG; None if it cannot be read."""
-    try:
-        return EncodedImage.jpeg(read_rgb(file), 80, _WIDTH)
-    except (InputError, OSError, ValueError):
-        return None
 
 
 def timeline(contents: Contents, states: FrameStates) -> Template:
@@ -235,7 +230,9 @@ def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
         yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
 
 
-def submap_between(contents: Contents, submap: SubmapContents, following: SubmapContents) -> tuple[bool, str]:
+def submap_between(
+    contents: Contents, states: FrameStates, submap: SubmapContents, following: SubmapContents
+) -> tuple[bool, str]:
     """Whether a sub-map and the one that follows it are joined, and how well, or why they are not, as far as known."""
     between = [join for join in contents.joins if {submap.segment, following.segment} == set(join.segments)]
     for join in between:
@@ -249,17 +246,6 @@ def submap_between(contents: Contents, submap: SubmapContents, following: Submap
         place = segment.places.get(submap.last)
         if segment.span.name == submap.segment == following.segment and place is not None and not place.joined:
             return False, place.reason
-    return False, _lost_between(contents, submap.last, following.first)
-
-
-def _lost_between(contents: Contents, last: int, first: int) -> str:
-    """The number of frames between two, and the commonest reason why they have no pose."""
-    reasons = Counter(
-        why for segment in contents.segments for frame, why in segment.lost.items() if last < frame < first
-    )
-    for skipped in contents.video.skipped:
-        if last < skipped.first < first:
-            reasons[skipped.why] += skipped.count
-    gap = max(0, first - last - 1)
-    why = f", most: {reasons.most_common(1)[0][0]}" if reasons else ""
-    return f"{counted(gap, 'frame')} without a pose in between{why}" if gap else "no frame has a pose in both"
+    gap = max(0, following.first - submap.last - 1)
+    why = [f", most: {state.why}" for state, _ in states.reasons(submap.last + 1, following.first).most_common(1)]
+    return False, f"{counted(gap, 'frame')} without a pose in between{''.join(why)}" if gap else _NO_COMMON

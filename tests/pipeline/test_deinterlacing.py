@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 import coliags_plugin as cp
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.pipeline.frame_selection import looks_interlaced, motion_and_survival, one_field, reduced
+from coliags_plugin.pipeline.frame_selection import corner_motion, looks_interlaced, one_field, reduced
 from coliags_plugin.pipeline.frame_sources import chosen_frames, frame_source, image_files
 from coliags_plugin.pipeline.frames import write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -59,7 +59,7 @@ def test_it_is_nearer_to_the_frame_of_its_first_moment_and_is_followed_as_that_i
 
     def followed(frames):
         """Error of the motion, pixels, and survival of corners."""
-        found = np.array([motion_and_survival(*pair) for pair in pairwise(map(reduced, frames))])
+        found = np.array([corner_motion(*pair) for pair in pairwise(map(reduced, frames))])
         return np.median(np.abs(found[:, 0] * WIDTH - np.abs(np.diff(places[::2])))), found[:, 1].mean()
 
     assert error(mended) < 0.2 * error(interlaced)

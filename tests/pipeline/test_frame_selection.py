@@ -13,8 +13,8 @@ from coliags_plugin.pipeline.frame_selection import (
     EMPTY,
     THINNED,
     blurred_frames,
+    corner_motion,
     lens_mask,
-    motion,
     overlays,
     reduced,
     sharpest_frames,
@@ -127,15 +127,15 @@ def test_highlights_do_not_make_a_blurred_frame_sharp():
 @pytest.mark.parametrize("shift", [0, 1, 3, 8])
 def test_motion_is_the_shift(shift):
     before, after = (reduced(frame) for frame in film([20, 20 + shift]))
-    assert motion(before, after) * WIDTH == pytest.approx(shift, abs=0.1)
+    assert corner_motion(before, after)[0] * WIDTH == pytest.approx(shift, abs=0.1)
 
 
 def test_motion_under_a_brighter_lamp():
     before, after = (reduced(frame) for frame in film([20, 22]))
-    assert motion(before, cv2.convertScaleAbs(after, alpha=0.7)) * WIDTH == pytest.approx(2, abs=0.3)
+    assert corner_motion(before, cv2.convertScaleAbs(after, alpha=0.7))[0] * WIDTH == pytest.approx(2, abs=0.3)
 
 
 def test_motion_of_another_scene_or_of_none_is_unknown():
     one, other = reduced(film([0])[0]), reduced(film([0], seed=1)[0])
-    assert motion(one, other) > 0.02
-    assert motion(np.full((100, 100), 80, np.uint8), one[:100, :100]) == float("inf")
+    assert corner_motion(one, other)[0] > 0.02
+    assert corner_motion(np.full((100, 100), 80, np.uint8), one[:100, :100])[0] == float("inf")

@@ -11,7 +11,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_alpha, read_rgb, write_image, write_mask
-from coliags_plugin.pipeline.frame_selection import motion, reduced
+from coliags_plugin.pipeline.frame_selection import corner_motion, reduced
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.frames import read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -138,5 +138,5 @@ def test_what_is_masked_does_not_rest():
     two[:80] = one[:80]
     mask = np.zeros(one.shape, bool)
     mask[80:] = True
-    assert motion(one, two) == pytest.approx(0.0, abs=1e-4)
-    assert motion(one, two, mask) == pytest.approx(6 / WIDTH, rel=0.02)
+    assert corner_motion(one, two)[0] == pytest.approx(0.0, abs=1e-4)
+    assert corner_motion(one, two, mask)[0] == pytest.approx(6 / WIDTH, rel=0.02)

@@ -15,10 +15,10 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
-from coliags_plugin.pipeline.context import StageContext, Submap
 from coliags_plugin.pipeline.jobs import StageJob, StageJobs
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
+from coliags_plugin.pipeline.steps import StageContext, Submap
 from tests.comparison.small import lock_holder, until
 from tests.pipeline.conftest import TRAINING, write_atlas
 

@@ -19,9 +19,9 @@ from coliags_plugin.engine.data_formats import UNKNOWN_MEDIAN_DEPTH
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import steps
-from coliags_plugin.pipeline.context import StageContext, Submap, find_submaps
 from coliags_plugin.pipeline.settings import ReconstructionSettings
 from coliags_plugin.pipeline.stages import Record, StageRecord
+from coliags_plugin.pipeline.steps import StageContext, Submap, find_submaps
 from coliags_plugin.reconstruction.structure.sfm import Atlas, Reconstruction
 from tests import commands
 from tests.pipeline.conftest import COUNTS, TRAINING, Killed, write_atlas
