@@ -12,6 +12,8 @@ import numpy as np
 from coliags_plugin.core.images import write_image
 
 WIDTH, HEIGHT = 160, 120
+#: Settings of a camera that is known.
+KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0, 60.0)}
 
 
 def wall(seed: int = 0) -> np.ndarray:

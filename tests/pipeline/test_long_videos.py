@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
-from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.tasks import TaskOutcome
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.contents import read_contents
@@ -155,7 +154,6 @@ def segments_of(record):
     return [segment["name"] for segment in record.stages["survey"].figures["segments"]]
 
 
-KNOWN = {"sfm.camera.model": "PINHOLE", "sfm.camera.params": (100.0, 100.0, 80.0, 60.0)}
 OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
 
 
@@ -264,28 +262,6 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
     assert "has no sub-map with poses" in commands.refused(
         capsys, "poses", "export", out, "--output", tmp_path / "atlas"
     )
-
-
-@pytest.mark.thorough
-def test_a_damaged_stretch_within_segments(done, tmp_path, workers):
-    noise = np.random.default_rng(0)
-    images = [np.clip(image + noise.normal(0, 12, image.shape), 0, 255).astype(np.uint8) for image in film(range(150))]
-    write_video(images, tmp_path / "film.mp4", 15.0)
-    data = bytearray((tmp_path / "film.mp4").read_bytes())
-    place = len(data) * 4 // 10
-    data[place : place + len(data) // 10] = noise.bytes(len(data) // 10)
-    (tmp_path / "damaged.mp4").write_bytes(data)
-    frames = dict(frame_source(tmp_path / "damaged.mp4"))
-    black = [number for number, image in enumerate(frames.values()) if not image.any()]
-    workers()
-    made = cp.reconstruct(tmp_path / "damaged.mp4", tmp_path / "out", settings={**OPTIONS, **KNOWN})
-    video = read_contents(tmp_path / "out", made).video
-    assert video.frames == 150 and black
-    for segment in video.segments:
-        name = segment.name
-        written = {path.stem: read_rgb(path) for path in (tmp_path / "out" / name / "frames" / "images").iterdir()}
-        assert set(written) == {f"frame_{n:06d}" for n in range(segment.first, segment.last + 1) if n not in black}
-        assert all(np.array_equal(image, frames[frame]) for frame, image in written.items())
 
 
 @pytest.mark.thorough

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
 
-from coliags_plugin.cli.reconstruct import every_of
+from coliags_plugin.cli.reconstruct import every_of, seconds_of
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import write_image
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.pipeline.frame_selection import one_field
 from coliags_plugin.pipeline.frame_sources import (
@@ -24,8 +27,9 @@ from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reporting.video import write_video
 from tests.layouts.endomapper import calibration_text
-from tests.pipeline.films import number_of, numbered, write_film
+from tests.pipeline.films import film, number_of, numbered, write_film, write_images
 
 FRAMES = numbered(40)
 #: Some frames that depend on those after them, and keys that later frames refer across.
@@ -68,6 +72,7 @@ class Pipe:
         ("a.mpg", "mpeg2video", ORDERED, True),
         ("a.vob", "mpeg2video", {**ORDERED, "kind": "vob"}, True),
         ("a.avi", "mjpeg", {"pix_fmt": "yuvj420p"}, True),
+        ("a.avi", "mjpeg", {"pix_fmt": "yuvj420p", "sound": True}, True),
         ("a.avi", "mpeg4", ORDERED, True),
         ("a.mp4", "libx264", ORDERED | {"times": [-120 + 50 * n for n in range(40)]}, True),
         ("a.mkv", "libx264", ORDERED | {"times": [90_000 + 50 * n for n in range(40)]}, True),
@@ -109,6 +114,98 @@ def test_a_folder_keeps_the_places_of_frames_that_a_file_lacks(tmp_path, caplog)
     lacking = [-4] * (40 - len(there))
     for span in (Span(), Span(5), Span(39), Span(39, 41)):
         assert numbers(tmp_path, span) == [*there, *lacking, *range(40)][span.first :][: span.count(80)]
+
+
+def test_images_are_frames_in_the_order_of_their_numbers(tmp_path):
+    frames = film(range(0, 120, 3))
+    folder = write_images(tmp_path, frames)
+    for first, last in ((0, None), (0, 5), (1, 1), (17, 30), (38, 99), (5, None)):
+        source, numbers = frame_source(folder, Span(first, last)), range(40)[first : None if last is None else last + 1]
+        read = list(source)
+        assert [name for name, _ in read] == [str(number) for number in numbers] and source.expected == len(read)
+        assert all(np.array_equal(image, frames[number]) for (_, image), number in zip(read, numbers, strict=True))
+    with pytest.raises(InputError, match=r"does not tell how many frames a second.*frames.first"):
+        source.frame_at(200.0)
+
+
+def test_what_cannot_be_read_is_refused(tmp_path):
+    frames = film([0, 5])
+    (tmp_path / "noise.mp4").write_bytes(np.random.default_rng(0).bytes(5000))
+    write_image(tmp_path / "one.png", frames[0])
+    (tmp_path / "empty").mkdir()
+    write_images(tmp_path / "two", [frames[0], frames[1][:100]])
+    write_video(film(range(0, 30, 3)), tmp_path / "film.mp4", 15.0)
+    for name, first, message in (
+        ("noise.mp4", 0, r"noise.mp4 \(5000 bytes\) cannot be opened as a video.*Make images with ffmpeg"),
+        ("one.png", 0, "is a single image"),
+        ("missing.mp4", 0, "no .*missing.mp4. Expected a video file, or a folder of images"),
+        ("empty", 0, "empty holds 0 images"),
+        ("two", 0, r"1.png is 160 x 100 at 1, what is before 160 x 120. Expected frames of one size"),
+        ("film.mp4", 50, r"film.mp4 has no frame 50. Expected one of about 10 frames"),
+    ):
+        with pytest.raises(InputError, match=message):
+            list(frame_source(tmp_path / name, Span(first)))
+
+
+def test_colours_are_those_of_the_video_and_times_are_frames(tmp_path):
+    """Videos are lossy; red and blue are not swapped."""
+    frames = film(range(0, 72, 6))
+    write_video(frames, tmp_path / "film.mp4", 15.0)
+    source = frame_source(tmp_path / "film.mp4")
+    for _ in range(2):
+        for (_, image), frame in zip(source, frames, strict=True):
+            np.testing.assert_allclose(image.mean(axis=(0, 1)), frame.mean(axis=(0, 1)), atol=5.0)
+            assert np.mean(np.abs(image.astype(float) - frame)) < 10.0
+    assert source.rate == pytest.approx(15.0)
+    for text, frame in (("0", 0), ("3:20", 3000), ("1:00:00.2", 54003), ("0.4", 6)):
+        assert source.frame_at(seconds_of(text)) == frame
+    for text in ("", "3:x", "-1", "1:2:3:4"):
+        with pytest.raises(InputError, match="seconds, or hours, minutes and seconds"):
+            seconds_of(text)
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted", "every"), [(50.0, 10.0, 5), (60.0, 24.0, 2), (59.94, 15.0, 4), (15.0, 30.0, 1), (15.0, 0.5, 30)]
+)
+def test_of_how_many_frames_one_is_used(rate, wanted, every, caplog):
+    with caplog.at_level(logging.INFO):
+        assert every_of(SimpleNamespace(path="film.mp4", known_rate=rate, is_variable=False), wanted) == every
+    assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
+
+
+@pytest.mark.thorough
+def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
+    generator = np.random.default_rng(0)
+    images = [
+        np.clip(image + generator.normal(0, 12, image.shape), 0, 255).astype(np.uint8) for image in film(range(150))
+    ]
+    write_video(images, tmp_path / "film.mp4", 15.0)
+    whole = list(frame_source(tmp_path / "film.mp4"))
+    data = bytearray((tmp_path / "film.mp4").read_bytes())
+    data[len(data) // 3 : len(data) // 2] = generator.bytes(len(data) // 2 - len(data) // 3)
+    (tmp_path / "damaged.mp4").write_bytes(data)
+    read = list(frame_source(tmp_path / "damaged.mp4"))
+    assert [name for name, _ in read] == [name for name, _ in whole]
+    black = [index for index, (_, image) in enumerate(read) if not image.any()]
+    assert 10 < len(black) < 100 and "cannot be decoded: black here" in caplog.text
+    assert all(np.array_equal(read[index][1], whole[index][1]) for index in (0, 20, 149))
+    for first in (0, black[0] - 2, *black[:2], black[-1] - 1, black[-1], black[-1] + 1, 140):
+        for last in (first, first + 3, black[-1], black[-1] + 2):
+            if first <= last:
+                some = list(frame_source(tmp_path / "damaged.mp4", Span(first, last)))
+                assert [name for name, _ in some] == [name for name, _ in read[first : last + 1]]
+                assert all(np.array_equal(one, read[first + n][1]) for n, (_, one) in enumerate(some))
+
+
+def test_the_videos_of_a_folder_are_one_in_the_order_of_their_numbers(tmp_path):
+    for part, numbers_of in ((2, range(15, 25)), (10, range(25, 40)), (1, range(15))):
+        write_film([FRAMES[number] for number in numbers_of], tmp_path / f"part {part}.mp4", **ORDERED)
+    assert frame_source(tmp_path).expected == 40
+    for span in (Span(), Span(0, 10), Span(12, 30), Span(15, 15), Span(33)):
+        assert numbers(tmp_path, span) == list(range(40)[span.first : None if span.last is None else span.last + 1])
+    write_film(numbered(3, 24, 64), tmp_path / "part 11.mp4")
+    with pytest.raises(InputError, match=r"part 11.mp4 is 64 x 24 at frame_000040, what is before 64 x 48"):
+        list(frame_source(tmp_path))
 
 
 def test_what_comes_before_the_first_key_frame_is_no_frame(tmp_path):
