@@ -36,7 +36,7 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True)
 def repeatable_torch():
-    """The same numbers in whatever order tests run: one torch thread (the order of sums), and a seed."""
+    """Equal numbers in whatever order tests run: one torch thread (the order of sums), and a seed."""
     import torch
 
     torch.set_num_threads(1)
@@ -47,7 +47,7 @@ def repeatable_torch():
 
 @pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_disks():
-    """What tests write need not survive a power failure."""
+    """Skip forcing files onto the disk: those of tests need not survive a power failure."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         yield

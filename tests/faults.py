@@ -86,7 +86,7 @@ class Faults:
 
     @property
     def has_struck(self) -> bool:
-        """Whether there were so many operations."""
+        """True if there were so many operations."""
         return self.seen > self.when
 
     def counted(self, operation: Callable[..., Any]) -> Callable[..., Any]:

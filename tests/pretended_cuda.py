@@ -112,7 +112,7 @@ class PretendedCuda(contextlib.AbstractContextManager):
         self._stack.enter_context(mock.patch.object(GridExecutor, "__call__", on_device))
 
     def holds(self, tensor):
-        """Whether a tensor is on the device; None of zeros by the autograd engine, which are where they should be."""
+        """True for a tensor on the device; None of zeros by the autograd engine, which are where they should be."""
         return _ON_CUDA.get(tensor.untyped_storage()._cdata, (None, False))[1]
 
     def mark(self, tensor, on_cuda):
@@ -130,7 +130,7 @@ class PretendedCuda(contextlib.AbstractContextManager):
         return copy
 
     def is_pinned(self, tensor):
-        """Whether the tensor is in such memory."""
+        """True for a tensor in such memory."""
         return tensor.untyped_storage()._cdata in _PINNED
 
     def copied(self, source, to_cuda, non_blocking):
@@ -272,7 +272,7 @@ class _Dispatch(TorchDispatchMode):
         return tree_map(mark, made)
 
     def _places(self, function, name, tensors):
-        """Where the operands are, as far as known; refuses two devices where CUDA does."""
+        """Places of the operands, as far as known; refuses two devices where CUDA does."""
         holds, across = self.pretended.holds, name.startswith(ACROSS)
         # A single number of the CPU is an argument of a pointwise kernel.
         numbers = across or torch.Tag.pointwise in function.tags

@@ -44,7 +44,7 @@ def wall_color(points: torch.Tensor) -> torch.Tensor:
 
 def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool = True, lamp: bool = True) -> Scene:
     """The wall z = 20 mm, lit by a lamp on the camera (1/d^2 in linear light) or evenly, filmed along a short path."""
-    made = []
+    wall_frames = []
     for index in range(frames):
         camera = camera_at(0.4 * index, 0.1 * index, 0.5 * index, width, height)
         rays = camera.rays()
@@ -53,9 +53,9 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
         distance = (points - camera.center).norm(dim=-1, keepdim=True)
         rgb = wall_color(points) * ((18.0 / distance) ** (2 / 2.2) if lamp else 1.0)
         image = (rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-        made.append(Frame.of(f"{index:04d}", index, image, camera, z.float() if depth else None))
-    test = [frame for frame in made if frame.index % 8 == 0]
-    train = [frame for frame in made if frame.index % 8]
+        wall_frames.append(Frame.of(f"{index:04d}", index, image, camera, z.float() if depth else None))
+    test = [frame for frame in wall_frames if frame.index % 8 == 0]
+    train = [frame for frame in wall_frames if frame.index % 8]
     grid = torch.stack(torch.meshgrid(torch.arange(-12.0, 16, 0.5), torch.arange(-10.0, 12, 0.5), indexing="ij"), -1)
     points = torch.cat([grid.reshape(-1, 2), torch.full((grid[..., 0].numel(), 1), 20.0)], dim=1)
     return Scene("wall", train, {"test": test}, PointCloud(points), Provenance(fingerprint=f"wall-{frames}-{depth}"))

@@ -158,12 +158,12 @@ def test_training_resumes(scene, trained, tmp_path):
 
 def test_scenes_are_made_and_read(tmp_path):
     tiny = {"mesh_spacing": 3.0, "texture_spacing": 1.0, "interreflection": 0.0}
-    made = cp.make_phantom(tmp_path / "p", seed=1, frames=9, width=32, height=26, rotation_views=0, **tiny)
-    assert made == tmp_path / "p"
-    scene = cp.load_scene(made, settings={"frame_step": 2})
+    folder = cp.make_phantom(tmp_path / "p", seed=1, frames=9, width=32, height=26, rotation_views=0, **tiny)
+    assert folder == tmp_path / "p"
+    scene = cp.load_scene(folder, settings={"frame_step": 2})
     assert [frame.index for frame in scene.train] == [2, 4, 6, 8]
     with pytest.raises(InputError, match="unknown key 'frame_stpe'"):
-        cp.load_scene(made, settings={"frame_stpe": 2})
+        cp.load_scene(folder, settings={"frame_stpe": 2})
     with pytest.raises(InputError, match=r"unknown key 'sede'.*Did you mean 'seed'"):
         cp.make_phantom(tmp_path / "q", sede=1)
 
@@ -202,7 +202,7 @@ def test_a_notebook_shows_an_error_as_one_message():
 
 @pytest.mark.thorough
 def test_examples_of_the_pages_run(tmp_path, monkeypatch):
-    """In the order of the page, each with a few steps of a small model."""
+    """Examples in the order of the page, each with a few steps of a small model."""
     write_wall(tmp_path / "SCENE", frames=17)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: InlineExecutor())
@@ -231,9 +231,9 @@ def test_a_handle_needs_no_torch(trained, result):
         "print(run, run.history['psnr'][-1], run.results['paper'])\n"
         "assert 'torch' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(repr(trained)) and str(result) in done.stdout
+    process = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.startswith(repr(trained)) and str(result) in process.stdout
 
 
 # Comparisons: the command's, by settings instead of texts, as tables
@@ -299,19 +299,21 @@ def test_the_command_goes_on_with_what_a_notebook_began(wall, compared, inline, 
 def test_what_fails_is_in_the_table(wall, tmp_path, inline, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = {**TINY_SETTINGS, "datamanager.split": "all-train"}
-    done = cp.compare("coliags", str(wall), steps=3, settings=settings)
+    comparison = cp.compare("coliags", str(wall), steps=3, settings=settings)
     assert [path.name for path in tmp_path.iterdir()] == ["comparison"]
-    assert done.table().rows == [{"method": "coliags", "done": "0 of 1", "psnr": None, "ssim": None, "depth_mse": None}]
-    (note,) = done.table().notes
+    assert comparison.table().rows == [
+        {"method": "coliags", "done": "0 of 1", "psnr": None, "ssim": None, "depth_mse": None}
+    ]
+    (note,) = comparison.table().notes
     assert note.startswith("failed: wall-all-train coliags seed 0: ") and "no test frames" in note
-    assert "0 of 1 cells done, 1 failed" in repr(done)
+    assert "0 of 1 cells done, 1 failed" in repr(comparison)
 
 
 def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline):
     text = "description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    done = cp.ablate(tmp_path / "mine.yaml", wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
-    assert [result.method for result in done.results] == ["full", "plain"]
+    comparison = cp.ablate(tmp_path / "mine.yaml", wall, tmp_path / "new", steps=3, settings=TINY_SETTINGS)
+    assert [result.method for result in comparison.results] == ["full", "plain"]
     with pytest.raises(InputError, match="paper-rows"):
         cp.ablate("paper-row", wall, tmp_path / "new")
 

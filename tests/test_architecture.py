@@ -51,17 +51,17 @@ def tree_of(path: Path) -> ast.Module:
 def imports(path: Path, top_level_only: bool = False) -> set[str]:
     """Every module that a file imports, absolute: at the top, within functions, and for type checkers alone."""
     tree = tree_of(path)
-    found = set()
+    modules = set()
     for node in tree.body if top_level_only else ast.walk(tree):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             parent = node.module or ""
-            found |= {
+            modules |= {
                 f"{parent}.{alias.name}" if f"{parent}.{alias.name}" in SOURCES else parent for alias in node.names
             }
-    return found
+    return modules
 
 
 @cache
@@ -85,11 +85,11 @@ def components() -> list[str]:
 def test_imports_point_down():
     upwards = []
     for name in components():
-        own = package_of(name)
+        package = package_of(name)
         for imported in imports(SOURCES[name]):
             is_root = imported == ROOT  # which imports everything
-            other = own if is_root or not imported.startswith(ROOT + ".") else package_of(imported)
-            if is_root or (other != own and RANK[other] >= RANK[own]):
+            other = package if is_root or not imported.startswith(ROOT + ".") else package_of(imported)
+            if is_root or (other != package and RANK[other] >= RANK[package]):
                 upwards.append(f"{name} imports {imported}")
     assert upwards == []
 
@@ -103,7 +103,7 @@ def test_no_import_circle():
 
 
 def test_only_the_registry_names_modules_in_strings():
-    """What a module imports by name closes circles that no import statement shows; components are the one exception."""
+    """A module imported by its name closes circles that no import statement shows; components are the one exception."""
     assert {name for name in components() if targets(SOURCES[name])} == {f"{ROOT}.config.registry"}
 
 
@@ -118,15 +118,15 @@ def test_heavy_libraries_are_imported_late():
 
 
 def test_the_key_of_the_code_covers_all_that_the_engine_imports():
-    """But presentation, and of the results what does not compute them."""
-    found = set()
+    """All but presentation, and those parts of results/ that compute none."""
+    modules = set()
     todo = [name for name in components() if package_of(name) == "engine"]
     while todo:
         name = todo.pop()
-        if name in SOURCES and name != ROOT and name not in found:
-            found.add(name)
+        if name in SOURCES and name != ROOT and name not in modules:
+            modules.add(name)
             todo += imports(SOURCES[name]) | targets(SOURCES[name])
-    left_out = {name for name in found if SOURCES[name] not in code_files().values()}
+    left_out = {name for name in modules if SOURCES[name] not in code_files().values()}
     assert {package_of(name) for name in left_out} <= {"_version", "phantom", "reporting", "results"}
     assert "coliags_plugin.results.profiles" not in left_out and "coliags_plugin.metrics.depth" not in left_out
 

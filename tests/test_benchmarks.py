@@ -70,7 +70,7 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_pat
     results = import_module("results")
     monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: InlineExecutor())
     methods = load_ablation("rivals")
-    few = [one for one in methods if one.name in ("coliags", "3dgs-depth")]
+    few = [method for method in methods if method.name in ("coliags", "3dgs-depth")]
     monkeypatch.setattr(results, "load_ablation", lambda name: few if name == "rivals" else few[:1])
     monkeypatch.setattr(results, "WHOLE", "coliags")
     tried = {
@@ -103,11 +103,11 @@ def test_results_are_made_with_what_was_chosen(run, monkeypatch, capsys, tmp_pat
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "tools"))
     page = import_module("results_page")
     monkeypatch.setattr(page, "WHOLE", "coliags")
-    made = page.tables(out)
-    after = page.filled("".join(f"<!-- table {name} -->\nold<!-- end -->" for name in made), made)
-    assert all(table in after for table in made.values()) and "old<" not in after
+    tables = page.tables(out)
+    after = page.filled("".join(f"<!-- table {name} -->\nold<!-- end -->" for name in tables), tables)
+    assert all(table in after for table in tables.values()) and "old<" not in after
     for kind in ("colour", "depth"):
-        assert re.search(r"^\| 3dgs-depth \|.* \| [01] of 1 \| \u2013 \|$", made[f"with-depth-{kind}"], re.MULTILINE)
+        assert re.search(r"^\| 3dgs-depth \|.* \| [01] of 1 \| \u2013 \|$", tables[f"with-depth-{kind}"], re.MULTILINE)
     picture = import_module("results_picture")
     here = {"METHODS": [*chosen], "CHOSEN_BY": {"test": "psnr"}, "ASSUMED": 0, "PICTURE": tmp_path / "picture.jpg"}
     for name, value in here.items():
@@ -139,9 +139,9 @@ def test_errors_of_depth_by_confidence(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     stated = np.repeat([0.25, 0.75], 100)
     good = np.concatenate([np.arange(100) < 25, np.arange(100) < 75])
-    found = np.stack([np.where(good, 20.0, 30.0), np.full(200, 20.0), stated], axis=1)
-    found[-1, 0] = np.nan
-    _, _, low, high = import_module("depth_check").rows_of(found)
+    estimates = np.stack([np.where(good, 20.0, 30.0), np.full(200, 20.0), stated], axis=1)
+    estimates[-1, 0] = np.nan
+    _, _, low, high = import_module("depth_check").rows_of(estimates)
     assert [row["pixels"] for row in (low, high)] == ["confidence 0.2 to 0.3", "confidence 0.7 to 0.8"]
     assert low["within 5 %"] == low["stated %"] == 25.0
     assert high["within 5 %"] == pytest.approx(100 * 75 / 99) and high["stated %"] == 75.0
@@ -205,10 +205,10 @@ def gpu_script(folder, *argv, **variables):
     """Exit status, parts by name, and the summary of `gpu.sh` on the CPU."""
     command = [str(ROOT / "benchmarks" / "gpu.sh"), "--device", "cpu", "--small", "--out", str(folder), *argv]
     environment = {**os.environ, "PYTHON": sys.executable, **variables}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=900)
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=900)
     parts = [json.loads(line) for line in (folder / "parts.jsonl").read_text().splitlines()]
     return (
-        done.returncode,
+        process.returncode,
         {part["part"]: part["status"] for part in parts},
         (folder / "summary").with_suffix(".md").read_text(),
     )

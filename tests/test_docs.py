@@ -79,7 +79,7 @@ def headings(page: Path) -> list[str]:
 @cache
 def sections(page: Path) -> set[str]:
     """Numbers that head a section; a page's title, such as "5 methods compared", heads none."""
-    return {found.group() for title in headings(page)[1:] if (found := re.match(r"\d+(\.\d+)*(?= )", title))}
+    return {matches.group() for title in headings(page)[1:] if (matches := re.match(r"\d+(\.\d+)*(?= )", title))}
 
 
 def cited(text: str) -> list[tuple[str, list[str]]]:
@@ -92,7 +92,7 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
 
 
 def wrong_citations(path: Path, text: str, folders: tuple[Path, ...]) -> list[str]:
-    """What a text cites that is not there: a page in none of the folders, or a section that the page lacks."""
+    """Citations of a text that lead nowhere: a page in none of the folders, or a section that the page lacks."""
     wrong = []
     for page, numbers in cited(text):
         target = next((folder / page for folder in folders if (folder / page).is_file()), None)
@@ -125,8 +125,8 @@ def test_sections_cited_by_name_are_there():
 
 @pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=name_of)
 def test_sections_are_numbered_in_order_and_references_lead_to_one(page):
-    found = [re.match(r"\d+(\.\d+)*(?= )", title) for title in headings(page)]
-    numbers = [tuple(map(int, each.group().split("."))) for each in found if each]
+    matches = [re.match(r"\d+(\.\d+)*(?= )", title) for title in headings(page)]
+    numbers = [tuple(map(int, each.group().split("."))) for each in matches if each]
     assert numbers == sorted(set(numbers))
     referred = re.findall(r"(?<!\w)\((\d(?:\.\d)?)\)", page.read_text())
     assert not sections(page) or set(referred) <= sections(page)
@@ -143,13 +143,13 @@ def test_the_project_speaks_of_itself_alone():
 
 def commands() -> list[tuple[str, str]]:
     """Every ``coliags`` command of README and docs: lines of shell blocks, and code in running text."""
-    found = []
+    typed = []
     for page in PAGES:
         lines = [line for block in fenced(page, "sh") for line in block.splitlines()]
         prose = re.sub(r"^ *```.*?^ *```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
         lines += re.findall(r"`(coliags [^`]+)`", prose)
-        found += [(name_of(page), line.strip()) for line in lines if re.match(r"(\w+=\S+ +)*coliags ", line.strip())]
-    return found
+        typed += [(name_of(page), line.strip()) for line in lines if re.match(r"(\w+=\S+ +)*coliags ", line.strip())]
+    return typed
 
 
 def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
@@ -174,20 +174,23 @@ def test_commands_parse(page, command, monkeypatch, capsys):
     argv = words[words.index("coliags") + 1 : words.index(">") if ">" in words else None]
     if len(argv) == 1 and argv[0] in ALONE:
         argv.append("--help")  # the subcommand's name alone, in running text
-    found = parsed(argv, monkeypatch)
+    parsed_command = parsed(argv, monkeypatch)
     if (
-        isinstance(found, (TrainCommand, ConfigCommand, CheckCommand))
-        and found.method not in OF_THE_EXAMPLE
-        and not found.method.endswith(".yaml")
+        isinstance(parsed_command, (TrainCommand, ConfigCommand, CheckCommand))
+        and parsed_command.method not in OF_THE_EXAMPLE
+        and not parsed_command.method.endswith(".yaml")
     ):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
-        overrides = [*format_of_page, *(found.settings if isinstance(found, TrainCommand) else found.set)]
-        assert load_method(found.method, overrides).config
-    if isinstance(found, PhantomCommand):
+        overrides = [
+            *format_of_page,
+            *(parsed_command.settings if isinstance(parsed_command, TrainCommand) else parsed_command.set),
+        ]
+        assert load_method(parsed_command.method, overrides).config
+    if isinstance(parsed_command, PhantomCommand):
         made = []
         monkeypatch.setattr("coliags_plugin.phantom.generate.generate", lambda *a, **k: made.append(a))
-        found.run()
+        parsed_command.run()
         assert made
 
 
@@ -235,9 +238,11 @@ def test_the_tutorial_runs_as_written(tmp_path):
             words += [part for override in SMALL for part in ("--set", override)]
         commands.append(words)
     run = [sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(commands)]
-    done = subprocess.run(run, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"^ *edges\b", done.stdout, re.MULTILINE), "listed"
+    process = subprocess.run(
+        run, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True, timeout=120
+    )
+    assert process.returncode == 0, process.stderr
+    assert re.search(r"^ *edges\b", process.stdout, re.MULTILINE), "listed"
     last = json.loads((tmp_path / "RUN" / "metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 2
     assert 0.0 < last["terms"]["edges"] < 0.5
@@ -292,43 +297,43 @@ def test_tables_of_options_are_complete_with_their_defaults_and_ranges(settings,
         (name, as_written(field.default)) for name, field in fields.items()
     )
     for name, _, values, *_ in rows:
-        told = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", values)}
+        limits = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", values)}
         for limit in fields[name].metadata:
             bounds = {getattr(limit, side) for side in ("ge", "le", "gt", "lt") if hasattr(limit, side)}
-            assert bounds <= told, f"{name}: {values} leaves out {bounds - told}"
+            assert bounds <= limits, f"{name}: {values} leaves out {bounds - limits}"
 
 
 def test_the_table_of_presets_is_the_presets():
-    told = {row[0]: row[1:] for row in table_rows("phantom.md", "| | `c3vd`, the default | `strong` |")}
+    cells = {row[0]: row[1:] for row in table_rows("phantom.md", "| | `c3vd`, the default | `strong` |")}
     for column, name in enumerate(("c3vd", "strong")):
         preset = PRESETS[name]
-        assert told["light_offset, mm"][column] == f"({', '.join(f'{value:g}' for value in preset.light_offset)})"
-        assert told["spread_law, spread"][column] == f"{preset.spread_law}, {preset.spread:g}"
+        assert cells["light_offset, mm"][column] == f"({', '.join(f'{value:g}' for value in preset.light_offset)})"
+        assert cells["spread_law, spread"][column] == f"{preset.spread_law}, {preset.spread:g}"
         for setting in ("vignetting", "white_balance_drift", "gain"):
-            assert told[setting][column] == f"{getattr(preset, setting)}".removesuffix(".0")
-        assert told["tilt, degrees"][column] == f"{preset.tilt:g}"
+            assert cells[setting][column] == f"{getattr(preset, setting)}".removesuffix(".0")
+        assert cells["tilt, degrees"][column] == f"{preset.tilt:g}"
         turns = ", ".join(f"{value:g}" for value in preset.turn)
-        assert told["yaw, pitch, roll of the pullback, degrees"][column] == turns
-        assert told["turn of the rotation path, degrees"][column] == f"{preset.scan:g}"
-        assert told["sideways, mm"][column] == f"{preset.wobble[0]:g} to {preset.wobble[1]:g}"
+        assert cells["yaw, pitch, roll of the pullback, degrees"][column] == turns
+        assert cells["turn of the rotation path, degrees"][column] == f"{preset.scan:g}"
+        assert cells["sideways, mm"][column] == f"{preset.wobble[0]:g} to {preset.wobble[1]:g}"
 
 
 def test_every_key_of_a_method_is_in_the_table():
-    told = [row[0] for row in table_rows("configs.md", "| key | what |")]
-    assert sorted(told) == sorted(["base", *MethodConfig.model_fields])
+    keys = [row[0] for row in table_rows("configs.md", "| key | what |")]
+    assert sorted(keys) == sorted(["base", *MethodConfig.model_fields])
     options = [(row[0], row[1]) for row in table_rows("configs.md", "| option | default | what |")]
     fields = OptimizerSettings.model_fields
     assert options == [(key, "" if field.is_required() else as_written(field.default)) for key, field in fields.items()]
-    said = (DOCS / "configs.md").read_text()
+    text_of_page = (DOCS / "configs.md").read_text()
     for key, field in ScheduleSettings.model_fields.items():
-        assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
+        assert re.search(rf"`{key}`\s+\({field.default}\b", text_of_page), key
 
 
 def test_rates_in_the_table_are_coliags():
-    told = table_rows("methods.md", "| group | rate | final rate | |")
+    rows_told = table_rows("methods.md", "| group | rate | final rate | |")
     rates = load_method("coliags").config.optimizers
-    assert [row[0] for row in told] == list(rates)
-    for name, rate, final, _ in told:
+    assert [row[0] for row in rows_told] == list(rates)
+    for name, rate, final, _ in rows_told:
         assert float(rate) == rates[name].lr
         assert (float(final) if final else None) == rates[name].final_lr
 
@@ -376,10 +381,15 @@ def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
         for option, field in {} if settings is None else settings.model_fields.items():
             rows = re.findall(rf"^\| `{option}` \| (.+) \| (.+) \| (.+) \|$", text, re.MULTILINE)
             assert rows, f"{name}: {option} is not there"
-            assert any(told.startswith(tool("options")["type_text"](field).replace("|", "\\|")) for told, _, _ in rows)
+            assert any(
+                range_text.startswith(tool("options")["type_text"](field).replace("|", "\\|"))
+                for range_text, _, _ in rows
+            )
             for limit in field.metadata:
                 bounds = [f"{getattr(limit, side):g}" for side in ("ge", "le", "gt", "lt") if hasattr(limit, side)]
-                assert any(all(bound in told for bound in bounds) for told, _, _ in rows), f"{name}: range of {option}"
+                assert any(all(bound in range_text for bound in bounds) for range_text, _, _ in rows), (
+                    f"{name}: range of {option}"
+                )
 
 
 def test_the_table_of_methods_has_every_method_and_constant():

@@ -53,14 +53,14 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
     assert "round-gaussians" in listed and "an example of a method in another package" in listed
     assert "vignette" in coliags("list", "modules").stdout
     small = ("--steps", 30, "--set", "datamanager.points_count=2000", "--set", "schedule.log_every=1")
-    done = coliags("train", "round-gaussians", "--data", "wall", "--output", "run", *small)
-    assert done.returncode == 0, done.stderr
-    assert "module lens: all views have the same vignette" in done.stderr
+    process = coliags("train", "round-gaussians", "--data", "wall", "--output", "run", *small)
+    assert process.returncode == 0, process.stderr
+    assert "module lens: all views have the same vignette" in process.stderr
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["loss"] < rows[0]["loss"]
     assert set(rows[0]["terms"]) == {"l1"} and set(rows[-1]["terms"]) == {"l1", "smooth"}
-    done = coliags("eval", "run")
-    assert done.returncode == 0, done.stderr
+    process = coliags("eval", "run")
+    assert process.returncode == 0, process.stderr
     scores = json.loads((tmp_path / "run" / "eval" / "paper" / "metrics.json").read_text())
     assert scores["untrained_views"] == {"lens": "all views have the same vignette"}
     assert scores["psnr"] > 5
@@ -68,27 +68,27 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
 
 @pytest.mark.thorough
 def test_the_example_keeps_the_contract(coliags, tmp_path):
-    done = coliags("check", "round-gaussians")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "19 passed, 0 failed, 2 skipped" in done.stdout
+    process = coliags("check", "round-gaussians")
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "19 passed, 0 failed, 2 skipped" in process.stdout
 
 
 def test_a_method_whose_file_is_missing_is_named(coliags, tmp_path):
     (info,) = (tmp_path / "site").glob("*.dist-info")
     (info / "entry_points.txt").write_text("[coliags_plugin.methods]\nghost = coliags_round\n", encoding="utf-8")
-    done = coliags("list", "methods")
-    assert done.returncode == 2
+    process = coliags("list", "methods")
+    assert process.returncode == 2
     assert (
         "entry point 'ghost' in coliags_plugin.methods names package coliags_round, which has no ghost.yaml"
-        in done.stderr
+        in process.stderr
     )
 
 
 @pytest.mark.parametrize("coliags", [RENDERER], indirect=True)
 def test_a_renderer_of_another_package_is_registered(coliags):
-    done = coliags("list", "renderers")
-    assert done.returncode == 0, done.stderr
-    assert "(entry point coliags_gsplat:GsplatRenderer)" in done.stdout
+    process = coliags("list", "renderers")
+    assert process.returncode == 0, process.stderr
+    assert "(entry point coliags_gsplat:GsplatRenderer)" in process.stdout
     renderer = renderer_class()
     assert renderer.obstacle("gaussians3d", torch.device("cpu")) == "runs on cuda, the device is cpu"
     assert "depth_expected" in renderer.outputs_of("gaussians3d") and "surfels" not in renderer.primitives
@@ -102,16 +102,16 @@ def renderer_class():
 @pytest.fixture
 def gsplat_renderer():
     """The class of the renderer, where gsplat and a device are."""
-    found = renderer_class().availability()
-    if not found.ok:
-        pytest.skip(found.reason)
+    availability = renderer_class().availability()
+    if not availability.ok:
+        pytest.skip(availability.reason)
     return renderer_class()
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("count", [0, 1, 200])
 def test_gsplat_gives_the_definition_s_numbers(gsplat_renderer, count):
-    """In few pixels, at a threshold, rounding decides; an image without Gaussians is the background, with a graph."""
+    """Rounding decides in few pixels, at a threshold; an image without Gaussians is the background, with a graph."""
     gaussians, camera = strewn(200, 96, 64, "gaussians3d")
     of = {name: getattr(gaussians, name)[:count] for name in (*INPUTS, "source_index", "visible_sources")}
     wants, background = ("depth_expected", "normals", "rgb"), (0.3, 0.1, 0.9)
@@ -128,5 +128,5 @@ def test_gsplat_gives_the_definition_s_numbers(gsplat_renderer, count):
         gradients.append([leaf.grad.cpu() for leaf in leaves.values()])
     differences = (images[0] - images[1]).abs().amax(-1)
     assert (differences > 1e-3).float().mean() <= 0.01
-    for found, true in zip(*gradients, strict=True):
-        assert (found - true).norm() <= 1e-2 * true.norm()
+    for output, true in zip(*gradients, strict=True):
+        assert (output - true).norm() <= 1e-2 * true.norm()

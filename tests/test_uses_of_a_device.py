@@ -42,7 +42,7 @@ def options_of(method):
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    """Of what is fitted to a run."""
+    """Fits to a run take two steps."""
     monkeypatch.setattr(distillation, "STEPS", 2)
     monkeypatch.setattr(pose_refinement, "STEPS", 2)
 
@@ -55,15 +55,15 @@ def wall(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(wall, tmp_path_factory):
     """A run of each method, trained on the device when it is first asked for."""
-    found = {}
+    folders = {}
 
     def on_device(method):
-        if method not in found:
+        if method not in folders:
             folder, steps = tmp_path_factory.mktemp("runs") / method, 8 if method == "coliags-in-vivo" else 2
             with PretendedCuda():
                 cp.train(method, wall, folder, steps=steps, settings=options_of(method), device="cuda")
-            found[method] = folder
-        return found[method]
+            folders[method] = folder
+        return folders[method]
 
     return on_device
 
@@ -181,9 +181,9 @@ def test_methods_are_compared(wall, tmp_path):
     options = CompareOptions((wall,), tmp_path / "compared", steps=2, settings=options_of("3dgs"))
     with pytest.MonkeyPatch.context() as patch, PretendedCuda():
         patch.setattr(compare, "make_executor", lambda options: InlineExecutor())
-        done = carry_out(
+        comparison = carry_out(
             make_request("3dgs", options), ComparisonFolder(options.output), ExecutionOptions(device="cuda")
         )
-    assert not done.failures
+    assert not comparison.failures
     (result,) = (tmp_path / "compared" / "results").rglob("*.json")
     assert "a pretended device" in result.read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ INTRINSICS = (101.0, 98.0, 83.0, 61.5)
 
 
 def depth_along(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """How many ray lengths away the wall x^2 + y^2 = RADIUS^2 or the end z = END is. [..., 3] -> [...]"""
+    """Ray lengths to where the wall x^2 + y^2 = RADIUS^2 or the end z = END is. [..., 3] -> [...]"""
     a = (rays[..., :2] ** 2).sum(-1)
     b = (rays[..., :2] * origin[:2]).sum(-1)
     c = (origin[:2] ** 2).sum() - RADIUS**2

@@ -42,8 +42,8 @@ def trained(scene, tmp_path_factory):
 
 
 def test_train_leaves_everything(trained):
-    found = {path.name for path in trained.iterdir()}
-    assert found == {"config.yaml", "provenance.json", "metrics.jsonl", "checkpoints", "eval"}
+    names = {path.name for path in trained.iterdir()}
+    assert names == {"config.yaml", "provenance.json", "metrics.jsonl", "checkpoints", "eval"}
     assert [path.name for path in (trained / "checkpoints").iterdir()] == ["step-000060"]
 
 
@@ -70,8 +70,8 @@ def test_eval_metrics_agree_with_its_images(trained):
     rendered, truth = (read_rgb(name).astype(float) / 255 for name in names)
     assert -10 * math.log10(((rendered - truth) ** 2).mean()) == pytest.approx(float(row["psnr"]), abs=0.05)
     depths = [read_depth_tiff(folder / kind / "test" / f"{row['frame']}.tiff") for kind in ("depth", "true_depth")]
-    known = np.isfinite(depths[1])
-    assert ((depths[0] - depths[1])[known] ** 2).mean() == pytest.approx(float(row["depth_mse"]), rel=1e-4)
+    is_known = np.isfinite(depths[1])
+    assert ((depths[0] - depths[1])[is_known] ** 2).mean() == pytest.approx(float(row["depth_mse"]), rel=1e-4)
 
 
 def test_render_writes_images_scales_and_a_video(trained, tmp_path):
@@ -137,10 +137,10 @@ def test_eval_against_another_scene(trained, scene, tmp_path, capsys):
     shown = capsys.readouterr().out.splitlines()
     assert shown[-2] == f"written: {trained / 'eval/paper-truth/metrics.json'}"
     assert shown[-1] == f"next:    coliags report {trained} --protocol paper-truth"
-    own, against = (
+    original, against = (
         json.loads((trained / f"eval/{name}/metrics.json").read_text()) for name in ("paper", "paper-truth")
     )
-    assert against["psnr"] == own["psnr"] and against["depth_mse"] == own["depth_mse"]
+    assert against["psnr"] == original["psnr"] and against["depth_mse"] == original["depth_mse"]
     assert against["scene"] == "true"
     assert run("report", trained, "--protocol", "paper-truth", "--output", tmp_path / "report.html") == 0
     other = write_wall(tmp_path / "other", frames=5)
@@ -150,9 +150,9 @@ def test_eval_against_another_scene(trained, scene, tmp_path, capsys):
 def test_default_run_folder_and_resume_of_the_newest(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("train", "ablations/depth", "--data", scene, "--steps", 1, "--json", *SETS) == 0
-    told = json.loads(capsys.readouterr().out)
-    printed = Path(told["written"][0])
-    assert told["step"] == 1 and told["next"] == [f"coliags eval {printed}"]
+    summary = json.loads(capsys.readouterr().out)
+    printed = Path(summary["written"][0])
+    assert summary["step"] == 1 and summary["next"] == [f"coliags eval {printed}"]
     assert printed.parts[:3] == ("runs", "wall", "depth")
     assert run("train", "ablations/depth", "--data", scene, "--steps", 2, "--resume", *SETS) == 0
     assert (printed / "checkpoints" / "step-000002").is_dir()

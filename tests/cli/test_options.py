@@ -34,7 +34,7 @@ def test_a_command_and_a_function_have_the_same_options_and_the_help_tells_them(
 def test_options_are_given_as_an_object_or_by_name_with_texts_and_mappings():
     @takes(TrainOptions)
     def told(first, options, *, last=0):
-        """What was given."""
+        """Return the arguments."""
         return first, options, last
 
     first, options, last = told(1, "coliags", "SCENE", settings={"a.b": None}, last=2)

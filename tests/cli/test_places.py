@@ -1,4 +1,4 @@
-"""Nothing that is written says where the data were."""
+"""Written files do not say where the data were."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def test_of_checks(tmp_path, scene, capsys):
     out = tmp_path / "out"
     assert run("data", "check", scene, "--html", out / "check.html", "--json") in (0, 1)
     printed = json.loads(capsys.readouterr().out)
-    told = json.dumps({key: value for key, value in printed.items() if key not in ("written", "next")})
-    assert "Jane Doe" not in told and str(tmp_path) not in told
+    summary = json.dumps({key: value for key, value in printed.items() if key not in ("written", "next")})
+    assert "Jane Doe" not in summary and str(tmp_path) not in summary
     assert not telling(out, "Jane Doe", str(tmp_path))
 
 

@@ -70,14 +70,14 @@ def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     caplog.set_level("INFO")
     assert run("poses", "convert", truth, "-o", tmp_path / "t.json", "--to", "nerfstudio") == 0
     assert run("poses", "convert", tmp_path / "t.json", "-o", tmp_path / "t.tum", "--to", "tum") == 0
-    said = caplog.text
-    assert "c3vd (camera-to-world matrices, column-major); 20 poses, path" in said
-    assert "mean step" in said
-    assert "mean looking direction (" in said
-    assert "the input has no image names: using 0000.png" in said
-    assert "t.json has no camera, which its readers need; --intrinsics and --size give it one" in said
-    assert "tum does not store names: dropped" in said
-    assert "no timestamps: frame numbers are written instead" in said
+    text = caplog.text
+    assert "c3vd (camera-to-world matrices, column-major); 20 poses, path" in text
+    assert "mean step" in text
+    assert "mean looking direction (" in text
+    assert "the input has no image names: using 0000.png" in text
+    assert "t.json has no camera, which its readers need; --intrinsics and --size give it one" in text
+    assert "tum does not store names: dropped" in text
+    assert "no timestamps: frame numbers are written instead" in text
 
 
 def test_images_give_names(truth, tmp_path, capsys):
@@ -129,18 +129,18 @@ def test_convert_replaces_only_when_asked_and_never_its_input(truth, tmp_path, c
 def test_align_prints_errors(estimate, truth, capsys):
     argv = ("poses", "align", estimate, truth)
     assert run(*argv, "--scale", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    errors = json.loads(capsys.readouterr().out)
     assert run(*argv, "--scale") == 0
     shown = capsys.readouterr().out
     assert "20 frames matched by index, of 20 estimated and 20 reference ones" in shown
     assert "Sim(3): rotation" in shown
-    assert told["unit"] == "mm"
-    assert told["scale"] == pytest.approx(4.0, rel=0.02)
-    assert 0.05 < told["ate"]["rmse"] < 0.2
-    assert f"{told['ate']['rmse']:.4g}" in shown
+    assert errors["unit"] == "mm"
+    assert errors["scale"] == pytest.approx(4.0, rel=0.02)
+    assert 0.05 < errors["ate"]["rmse"] < 0.2
+    assert f"{errors['ate']['rmse']:.4g}" in shown
     assert run(*argv, "--json") == 0
     without_scale = json.loads(capsys.readouterr().out)
-    assert without_scale["ate"]["rmse"] > told["ate"]["rmse"]
+    assert without_scale["ate"]["rmse"] > errors["ate"]["rmse"]
 
 
 @pytest.mark.parametrize(
@@ -173,8 +173,8 @@ def test_align_with_the_truth_inside_params_npz(truth, tmp_path, capsys):
 
 
 def test_align_of_training_frames(truth, tmp_path, capsys):
-    kept = [index for index in range(20) if index % 8 != 7]
-    write_trajectory(tmp_path / "train.txt", Trajectory(spiral()[kept]), "c3vd")
+    training = [index for index in range(20) if index % 8 != 7]
+    write_trajectory(tmp_path / "train.txt", Trajectory(spiral()[training]), "c3vd")
     assert "--match endogslam-train" in refused(capsys, "poses", "align", tmp_path / "train.txt", truth)
     assert run("poses", "align", tmp_path / "train.txt", truth, "--match", "endogslam-train") == 0
     assert "18 frames matched by endogslam-train" in capsys.readouterr().out
@@ -220,17 +220,17 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
                tube / "images", "--intrinsics", "1,1,1,1", "--size", "2x2") == 0  # fmt: skip
     capsys.readouterr()
     assert run("poses", "align", out / "sparse" / "0", tmp_path / "true", "--scale", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["matched_by"] == "name"
-    assert told["ate"]["rmse"] < 0.2
+    errors = json.loads(capsys.readouterr().out)
+    assert errors["matched_by"] == "name"
+    assert errors["ate"]["rmse"] < 0.2
 
 
 def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, caplog):
     truth = np.stack([frame.camera.camera_to_world.numpy() for frame in tube_frames(COUNT)])
     first, last = truth[0, :3, 3], truth[8, :3, 3]
     argv = ("poses", "sfm", tube / "images", *CAMERA, "--every", 4)
-    known = f"0000_color.png,0008_color,{np.linalg.norm(last - first)}"
-    assert run(*argv, "--output", tmp_path / "by-distance", "--distance", known) == 0
+    distance = f"0000_color.png,0008_color,{np.linalg.norm(last - first)}"
+    assert run(*argv, "--output", tmp_path / "by-distance", "--distance", distance) == 0
     assert "unit: mm, " in capsys.readouterr().out
     assert read_unit(tmp_path / "by-distance") == "mm"
     scene = open_scene(tmp_path / "by-distance", options=["split=all-train"])
@@ -276,14 +276,15 @@ def test_images_too_dark_for_sfm_are_refused_with_a_mask_too(tmp_path, capsys):
         write_image(tmp_path / f"frames/{index}.png", np.full((48, 64), 4095, np.uint16))
     write_mask(tmp_path / "mask.png", np.ones((48, 64), bool))
     for more in ((), ("--mask", tmp_path / "mask.png")):
-        said = refused(capsys, "poses", "sfm", tmp_path / "frames", "--output", tmp_path / "out", *more)
-        assert "no pixel of the 3 frames" in said and "brighter than 15 of 255" in said
+        text = refused(capsys, "poses", "sfm", tmp_path / "frames", "--output", tmp_path / "out", *more)
+        assert "no pixel of the 3 frames" in text and "brighter than 15 of 255" in text
 
 
 def test_defaults_of_a_part_stay_where_one_of_its_options_is_set():
-    given = settings_of(SfmSettings, ["features.upright=false", "camera.model=PINHOLE", "camera.params=[1, 2.5, 3, 4]"])
-    assert given.features == SfmSettings().features.model_copy(update={"upright": False})
-    assert given.camera.params == (1.0, 2.5, 3.0, 4.0)
+    camera = ("camera.model=PINHOLE", "camera.params=[1, 2.5, 3, 4]")
+    settings = settings_of(SfmSettings, ["features.upright=false", *camera])
+    assert settings.features == SfmSettings().features.model_copy(update={"upright": False})
+    assert settings.camera.params == (1.0, 2.5, 3.0, 4.0)
 
 
 def test_the_table_of_the_documentation_tells_the_defaults():

@@ -31,8 +31,8 @@ def method_file(tmp_path):
 
 
 def test_every_shipped_method_is_described():
-    found = descriptions(method_files())
-    assert all(found[name] for name in method_names())
+    texts = descriptions(method_files())
+    assert all(texts[name] for name in method_names())
 
 
 def test_benchmarks_are_no_methods():
@@ -64,12 +64,12 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     ],
 )
 def test_methods_for_scenes_without_true_depth_learn_from_what_there_is(method, base, loss):
-    own, full, paper = (load_method(name).config.losses for name in (method, base, "coliags"))
-    assert "opacity" in own.keys() - full.keys() and full.keys() <= own.keys()
-    assert own["depth"].name == loss
+    losses, full, paper = (load_method(name).config.losses for name in (method, base, "coliags"))
+    assert "opacity" in losses.keys() - full.keys() and full.keys() <= losses.keys()
+    assert losses["depth"].name == loss
     for step in (0, 1, 2):  # relative to a depth of 30 mm
         expected = 30 * paper["depth"].settings.weight_at(step, 2)
-        assert own["depth"].settings.weight_at(step, 2) == pytest.approx(expected)
+        assert losses["depth"].settings.weight_at(step, 2) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -104,14 +104,14 @@ def test_methods_that_differ_in_one_option_of_the_appearance_head_alone(method, 
 def test_the_papers_ablation_rows_and_embedding_sizes(row, depth, heads, frequencies):
     config = load_method(f"ablations/{row}").config
     assert ("depth" in config.losses) == depth
-    found = config.field.settings.geometry_head, config.field.settings.appearance_head
-    assert tuple(head.name for head in found) == heads
+    head_nodes = config.field.settings.geometry_head, config.field.settings.appearance_head
+    assert tuple(head.name for head in head_nodes) == heads
     if frequencies:
-        assert tuple(head.settings.frequencies for head in found) == frequencies
+        assert tuple(head.settings.frequencies for head in head_nodes) == frequencies
 
 
 def looked_up(config, path):
-    """What a config has at a path of attributes and keys."""
+    """Value of a config at a path of attributes and keys."""
     for key in path.split("."):
         config = config[key] if isinstance(config, dict) else getattr(config, key)
     return config
@@ -201,7 +201,7 @@ def test_mistakes_are_named(method_file, text, parts):
 
 
 @pytest.mark.parametrize(
-    ("assignment", "seen", "end", "start"),
+    ("assignment", "values", "end", "start"),
     [
         ("losses.depth.final_weight=0", "final_weight 0.0 with weight 0.2", "final_weight", "weight"),
         ("losses.depth.weight=0", "final_weight 0.01 with weight 0.0", "final_weight", "weight"),
@@ -209,12 +209,12 @@ def test_mistakes_are_named(method_file, text, parts):
         ("optimizers.offsets.lr=0", "final_lr 0.0001 with lr 0.0", "final_lr", "lr"),
     ],
 )
-def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen, end, start):
-    """It would be 0 for the whole run."""
+def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, values, end, start):
+    """A rate or weight would be 0 for the whole run."""
     with pytest.raises(InputError) as caught:
         load_method("coliags", [assignment])
     assert str(caught.value) == (
-        f"`{assignment}`: {assignment.split('=')[0]}: {seen}: a logarithmic schedule cannot reach or leave 0; give "
+        f"`{assignment}`: {assignment.split('=')[0]}: {values}: a logarithmic schedule cannot reach or leave 0; give "
         f"both above 0, or leave {end} out (null) for a constant {start}."
     )
 
@@ -275,9 +275,9 @@ paths = st.from_regex(r"[a-z_]{1,8}(\.[a-z_]{1,8}){0,2}", fullmatch=True)
 @settings(max_examples=40, deadline=None)
 @given(settings=st.dictionaries(paths, plain, max_size=4))
 def test_settings_survive_as_texts(settings):
-    found = parse_assignments(assignments(settings))
-    assert found == settings and list(found) == list(settings)
-    assert repr(found) == repr(settings)  # 1 is not 1.0, nor is True
+    parsed = parse_assignments(assignments(settings))
+    assert parsed == settings and list(parsed) == list(settings)
+    assert repr(parsed) == repr(settings)  # 1 is not 1.0, nor is True
 
 
 @pytest.mark.parametrize(

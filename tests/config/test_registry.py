@@ -46,8 +46,8 @@ def test_listing_imports_nothing():
 
 def test_entry_points_are_found(monkeypatch):
     def fake(group):
-        wanted = group == "coliags_plugin.things"
-        return (metadata.EntryPoint("pi", "math:pi", group),) if wanted else ()
+        is_group = group == "coliags_plugin.things"
+        return (metadata.EntryPoint("pi", "math:pi", group),) if is_group else ()
 
     monkeypatch.setattr(registry_module, "installed", fake)
     registry = Registry("things", {}, "thing")

@@ -50,6 +50,6 @@ def test_lens_terms_out_of_bounds_are_refused(lens, term, value):
 
 def test_points_far_away_are_left_out(caplog):
     positions = torch.tensor([[0.0, 0, 1], [1e7, 0, 0], [0, float("inf"), 0], [0, 0, float("nan")], [1, 1, 1]])
-    kept = subsampled(PointCloud(positions), 10, np.random.default_rng(0), None)
-    assert kept.positions.tolist() == [[0, 0, 1], [1, 1, 1]]
+    points = subsampled(PointCloud(positions), 10, np.random.default_rng(0), None)
+    assert points.positions.tolist() == [[0, 0, 1], [1, 1, 1]]
     assert "3 of 5 points are not finite, or beyond 1e+06" in caplog.text

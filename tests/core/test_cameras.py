@@ -21,11 +21,11 @@ from tests.scenes import camera_at, wall_scene
 def test_unproject_then_project_is_the_pixel_centre(x, y, z, yaw, depth):
     camera = camera_at(x, y, z, yaw=yaw)
     points = camera.unproject(torch.full((24, 32), depth, dtype=torch.float64))
-    pixels, found = camera.project(points.reshape(-1, 3))
+    pixels, depths = camera.project(points.reshape(-1, 3))
     rows, columns = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
     expected = torch.stack([columns, rows], -1).reshape(-1, 2).double() + 0.5
     torch.testing.assert_close(pixels, expected, rtol=0, atol=1e-9)
-    torch.testing.assert_close(found, torch.full_like(found, depth), rtol=1e-9, atol=0)
+    torch.testing.assert_close(depths, torch.full_like(depths, depth), rtol=1e-9, atol=0)
 
 
 def test_project_agrees_with_the_matrices():
@@ -107,11 +107,11 @@ def test_samples_are_scipys_also_beyond_the_edge():
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(7, 9, 2, generator=generator)
     pixels = torch.rand(4, 5, 2, generator=generator) * torch.tensor([13.0, 11.0]) - 2.0
-    made = bilinear(image, pixels)
+    samples = bilinear(image, pixels)
     rows, columns = (pixels[..., 1] - 0.5).numpy(), (pixels[..., 0] - 0.5).numpy()
     for channel in range(2):
         expected = map_coordinates(image[..., channel].numpy(), [rows, columns], order=1, mode="nearest")
-        torch.testing.assert_close(made[..., channel], torch.from_numpy(expected), atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(samples[..., channel], torch.from_numpy(expected), atol=1e-5, rtol=0.0)
 
 
 def test_pixel_centres_are_at_halves():

@@ -69,7 +69,7 @@ def hidden(folder):
 @cases
 @pytest.mark.parametrize("kind", [no_space, broken_disk])
 def test_every_operation_may_fail(tmp_path, write, before, kind):
-    found = []
+    contents = []
     for number in range(100):
         target = tmp_path / str(number) / "target"
         target.parent.mkdir()
@@ -83,13 +83,13 @@ def test_every_operation_may_fail(tmp_path, write, before, kind):
                 failed = True
         assert failed == faulty.has_struck
         assert not hidden(target.parent)
-        found.append(content(target))
+        contents.append(content(target))
         if not failed:
             break
-    new = found[-1]
-    assert len(found) > 3
+    new = contents[-1]
+    assert len(contents) > 3
     assert new != old
-    assert all(each in (old, new) for each in found)
+    assert all(each in (old, new) for each in contents)
 
 
 @cases
@@ -218,7 +218,7 @@ def test_a_lock_that_cannot_be_written(tmp_path):
 
 @pytest.mark.thorough
 def test_no_module_needs_fcntl():
-    """Which Windows does not have; torch and filelock do without it."""
+    """Windows does not have fcntl; torch and filelock do without it."""
     code = """if True:
         import sys
         import torch, filelock
@@ -263,13 +263,13 @@ def checkpoint(target, count):
 def test_what_was_there_stays_until_all_fits(tmp_path, write):
     target = tmp_path / "target"
 
-    def found():
+    def contents():
         return content(target) if target.exists() else content(target.with_suffix(".mp4"))
 
     write(target, 5)
-    old = found()
+    old = contents()
     write(target, 9)
-    new = found()
+    new = contents()
     assert old != new
     refused = 0
     for size in (0, 1, 40, 100, 300, 500, 700, 1000, 2000, 4000, 8000, 16000, 10**9):
@@ -280,9 +280,9 @@ def test_what_was_there_stays_until_all_fits(tmp_path, write):
             except InputError as error:
                 refused += 1
                 assert "space" in str(error)
-                assert found() == old
+                assert contents() == old
                 continue
-        assert found() == new
+        assert contents() == new
     assert refused >= 3
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 

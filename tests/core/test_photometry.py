@@ -49,18 +49,18 @@ def test_wrong_depth_and_masked_or_clipped_pixels_do_not_count():
     depth = spoilt[2].depth.clone()
     depth[30:36], image[30:36] = 11.0, 90
     spoilt[2] = spoilt[2].with_maps(image=image, mask=mask, depth=depth)
-    found = fit_light(replace(scene, train=spoilt)).log_gains
-    torch.testing.assert_close(found, GAINS.log() - GAINS.log().mean(), atol=0.015, rtol=0.0)
+    fit = fit_light(replace(scene, train=spoilt)).log_gains
+    torch.testing.assert_close(fit, GAINS.log() - GAINS.log().mean(), atol=0.015, rtol=0.0)
 
 
 def test_frames_that_show_nothing_known():
     scene = gained(GAINS, every=12)
     black = scene.train[3].with_maps(image=torch.zeros_like(scene.train[3].image))
-    found = fit_light(replace(scene, train=[*scene.train[:3], black, *scene.train[4:]])).log_gains
-    assert found.isfinite().all() and found.abs().max() < 1.0
+    fit = fit_light(replace(scene, train=[*scene.train[:3], black, *scene.train[4:]])).log_gains
+    assert fit.isfinite().all() and fit.abs().max() < 1.0
     hidden = [frame.with_maps(mask=torch.zeros(48, 64, dtype=torch.bool)) for frame in scene.train]
-    found = fit_light(replace(scene, train=hidden))
-    assert found.log_gains.tolist() == [0.0] * 7 and found.cosine_exponents.tolist() == [0.0] * 3
+    fit = fit_light(replace(scene, train=hidden))
+    assert fit.log_gains.tolist() == [0.0] * 7 and fit.cosine_exponents.tolist() == [0.0] * 3
 
 
 def test_masked_pixels_have_no_influence_to_the_bit():
@@ -128,16 +128,16 @@ def lit_wall(offset, frames=24):
 @pytest.mark.parametrize("offset", [OFFSET, torch.zeros(3, dtype=torch.float64)])
 def test_lamp_and_exponents_and_gains_are_found(offset):
     scene, log_gains = lit_wall(offset)
-    found = fit_light(scene)
-    torch.testing.assert_close(found.lamp_offset.double(), offset, atol=0.1, rtol=0.0)
-    torch.testing.assert_close(found.cosine_exponents, torch.tensor(EXPONENTS["cosine"]), atol=0.06, rtol=0.0)
-    torch.testing.assert_close(found.incidence_exponents, torch.tensor(EXPONENTS["incidence"]), atol=0.06, rtol=0.0)
-    torch.testing.assert_close(found.log_gains.double(), log_gains, atol=0.01, rtol=0.0)
+    fit = fit_light(scene)
+    torch.testing.assert_close(fit.lamp_offset.double(), offset, atol=0.1, rtol=0.0)
+    torch.testing.assert_close(fit.cosine_exponents, torch.tensor(EXPONENTS["cosine"]), atol=0.06, rtol=0.0)
+    torch.testing.assert_close(fit.incidence_exponents, torch.tensor(EXPONENTS["incidence"]), atol=0.06, rtol=0.0)
+    torch.testing.assert_close(fit.log_gains.double(), log_gains, atol=0.01, rtol=0.0)
 
 
 @pytest.mark.thorough
 def test_a_wall_that_lights_itself(tmp_path):
-    """On a phantom's wall, whose gains err by 3 % where its interreflections are not part of the fit."""
+    """Fit on a phantom's wall, whose gains err by 3 % where its interreflections are not part of the fit."""
     size = {"width": 96, "height": 77, "supersampling": 1, "mesh_spacing": 1.0, "texture_spacing": 0.4}
     settings = PhantomSettings(seed=4, trajectory="inspection", frames=30, rotation_views=0, specular=0.0, **size)
     generate(settings, tmp_path / "phantom")
@@ -145,13 +145,13 @@ def test_a_wall_that_lights_itself(tmp_path):
     with (tmp_path / "phantom/truth/gain.csv").open() as rows:
         gains = {int(row["frame"]): float(row["gain_g"]) for row in csv.DictReader(rows)}
     expected = torch.tensor([gains[frame.index] for frame in scene.train]).log() / truth["gamma"]
-    found = fit_light(scene)
-    assert fit_light(scene.with_near_plane(scene.train[0].camera.near_plane)) is found, "once for all of its runs"
-    errors = found.log_gains - expected
+    fit = fit_light(scene)
+    assert fit_light(scene.with_near_plane(scene.train[0].camera.near_plane)) is fit, "once for all of its runs"
+    errors = fit.log_gains - expected
     assert float((errors - errors.mean()).square().mean().sqrt()) < 0.015
-    torch.testing.assert_close(found.lamp_offset, torch.tensor(truth["lamp"]["offset"]).float(), atol=0.5, rtol=0.0)
+    torch.testing.assert_close(fit.lamp_offset, torch.tensor(truth["lamp"]["offset"]).float(), atol=0.5, rtol=0.0)
     # Albedo of green .29; mutual visibility of folds is neglected.
-    assert found.albedo == pytest.approx(0.35, abs=0.1)
+    assert fit.albedo == pytest.approx(0.35, abs=0.1)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -181,17 +181,17 @@ def sphere(count, radius):
 
 @pytest.mark.parametrize("albedo", [0.0, 0.3, 0.5])
 def test_a_sphere_lights_every_point_alike(albedo):
-    """In a sphere, the form factor of a patch is its share of the area: irradiance of all, from any light."""
+    """The form factor in a sphere of a patch is its share of the area: irradiance of all, from any light."""
     points, normals = sphere(2400, 25.0)
     cavity = Cavity.of(points, normals)
     direct = torch.zeros(len(points[:: cavity.every]), 2, dtype=torch.float64)
     direct[:, 0], direct[:100, 1] = 3.0, 5.0
-    found = cavity.indirect(direct, albedo)
+    irradiance = cavity.indirect(direct, albedo)
     reflections = sum(albedo**bounce for bounce in range(1, 6))
-    expected = reflections * direct.mean(0).expand_as(found)
-    torch.testing.assert_close(found[:, 0], expected[:, 0], rtol=0.05, atol=1e-9)
+    expected = reflections * direct.mean(0).expand_as(irradiance)
+    torch.testing.assert_close(irradiance[:, 0], expected[:, 0], rtol=0.05, atol=1e-9)
     # Near patches are discs, not points: a few points are nearly on one.
-    torch.testing.assert_close(found[:, 1].median(), expected[0, 1], rtol=0.05, atol=1e-9)
+    torch.testing.assert_close(irradiance[:, 1].median(), expected[0, 1], rtol=0.05, atol=1e-9)
 
 
 def test_what_is_flat_or_faces_away_gets_nothing():

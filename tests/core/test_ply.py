@@ -19,10 +19,10 @@ FORMATS = {"<": "binary_little_endian", ">": "binary_big_endian", "a": "ascii"}
 
 def vertices(order: str = "<") -> np.ndarray:
     rng = np.random.default_rng(0)
-    made = np.empty(5, [(name, order + kind) for name, kind in FIELDS])
+    rows = np.empty(5, [(name, order + kind) for name, kind in FIELDS])
     for name, kind in FIELDS:
-        made[name] = rng.normal(size=5) if kind[0] == "f" else rng.integers(0, 255, 5)
-    return made
+        rows[name] = rng.normal(size=5) if kind[0] == "f" else rng.integers(0, 255, 5)
+    return rows
 
 
 def header(form: str, count: int = 5, more: str = "") -> str:
@@ -39,27 +39,27 @@ SPLIT = [(0, 1, 2), (0, 2, 3), (1, 2, 3), (1, 3, 4)]
     ("faces", "triangles"), [([], []), ([(0, 1, 2), (2, 3, 4)],) * 2, ([(0, 1, 2, 3), (1, 2, 3, 4)], SPLIT)]
 )
 def test_every_form(tmp_path, order, faces, triangles):
-    """With other lists, and polygons, which are split into triangles."""
+    """Files with other lists, and polygons, which are split into triangles."""
     binary = order.replace("a", "<")
-    made, path = vertices(binary), tmp_path / "p.ply"
-    body = made.tobytes()
+    table, path = vertices(binary), tmp_path / "p.ply"
+    body = table.tobytes()
     for face in faces:
         body += struct.pack("BB", 7, len(face)) + np.array(face, f"{binary}i4").tobytes()
         body += struct.pack("B", 2 * len(face)) + bytes(8 * len(face))
     if order == "a":
-        rows = [" ".join(repr(value.item()) for value in row) for row in made]
+        rows = [" ".join(repr(value.item()) for value in row) for row in table]
         rows += [f"7 {len(face)} {' '.join(map(str, face))} {2 * len(face)}{2 * len(face) * ' 0'}" for face in faces]
         body = "\n".join([*rows, ""]).encode()
     whole = header(FORMATS[order], more=f"element face 2\n{FACES}" if faces else "").encode() + body
     path.write_bytes(whole)
-    found = read_vertices(path)
-    assert list(found) == [name for name, _ in FIELDS]
+    properties = read_vertices(path)
+    assert list(properties) == [name for name, _ in FIELDS]
     for name, kind in FIELDS:
-        assert found[name].dtype == np.dtype(kind)
-        np.testing.assert_array_equal(found[name], made[name])
+        assert properties[name].dtype == np.dtype(kind)
+        np.testing.assert_array_equal(properties[name], table[name])
     points = load_points(path)
-    np.testing.assert_array_equal(points.positions[:, 0], made["x"])
-    np.testing.assert_array_equal(points.colors[:, 2], made["blue"])
+    np.testing.assert_array_equal(points.positions[:, 0], table["x"])
+    np.testing.assert_array_equal(points.colors[:, 2], table["blue"])
     if faces:
         assert set(map(tuple, np.sort(read_triangles(path)[1], axis=1).tolist())) == set(triangles)
         for cut in range(3, 40):

@@ -48,9 +48,9 @@ RENDERERS = ("torch",)
 def coliags(*argv: object) -> None:
     """Run a ``coliags`` command, or stop with what it said."""
     command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{' '.join(map(str, argv))}:\n{done.stderr}")
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode:
+        sys.exit(f"{' '.join(map(str, argv))}:\n{process.stderr}")
 
 
 def digests(run: Path) -> list[str]:
@@ -60,7 +60,7 @@ def digests(run: Path) -> list[str]:
 
 
 def fingerprint(data: Path, method: str, seed: int, changes: tuple[str, ...], folder: Path) -> dict[str, object]:
-    """What one run ends in, and whether it ends in the same when resumed."""
+    """Digest of the state that a run ends in, and of a resumed one."""
     run = folder / "run"
     shutil.rmtree(run, ignore_errors=True)
     growth = GROWTH.get(load_method(method).config.strategy.name, ())
@@ -91,16 +91,19 @@ def main() -> None:
     jobs = [(method, seed, ()) for method in options.methods for seed in range(options.seeds)]
     jobs += [("coliags", 0, (f"renderer.name={name}",)) for name in RENDERERS]
     before = json.loads(options.compare.read_text(encoding="utf-8")) if options.compare else {}
-    found = {}
+    fingerprints = {}
     with tempfile.TemporaryDirectory() as folder:
         for method, seed, changes in jobs:
             key = " ".join([method, str(seed), *changes])
             data = options.sparse if "sparse-depth" in method else options.data
-            found[key] = fingerprint(data, method, seed, changes, Path(folder))
-            verdict = "new" if key not in before else "same" if found[key] == before[key] else "DIFFERENT"
-            print(f"{key}: grown {found[key]['grown']}, resumed {found[key]['resumed_alike']} {verdict}", flush=True)
-            options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    sys.exit(any(found[key] != before[key] for key in before.keys() & found.keys()))
+            fingerprints[key] = fingerprint(data, method, seed, changes, Path(folder))
+            verdict = "new" if key not in before else "same" if fingerprints[key] == before[key] else "DIFFERENT"
+            print(
+                f"{key}: grown {fingerprints[key]['grown']}, resumed {fingerprints[key]['resumed_alike']} {verdict}",
+                flush=True,
+            )
+            options.out.write_text(json.dumps(fingerprints, indent=1) + "\n", encoding="utf-8")
+    sys.exit(any(fingerprints[key] != before[key] for key in before.keys() & fingerprints.keys()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What training and rendering cost: sums over resumptions, marks of quality, and no change of the result."""
+"""Costs of training and rendering: sums over resumptions, marks of quality, and no change of the result."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Clocks:
 
 @pytest.fixture
 def clocks(monkeypatch):
-    found = Clocks()
-    monkeypatch.setattr(costs, "_clocks", found)
-    return found
+    set_by_hand = Clocks()
+    monkeypatch.setattr(costs, "_clocks", set_by_hand)
+    return set_by_hand
 
 
 # The meter
@@ -66,9 +66,9 @@ def test_earlier_parts_of_the_run_are_added(clocks):
     meter = CostMeter(CPU, earlier)
     with meter.running():
         clocks.go_on(3, 5)
-    found = meter.cost()
-    assert (found.seconds, found.processor_seconds, found.peak_memory_mib) == (13.0, 25.0, 1e9)
-    assert found.device == device_name(CPU) and found.threads == torch.get_num_threads()
+    measured = meter.cost()
+    assert (measured.seconds, measured.processor_seconds, measured.peak_memory_mib) == (13.0, 25.0, 1e9)
+    assert measured.device == device_name(CPU) and measured.threads == torch.get_num_threads()
 
 
 def test_processor_time_counts_work_and_not_waiting():
@@ -80,10 +80,10 @@ def test_processor_time_counts_work_and_not_waiting():
 
 def test_the_peak_holds_what_is_allocated():
     before = costs.peak_memory_mib(CPU)
-    held = np.ones(64 * 2**20 + int(before - _resident_mib()) * 2**20, dtype=np.uint8)
+    block = np.ones(64 * 2**20 + int(before - _resident_mib()) * 2**20, dtype=np.uint8)
     after = costs.peak_memory_mib(CPU)
     assert 55 < after - before < 120
-    del held
+    del block
     assert costs.peak_memory_mib(CPU) == pytest.approx(after, abs=1.0), "a peak does not fall"
 
 
@@ -93,9 +93,9 @@ def _resident_mib():
 
 
 def test_without_proc_the_peak_is_that_of_getrusage(monkeypatch):
-    told = costs.peak_memory_mib(CPU)
+    peak = costs.peak_memory_mib(CPU)
     monkeypatch.setattr(costs, "Path", lambda path: Path("no such file"))
-    assert costs.peak_memory_mib(CPU) >= told * 0.99
+    assert costs.peak_memory_mib(CPU) >= peak * 0.99
     monkeypatch.setitem(sys.modules, "resource", None)
     assert costs.peak_memory_mib(CPU) is None
 
@@ -118,8 +118,8 @@ def test_the_cost_of_a_resumed_run_goes_on_from_its_checkpoint(tmp_path, clocks)
     clocks.go_on(1000, 1000)
     _tick(second, clocks)
     second.train()
-    found = final_state(second).cost
-    assert (found.seconds, found.processor_seconds) == (8.0, 16.0)
+    measured = final_state(second).cost
+    assert (measured.seconds, measured.processor_seconds) == (8.0, 16.0)
     assert [row["seconds"] for row in log_rows(second)] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
 
 
@@ -198,8 +198,8 @@ def test_marks_agree_with_means_taken_one_by_one(psnr, frames, every):
         for mark in PSNR_MARKS:
             if row["step"] >= frames and expected[str(mark)] is None and fmean(window) >= mark:
                 expected[str(mark)] = row["seconds"]
-    found = seconds_to_psnr(rows, frames)
-    assert found == expected
+    times = seconds_to_psnr(rows, frames)
+    assert times == expected
 
 
 # Blocks of 64 KiB, below the size from which glibc maps each apart; the last one stays, so that the heap cannot shrink.
@@ -222,7 +222,7 @@ for count in (2_000, 12_000):
     sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library has no malloc_trim"
 )
 def test_freed_memory_is_given_back_when_the_process_has_grown():
-    done = subprocess.run([sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, timeout=120)
-    of_little, of_much = map(int, done.stdout.split())
+    process = subprocess.run([sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, timeout=120)
+    of_little, of_much = map(int, process.stdout.split())
     assert of_little < 25  # of 125 MiB: the process has not grown enough
     assert of_much > 600  # of 750 MiB

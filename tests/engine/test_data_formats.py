@@ -1,4 +1,4 @@
-"""Which data manager reads a folder."""
+"""Choice of the data manager that reads a folder."""
 
 from __future__ import annotations
 

@@ -36,11 +36,11 @@ def test_tensorboard_reads_what_the_log_has(tmp_path):
     argv = ("train", "coliags", "--data", write_wall(tmp_path / "wall"), "--output", tmp_path / "run", *SETS)
     assert run(*argv, "--steps", 4, "--logger", "tensorboard", "--set", "schedule.log_every=1") == 0
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
-    found = logged(tmp_path / "run")
-    assert found.keys() == scalars(rows[0]).keys()
+    scalars_by_step = logged(tmp_path / "run")
+    assert scalars_by_step.keys() == scalars(rows[0]).keys()
     for row in rows:
         for name, value in scalars(row).items():
-            assert found[name][row["step"]] == pytest.approx(value, rel=1e-6)
+            assert scalars_by_step[name][row["step"]] == pytest.approx(value, rel=1e-6)
 
 
 def test_what_is_repeated_after_a_resumption_is_there_once(tmp_path):
@@ -64,8 +64,8 @@ def test_wandb_stays_on_this_machine(tmp_path, monkeypatch):
         ids.add(logger._run.id)
         logger.close()
     assert len(ids) == 1
-    kept = list((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
-    assert kept and all(b"loss" in file.read_bytes() for file in kept)
+    files = list((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
+    assert files and all(b"loss" in file.read_bytes() for file in files)
 
 
 class Failing(Follower):

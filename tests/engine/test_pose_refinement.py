@@ -36,9 +36,9 @@ def model():
         torch.arange(count),
         torch.arange(count),
     )
-    made = Model(FieldOf(wall), TorchRenderer(TorchRendererSettings()), {})
-    made.register_parameter("weight", torch.nn.Parameter(torch.ones(1)))
-    return made
+    tube_model = Model(FieldOf(wall), TorchRenderer(TorchRendererSettings()), {})
+    tube_model.register_parameter("weight", torch.nn.Parameter(torch.ones(1)))
+    return tube_model
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +73,9 @@ def test_its_scores_are_better(model, frame):
     scorer = Scorer("paper", ["psnr", "ssim"])
     darker = frame.with_maps(image=(frame.image * 0.8).to(torch.uint8))
     wrong = replace(darker, camera=frame.camera.moved(torch.zeros(3), torch.tensor([0.5, 0.0, 0.0]), 40.0))
-    given = scorer.score(scorer.compare(model, wrong, torch.device("cpu"))).values
+    scores = scorer.score(scorer.compare(model, wrong, torch.device("cpu"))).values
     refined, fitted = (scorer.score(view).values for view in scorer.refined(model, wrong))
-    assert refined["psnr"] > given["psnr"] + 0.1
+    assert refined["psnr"] > scores["psnr"] + 0.1
     assert fitted["psnr"] > refined["psnr"] + 10.0 and fitted["psnr"] > 35.0
 
 

@@ -58,17 +58,17 @@ def make_trainer(path, method, steps=4, more=(), scene=None):
 
 
 def waits_of_a_step(path, method, *options):
-    """How often a step in the middle of a run waits, by what for and file."""
+    """Number of waits of a step in the middle of a run, by cause and file."""
     with PretendedCuda() as device:
         trainer = make_trainer(path, method, 40, options, rich_scene())
         trainer.step = 20
         for _ in range(2):
             device.waits.clear()
             trainer.take_step()
-    found = Counter()
+    waits = Counter()
     for place, count in device.waits.items():
-        found[place.rsplit(":", 1)[0]] += count
-    return found
+        waits[place.rsplit(":", 1)[0]] += count
+    return waits
 
 
 def rich_scene(width=16, height=12):
@@ -211,20 +211,20 @@ def test_a_step_waits_for_its_losses_and_for_lists_only(method, tmp_path):
     pytest.importorskip("triton")  # without it, anchors are decoded by PyTorch, with more lists
     # The device has no room for the frames: they are sent at every step.
     with mock.patch("coliags_plugin.engine.trainer._size", lambda frame: 2**40):
-        found = waits_of_a_step(tmp_path / "run", method, *STEPS[method])
-    found = Counter({place: count for place, count in found.items() if "renderers/" not in place})
-    assert found <= WAITS and found["tolist engine/trainer.py"] == 1
+        waits = waits_of_a_step(tmp_path / "run", method, *STEPS[method])
+    waits = Counter({place: count for place, count in waits.items() if "renderers/" not in place})
+    assert waits <= WAITS and waits["tolist engine/trainer.py"] == 1
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", ["coliags", "2dgs"])
 def test_triton_kernels_wait_for_the_number_of_pairs_besides(method, tmp_path):
     pytest.importorskip("triton")
-    found = waits_of_a_step(tmp_path / "run", method, "renderer=triton")
-    assert found <= WAITS + Counter({"local_scalar_dense renderers/triton_kernels/placing.py": 1})
+    waits = waits_of_a_step(tmp_path / "run", method, "renderer=triton")
+    assert waits <= WAITS + Counter({"local_scalar_dense renderers/triton_kernels/placing.py": 1})
 
 
 @pytest.mark.thorough
 def test_the_volume_renderer_waits_for_nothing(tmp_path):
-    found = waits_of_a_step(tmp_path / "run", "reim-nerf-small", *STEPS["reim-nerf-small"])
-    assert found == Counter({"tolist engine/trainer.py": 1})
+    waits = waits_of_a_step(tmp_path / "run", "reim-nerf-small", *STEPS["reim-nerf-small"])
+    assert waits == Counter({"tolist engine/trainer.py": 1})

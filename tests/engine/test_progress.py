@@ -22,15 +22,15 @@ def clock(monkeypatch):
 def count(clock, titles, seconds, **options):
     with progress_callback(**options) as report:
         for title in titles:
-            for done in range(1, 11):
+            for count_done in range(1, 11):
                 clock[0] += seconds
-                report(title, done, 10)
+                report(title, count_done, 10)
 
 
 def test_each_title_ends_with_a_line(clock, capsys):
     count(clock, ["read", "fuse"], 0.01)
-    said = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[0] for line in said] == ["read 10/10", "fuse 10/10"]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in lines] == ["read 10/10", "fuse 10/10"]
 
 
 def test_what_is_quick_is_not_mentioned(clock, capsys):
@@ -40,24 +40,24 @@ def test_what_is_quick_is_not_mentioned(clock, capsys):
 
 def test_what_takes_long_is(clock, capsys):
     count(clock, ["read", "fuse"], 6.0, after=2.0)
-    said = capsys.readouterr().err.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     # A line every ten seconds, at most, from two seconds on.
-    assert [line.split(",")[0] for line in said[:2]] == ["read 4/10", "read 6/10"]
-    assert said[-1].startswith("fuse 10/10")
-    assert len(said) == 2 * 4
+    assert [line.split(",")[0] for line in lines[:2]] == ["read 4/10", "read 6/10"]
+    assert lines[-1].startswith("fuse 10/10")
+    assert len(lines) == 2 * 4
     # Six seconds a step: what was done before the first word does not count as done in no time.
-    assert "36.0 s to go" in said[0]
+    assert "36.0 s to go" in lines[0]
 
 
 def test_the_first_step_and_a_slow_one_do_not_count_for_much(clock, capsys):
     """Kernels are compiled in the first: 25 s then would promise hours."""
     with ProgressReport("train", 1001, plain_every=0.0) as report:
-        for done in range(1, 502):
-            clock[0] += 25.4 if done == 1 else 5.0 if done == 400 else 0.1
-            report.update(done)
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "train 1/1001"
-    assert said[1] == "train 2/1001, 1 min 40 s to go" and said[-1] == "train 501/1001, 55.0 s to go"
+        for count_done in range(1, 502):
+            clock[0] += 25.4 if count_done == 1 else 5.0 if count_done == 400 else 0.1
+            report.update(count_done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "train 1/1001"
+    assert lines[1] == "train 2/1001, 1 min 40 s to go" and lines[-1] == "train 501/1001, 55.0 s to go"
 
 
 def test_a_terminal_shows_the_facts_and_the_end(clock):
@@ -68,7 +68,7 @@ def test_a_terminal_shows_the_facts_and_the_end(clock):
 
 
 class Shown:
-    """In place of a notebook: what it shows at last, and how often it changed."""
+    """Stand-in for a notebook: the text it shows at last, and how often it changed."""
 
     def __init__(self):
         self.text, self.changes = "", 0
@@ -88,9 +88,9 @@ def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
     monkeypatch.setattr("IPython.display.display", shown)
     console = Console(force_jupyter=True)
     with ProgressReport("train", 1000, console=console) as report:
-        for done in range(1, 1001):
+        for count_done in range(1, 1001):
             clock[0] += 0.01
-            report.update(done, f"loss {done}")
+            report.update(count_done, f"loss {count_done}")
     assert shown.text == "train 1000/1000, took 10.0 s  loss 1000"
     assert 15 <= shown.changes <= 22  # two a second
     assert capsys.readouterr() == ("", "")

@@ -1,4 +1,4 @@
-"""What training recovers of a lamp, learned numbers in results, other lamps after training, and flattened light."""
+"""Lamps recovered by training, learned numbers in results, other lamps after training, and flattened light."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def lit_wall(frames: int = 10) -> Scene:
     ]
     centers = torch.stack([camera.center for camera in cameras])
     extent = 1.1 * (centers - centers.mean(0)).norm(dim=1).max()
-    made = []
+    views = []
     for index, camera in enumerate(cameras):
         rays = camera.rays()
         points = camera.center + ((20.0 - camera.center[2]) / rays[..., 2])[..., None] * rays
@@ -44,10 +44,10 @@ def lit_wall(frames: int = 10) -> Scene:
         density = squared / (math.pi * (cosine**2 * (squared - 1) + 1) ** 2)
         mirrored = F0 * density / (4 * (cosine * (1 - k) + k) ** 2)
         light = arriving * (wall_albedo(points) * (1 - F0) / math.pi + mirrored)
-        made.append(Frame.of(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
+        views.append(Frame.of(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
     x, y = torch.meshgrid(torch.arange(-22.0, 22, 0.8), torch.arange(-16.0, 16, 0.8), indexing="ij")
     points = torch.stack([x, y, torch.full_like(x, 20.0)], -1).reshape(-1, 3)
-    return Scene("lit", made, {"test": made[:1]}, PointCloud(points), Provenance(fingerprint="lit"))
+    return Scene("lit", views, {"test": views[:1]}, PointCloud(points), Provenance(fingerprint="lit"))
 
 
 def wall_albedo(points):
@@ -86,11 +86,11 @@ def test_training_recovers_the_fall_off_and_the_roughness(tmp_path):
     arriving = intensity / (1 + falloff * distances**exponent)
     ratio = arriving / (INTENSITY / (1 + FALLOFF * distances**EXPONENT))
     assert ratio.max() / ratio.min() < 1.03  # the start, 2 / (1 + 0.95 d^2), is off by a factor of 2.4
-    seen = field.gaussians(scene.train[5].camera)
-    assert seen.features["roughness"].mean().item() == pytest.approx(ROUGHNESS, abs=0.03)
+    gaussians = field.gaussians(scene.train[5].camera)
+    assert gaussians.features["roughness"].mean().item() == pytest.approx(ROUGHNESS, abs=0.03)
     scale = ratio.mean().item()
-    assert seen.features["f0"].mean().item() * scale == pytest.approx(F0, rel=0.1)
-    shares = seen.features["albedo"] * scale / wall_albedo(seen.means)
+    assert gaussians.features["f0"].mean().item() * scale == pytest.approx(F0, rel=0.1)
+    shares = gaussians.features["albedo"] * scale / wall_albedo(gaussians.means)
     assert shares.log().mean(0).abs().max() < 0.05
 
 

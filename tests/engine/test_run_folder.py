@@ -14,7 +14,7 @@ from coliags_plugin.engine.run_folder import RunFolder
 
 @pytest.fixture
 def stopped_clock(monkeypatch):
-    """The same second for ever."""
+    """A clock that stands still."""
 
     class Clock(datetime):
         @classmethod

@@ -30,13 +30,13 @@ STEPS = 6
 
 @pytest.fixture(scope="module")
 def scene():
-    """With a second test set, whose frames have seen masks, and points from a test frame's image."""
-    made = wall_scene()
+    """A scene with a second test set, whose frames have seen masks, and points from a test frame's image."""
+    wall = wall_scene()
     left = torch.zeros(24, 32, dtype=torch.bool)
     left[:, :16] = True
-    turned = [replace(frame.with_maps(seen=left), name=f"turned-{frame.name}") for frame in made.test_sets["test"]]
-    provenance = made.provenance.model_copy(update={"held_out_used": {"points": ["0000"]}})
-    return replace(made, test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
+    turned = [replace(frame.with_maps(seen=left), name=f"turned-{frame.name}") for frame in wall.test_sets["test"]]
+    provenance = wall.provenance.model_copy(update={"held_out_used": {"points": ["0000"]}})
+    return replace(wall, test_sets={**wall.test_sets, "rotation": turned}, provenance=provenance)
 
 
 @pytest.fixture(scope="module")
@@ -116,29 +116,29 @@ def test_its_values_are_those_of_the_metrics(result, whole, scene):
 
 def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
     assert "psnr_seen" not in result.sets["test"].values
-    seen, everywhere = (result.sets["rotation"].values[name] for name in ("psnr_seen", "psnr"))
-    assert all(value is not None for value in seen) and seen != everywhere
+    over_seen, everywhere = (result.sets["rotation"].values[name] for name in ("psnr_seen", "psnr"))
+    assert all(value is not None for value in over_seen) and over_seen != everywhere
     assert list(result.metrics)[-5:] == [
         "psnr_seen", "psnr_gain_fitted_seen", "ssim_seen", "depth_mse_seen", "depth_median_error_seen",
     ]  # fmt: skip
     for suffix in ("", "_seen"):
         fitted, plain = (result.sets["rotation"].values[name + suffix] for name in ("psnr_gain_fitted", "psnr"))
-        assert all(one >= other for one, other in zip(fitted, plain, strict=True))
+        assert all(fitted_value >= other for fitted_value, other in zip(fitted, plain, strict=True))
     assert result.metrics["depth_mse_seen"] == result.metrics["depth_mse"]
 
 
 @pytest.mark.thorough
 def test_refined_poses_add_metrics_and_change_no_other(result, whole):
-    found = evaluate(whole, "paper", refine_poses=True)
+    other_result = evaluate(whole, "paper", refine_poses=True)
     added = ["psnr_pose_refined", "ssim_pose_refined", "psnr_pose_color_refined", "ssim_pose_color_refined"]
-    assert list(found.metrics) == [*result.metrics, *added]
+    assert list(other_result.metrics) == [*result.metrics, *added]
     for name, part in result.sets.items():
-        own = found.sets[name]
-        assert {key: own.values[key] for key in part.values} == part.values
-        assert own.predictions_sha256 == part.predictions_sha256
-        assert all(None not in own.values[key] for key in added)
-    assert found.metrics["psnr_pose_refined"] == result.metrics["psnr"] and found.key != result.key
-    assert means_summary(found)["psnr_pose_refined"] == found.mean("psnr_pose_refined")
+        refined_part = other_result.sets[name]
+        assert {key: refined_part.values[key] for key in part.values} == part.values
+        assert refined_part.predictions_sha256 == part.predictions_sha256
+        assert all(None not in refined_part.values[key] for key in added)
+    assert other_result.metrics["psnr_pose_refined"] == result.metrics["psnr"] and other_result.key != result.key
+    assert means_summary(other_result)["psnr_pose_refined"] == other_result.mean("psnr_pose_refined")
     evaluate(whole, "paper")  # as other tests expect it
 
 
@@ -164,26 +164,26 @@ def test_profiles_and_metrics_agree(result):
 
 def test_a_killed_and_resumed_run_has_the_same_result(loaded, result):
     resumed = loaded(stop=4, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
-    found = evaluate(resumed, "paper")
-    assert found.sets == result.sets
-    assert found.metrics_sha256 == result.metrics_sha256
+    other_result = evaluate(resumed, "paper")
+    assert other_result.sets == result.sets
+    assert other_result.metrics_sha256 == result.metrics_sha256
 
 
 def test_another_model_has_other_predictions_and_the_same_truth(loaded, result):
-    found = evaluate(loaded(seed=1), "paper")
-    assert found.key != result.key and found.metrics_sha256 != result.metrics_sha256
+    other_result = evaluate(loaded(seed=1), "paper")
+    assert other_result.key != result.key and other_result.metrics_sha256 != result.metrics_sha256
     for name, part in result.sets.items():
-        assert found.sets[name].predictions_sha256 != part.predictions_sha256
-        assert found.sets[name].truth_sha256 == part.truth_sha256
+        assert other_result.sets[name].predictions_sha256 != part.predictions_sha256
+        assert other_result.sets[name].truth_sha256 == part.truth_sha256
 
 
 def test_other_truth_has_another_hash(loaded, result, whole, scene):
     frames = scene.test_sets["rotation"]
     everything = [frame.with_maps(seen=torch.ones(24, 32, dtype=torch.bool)) for frame in frames]
     other = replace(whole, scene=replace(scene, test_sets={"rotation": everything}))
-    found = evaluate(other, "paper").sets["rotation"]
-    assert found.predictions_sha256 == result.sets["rotation"].predictions_sha256
-    assert found.truth_sha256 != result.sets["rotation"].truth_sha256
+    other_result = evaluate(other, "paper").sets["rotation"]
+    assert other_result.predictions_sha256 == result.sets["rotation"].predictions_sha256
+    assert other_result.truth_sha256 != result.sets["rotation"].truth_sha256
 
 
 @pytest.mark.thorough
@@ -204,7 +204,7 @@ def test_a_run_that_other_code_trained_has_a_key_of_its_own(whole, result):
         {**whole.provenance, "code": "0123456789abcdef"},
         {**whole.provenance, "code_changes": [{"at_step": 3, "code": "0123456789abcdef"}]},
     ]
-    keys = [evaluate(replace(whole, provenance=own), "paper").key for own in others]
+    keys = [evaluate(replace(whole, provenance=provenance), "paper").key for provenance in others]
     assert len({*keys, result.key}) == 3
 
 

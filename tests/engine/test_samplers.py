@@ -1,4 +1,4 @@
-"""What a training step looks at."""
+"""Samplers: the frames and pixels of a training step."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def test_pixels_are_shared_between_frames_and_lie_inside(pixels, frames, counts)
 
 def test_every_pixel_comes_up():
     sampler = make(pixels=64, frames=1)
-    seen = {
+    pixels = {
         (draws[0].frame, *pixel) for draws in (sampler.next() for _ in range(60)) for pixel in draws[0].pixels.tolist()
     }
-    assert len(seen) == sum(width * height for width, height in SIZES)
+    assert len(pixels) == sum(width * height for width, height in SIZES)
 
 
 def test_targets_at_pixels():

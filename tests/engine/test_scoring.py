@@ -23,27 +23,27 @@ def comparison(error=0.1):
 
 
 @pytest.mark.parametrize(
-    ("found", "reason"),
+    ("value", "reason"),
     [
         (float("nan"), "the metric is nan"),
         (float("-inf"), "the metric is -inf"),
         (UnavailableError("no weights"), "no weights"),
     ],
 )
-def test_a_metric_that_cannot_be_had_has_a_reason(found, reason, monkeypatch):
-    monkeypatch.setattr(PSNR, "__call__", mock.Mock(side_effect=[found]))
+def test_a_metric_that_cannot_be_had_has_a_reason(value, reason, monkeypatch):
+    monkeypatch.setattr(PSNR, "__call__", mock.Mock(side_effect=[value]))
     scores = Scorer("paper", only=("psnr", "ssim")).score(comparison())
     assert scores.reasons == {"psnr": reason} and set(scores.values) == {"ssim"}
 
 
 def test_views_that_show_nothing_within_their_masks_are_counted():
-    left, nothing, everything = torch.zeros(16, 16, dtype=torch.bool), torch.zeros(16, 16), torch.ones(16, 16)
-    left[:, :8] = True
+    left_half, nothing, everything = torch.zeros(16, 16, dtype=torch.bool), torch.zeros(16, 16), torch.ones(16, 16)
+    left_half[:, :8] = True
     views = [
         (None, nothing),
-        (left, (~left).float()),
-        (left, left.float()),
-        (~left & left, nothing),
+        (left_half, (~left_half).float()),
+        (left_half, left_half.float()),
+        (~left_half & left_half, nothing),
         (None, everything),
     ]
     evaluated = EvaluatedSet("mm", Scorer("paper", only=("psnr",)))

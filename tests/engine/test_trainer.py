@@ -276,13 +276,13 @@ def test_a_changed_schedule_is_recorded(tmp_path):
     longer = make_trainer(tmp_path / "run", steps=6)
     longer.resume()
     longer.train()
-    found = longer.run.provenance()
-    assert found["steps"] == longer.run.method().config.schedule.steps == 6
-    assert found["plan"] == longer.strategy.plan()
-    (change,) = found["schedule_changes"]
+    provenance = longer.run.provenance()
+    assert provenance["steps"] == longer.run.method().config.schedule.steps == 6
+    assert provenance["plan"] == longer.strategy.plan()
+    (change,) = provenance["schedule_changes"]
     assert (change["at_step"], change["from"]["steps"], change["to"]["steps"]) == (4, 4, 6)
     make_trainer(tmp_path / "run", steps=6).resume()
-    assert longer.run.provenance() == found
+    assert longer.run.provenance() == provenance
     with pytest.raises(InputError, match="has taken 6 steps already"):
         make_trainer(tmp_path / "run", steps=5).resume()
 
@@ -424,12 +424,12 @@ def test_learning_rates_follow_the_papers_schedules(tmp_path):
 
 def test_provenance_says_where_the_run_came_from(tmp_path):
     trainer = train(tmp_path / "run", steps=1, seed=5)
-    found = json.loads(trainer.run.provenance_file.read_text())
-    assert found["seed"] == 5
-    assert found["renderer"] == "cpu"
-    assert "auto" in found["renderer_reason"]
-    assert found["scene"]["provenance"]["fingerprint"] == "wall-9-True"
-    assert software().items() <= found.items()
+    provenance = json.loads(trainer.run.provenance_file.read_text())
+    assert provenance["seed"] == 5
+    assert provenance["renderer"] == "cpu"
+    assert "auto" in provenance["renderer_reason"]
+    assert provenance["scene"]["provenance"]["fingerprint"] == "wall-9-True"
+    assert software().items() <= provenance.items()
 
 
 # Memory of a device

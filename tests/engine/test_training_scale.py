@@ -83,27 +83,27 @@ def test_the_median_depth_in_view_becomes_that_of_a_colon(small, factor):
 
 @pytest.mark.thorough
 def test_a_scene_of_unknown_unit_trains_like_the_same_in_mm(runs, factor):
-    own, mm = runs
-    assert own.provenance["scene"]["provenance"]["training_scale"] == own.model.scale == factor
-    assert mm.model.scale == 1.0 and own.step == mm.step == 6
-    for one, other in zip(own.model.parameters(), mm.model.parameters(), strict=True):
-        assert torch.equal(one, other)
+    unscaled, mm = runs
+    assert unscaled.provenance["scene"]["provenance"]["training_scale"] == unscaled.model.scale == factor
+    assert mm.model.scale == 1.0 and unscaled.step == mm.step == 6
+    for first, other in zip(unscaled.model.parameters(), mm.model.parameters(), strict=True):
+        assert torch.equal(first, other)
 
 
 def test_views_have_depths_in_their_own_unit(runs, factor):
-    own, mm = runs
-    for one, other in zip(own.scene.video, mm.scene.video, strict=True):
-        given, at_scale = render_view(own, one, DEPTHS), render_view(mm, other, DEPTHS)
-        torch.testing.assert_close(given.rgb, at_scale.rgb, atol=1e-4, rtol=1e-4)
-        torch.testing.assert_close(factor * given["depth_expected"], at_scale["depth_expected"], rtol=1e-3, atol=1e-3)
-        inverse = given["inverse_depth_accumulated"] / factor
+    unscaled, mm = runs
+    for first, other in zip(unscaled.scene.video, mm.scene.video, strict=True):
+        view, at_scale = render_view(unscaled, first, DEPTHS), render_view(mm, other, DEPTHS)
+        torch.testing.assert_close(view.rgb, at_scale.rgb, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(factor * view["depth_expected"], at_scale["depth_expected"], rtol=1e-3, atol=1e-3)
+        inverse = view["inverse_depth_accumulated"] / factor
         torch.testing.assert_close(inverse, at_scale["inverse_depth_accumulated"], rtol=1e-3, atol=1e-4)
-        torch.testing.assert_close(factor * given.camera.center, at_scale.camera.center, rtol=1e-4, atol=1e-4)
-    flat, flat_mm = flatten(own), flatten(mm)
+        torch.testing.assert_close(factor * view.camera.center, at_scale.camera.center, rtol=1e-4, atol=1e-4)
+    flat, flat_mm = flatten(unscaled), flatten(mm)
     assert factor * flat.held.distance == pytest.approx(flat_mm.held.distance, rel=1e-3)
-    one, other = (render_view(run, run.scene.train[0], DEPTHS[:3]) for run in (flat, flat_mm))
-    torch.testing.assert_close(one.rgb, other.rgb, atol=1e-3, rtol=1e-3)
-    torch.testing.assert_close(factor * one["depth_accumulated"], other["depth_accumulated"], rtol=1e-3, atol=1e-3)
+    first, other = (render_view(run, run.scene.train[0], DEPTHS[:3]) for run in (flat, flat_mm))
+    torch.testing.assert_close(first.rgb, other.rgb, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(factor * first["depth_accumulated"], other["depth_accumulated"], rtol=1e-3, atol=1e-3)
 
 
 def test_evaluations_are_in_its_own_unit(runs, factor):

@@ -27,13 +27,13 @@ def changed(scene, change, **values):
 
 @pytest.fixture(scope="module")
 def true():
-    """With views beyond the path, whose seen masks are of this scene's split."""
-    made = wall_scene()
-    seen = torch.zeros(24, 32, dtype=torch.bool)
-    seen[:, :16] = True
-    turned = [replace(frame.with_maps(seen=seen), name=f"turned-{frame.name}") for frame in made.test_sets["test"]]
+    """A scene with views beyond the path, whose seen masks are of this scene's split."""
+    wall = wall_scene()
+    mask = torch.zeros(24, 32, dtype=torch.bool)
+    mask[:, :16] = True
+    turned = [replace(frame.with_maps(seen=mask), name=f"turned-{frame.name}") for frame in wall.test_sets["test"]]
     provenance = Provenance(fingerprint="true", split=SplitRecord(name="every-8th"))
-    return replace(made, name="phantom", test_sets={**made.test_sets, "rotation": turned}, provenance=provenance)
+    return replace(wall, name="phantom", test_sets={**wall.test_sets, "rotation": turned}, provenance=provenance)
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +45,8 @@ def estimated(true):
         return replace(estimate, sparse_depth=points)
 
     sets = {"test": true.test_sets["test"]}
-    own = SplitRecord(name="own")
-    provenance = Provenance(fingerprint="estimated", split=own, unit="unknown", dataset="nerfstudio")
+    split = SplitRecord(name="own")
+    provenance = Provenance(fingerprint="estimated", split=split, unit="unknown", dataset="nerfstudio")
     return changed(replace(true, test_sets=sets), change, name="estimate", provenance=provenance)
 
 
@@ -83,8 +83,8 @@ def test_or_by_index_where_names_differ(true, estimated):
 
 def test_of_another_split_the_seen_masks_do_not_hold(true, estimated):
     moved = [*estimated.train[1:], *estimated.test_sets["test"]]
-    own = replace(estimated, train=moved, test_sets={"test": estimated.train[:1]})
-    truth = match_truth(own, true)
+    own_scene = replace(estimated, train=moved, test_sets={"test": estimated.train[:1]})
+    truth = match_truth(own_scene, true)
     assert truth.scene.provenance.split_name == "own"
     assert [frame.name for frame in truth.scene.test_sets["test"]] == [estimated.train[0].name]
     assert all(frame.seen is None for frames in truth.scene.test_sets.values() for frame in frames)
@@ -116,12 +116,12 @@ def test_on_its_own_scene_depth_metrics_have_a_reason(trained):
 
 
 def test_against_the_truth_they_are_measured(trained, true):
-    result, own = evaluate(trained, "paper", true), evaluate(trained, "paper")
-    assert result.evaluation_name == "paper-truth" and own.evaluation_name == "paper"
-    assert result.key != own.key
+    result, own_result = evaluate(trained, "paper", true), evaluate(trained, "paper")
+    assert result.evaluation_name == "paper-truth" and own_result.evaluation_name == "paper"
+    assert result.key != own_result.key
     assert result.title.startswith("coliags-estimated-depth on phantom (trained on estimate), seed 0")
     assert result.scene.name == "phantom" and result.scene.fingerprint == "true" and result.scene.split == "every-8th"
-    assert result.mean("psnr") == own.mean("psnr")
+    assert result.mean("psnr") == own_result.mean("psnr")
     assert all(result.mean("depth_mse", name) is not None for name in ("test", "rotation"))
     assert result.mean("psnr_seen", "rotation") is not None
     assert result.metrics["depth_mse"].unit == "mm^2" and "sparse_depth_median" not in result.metrics
