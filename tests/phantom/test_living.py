@@ -18,7 +18,7 @@ from coliags_plugin.phantom.colon import WAVE_LENGTH, WAVE_SPEED, breathing, per
 from coliags_plugin.phantom.generate import PreparedPhantom, generate, prepare
 from coliags_plugin.phantom.imaging import Sensor
 from coliags_plugin.phantom.props import Cover
-from coliags_plugin.phantom.settings import IN_VIVO, PhantomSettings, phantom_settings
+from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.tracing import Tracer
 from coliags_plugin.phantom.trajectory import poses_between, poses_during, rotation
 from tests.phantom.phantom_layouts import TINY
@@ -187,10 +187,3 @@ def test_a_wall_that_moves_over_the_camera_is_refused(monkeypatch):
     monkeypatch.setattr("coliags_plugin.phantom.generate._CLEAR", 30.0)
     with pytest.raises(InputError, match=r"from the camera at frame 0"):
         prepared(PhantomSettings(**SMALL, wave=1.0))
-
-
-def test_settings_that_are_given_win_over_the_preset_and_the_record_is_read_back():
-    settings = phantom_settings({"preset": "in-vivo", "wave": 0.0, "frames": 30})
-    assert settings.wave == 0.0 and settings.frames == 30 and settings.breathing == IN_VIVO["breathing"]
-    assert PhantomSettings(**settings.model_dump()) == settings
-    assert phantom_settings({}).model_dump() == PhantomSettings().model_dump()

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.phantom import light as lighting
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
@@ -31,28 +31,10 @@ def phantom(tmp_path_factory) -> Path:
     return folder
 
 
-def read(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None, path
-    return image
-
-
-def z_depth(path: Path) -> torch.Tensor:
-    return torch.from_numpy(read(path).astype(np.float64) * (100.0 / 65535.0))
-
-
-def poses(path: Path) -> np.ndarray:
-    return np.array([[float(number) for number in line.split(",")] for line in path.read_text().splitlines()])
-
-
-def cameras(folder: Path) -> list[Camera]:
-    k = json.loads((folder / "camera.json").read_text())
-    assert sorted(k) == ["cx", "cy", "fx", "fy", "h", "w"]
-    stored = poses(folder / "camera_pose.txt").reshape(-1, 4, 4).transpose(0, 2, 1)
-    return [
-        Camera(k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5, k["w"], k["h"], torch.from_numpy(pose.copy()))
-        for pose in stored
-    ]
+def image(path: Path) -> np.ndarray:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None, path
+    return pixels
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -60,11 +42,17 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+@pytest.fixture(scope="module")
+def scene(phantom) -> Scene:
+    return phantom_layouts.read(phantom, "c3vd")
+
+
 def test_layout_is_coliags_own(phantom):
     assert [path.name for path in sorted((phantom / "images").iterdir())] == [f"{i:04d}_color.png" for i in range(17)]
-    color, depth = read(phantom / "images/0000_color.png"), read(phantom / "depths/0016_depth.png")
+    color, depth = image(phantom / "images/0000_color.png"), image(phantom / "depths/0016_depth.png")
     assert color.shape == (38, 48, 3) and color.dtype == np.uint8
     assert depth.shape == (38, 48) and depth.dtype == np.uint16 and depth.min() > 0
+    assert sorted(json.loads((phantom / "camera.json").read_text())) == ["cx", "cy", "fx", "fy", "h", "w"]
     rotated = phantom / "rotation"
     assert len(list((rotated / "images").iterdir())) == len(list((rotated / "seen").iterdir())) == 3
     assert (rotated / "camera.json").read_text() == (phantom / "camera.json").read_text()
@@ -73,45 +61,38 @@ def test_layout_is_coliags_own(phantom):
     assert record["settings"]["gain"] == "auto" and record["settings"]["width"] == 48
 
 
-def test_the_image_is_exposed_and_red(phantom):
-    for path in (phantom / "images").iterdir():
-        blue, green, red = (read(path) / 255.0).mean(axis=(0, 1))
+def test_the_image_is_exposed_and_red(scene):
+    for frame in scene.video:
+        red, green, blue = frame.rgb.mean(dim=(0, 1)).tolist()
         assert 0.35 < (red + green + blue) / 3 < 0.55
         assert red > 1.3 * green and green > blue
 
 
-def test_poses_are_rigid_column_major_and_those_of_the_truth(phantom):
+def test_poses_are_column_major_and_those_of_the_truth(phantom):
     truth = np.load(phantom / "truth/camera_to_world.npy")
-    rows = poses(phantom / "camera_pose.txt")
-    assert rows.shape == (17, 16)
-    assert np.all(rows[:, [3, 7, 11]] == 0.0) and np.all(rows[:, 15] == 1.0)
-    np.testing.assert_allclose(rows[:, 12:15], truth[:, :3, 3], rtol=1e-8)
-    for row in rows:
-        rotation = row.reshape(4, 4).T[:3, :3]
-        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-7)
-        assert np.linalg.det(rotation) == pytest.approx(1.0)
+    rows = np.loadtxt(phantom / "camera_pose.txt", delimiter=",")
+    np.testing.assert_allclose(rows.reshape(17, 4, 4).transpose(0, 2, 1), truth, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        truth[:, :3, :3] @ truth[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (17, 1, 1)), atol=1e-12
+    )
 
 
-def test_seen_masks_agree_with_a_depth_test(phantom):
-    views = cameras(phantom)
-    training = [index for index in range(17) if index % 8]
+def test_seen_masks_agree_with_a_depth_test(phantom, scene):
     agreement = []
-    for number, rotated in enumerate(cameras(phantom / "rotation")):
-        depth = z_depth(phantom / f"rotation/depths/{number:04d}_depth.png")
-        mask = read(phantom / f"rotation/seen/{number:04d}_seen.png")
-        assert mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 255}
-        points = rotated.unproject(depth).reshape(-1, 3)
+    for view in scene.test_sets["rotation"]:
+        mask = view.seen.reshape(-1)
+        points = view.camera.unproject(view.depth).reshape(-1, 3)
         seen = torch.zeros(len(points), dtype=torch.bool)
-        for index in training:
-            other = z_depth(phantom / f"depths/{index:04d}_depth.png")
-            pixels, z = views[index].project(points)
+        for frame in scene.train:
+            pixels, z = frame.camera.project(points)
             column, row = (pixels - 0.5).round().long().unbind(-1)
             framed = (z > 0) & (column >= 0) & (row >= 0) & (column < 48) & (row < 38)
-            found = other[row.clamp(0, 37), column.clamp(0, 47)]
-            seen |= framed & (z < 1.06 * found + 0.3)
-        agreement.append((seen.reshape(38, 48).numpy() == (mask > 0)).mean())
-    assert min(agreement) > 0.93
-    assert read(phantom / "truth/seen/0008_seen.png").mean() > 0.97 * 255
+            wall = frame.depth[row.clamp(0, 37), column.clamp(0, 47)]
+            seen |= framed & (z < 1.06 * wall + 0.3)
+        agreement.append((seen == mask).double().mean())
+    assert len(agreement) == 3 and min(agreement) > 0.93
+    mask = image(phantom / "truth/seen/0008_seen.png")
+    assert mask.mean() > 0.97 * 255 and set(np.unique(mask)) <= {0, 255}
 
 
 def test_mesh_flags_what_training_frames_saw(phantom):
@@ -150,10 +131,10 @@ def test_same_seed_same_bytes_and_another_seed_another_colon(tmp_path, monkeypat
     small = {**TINY, "frames": 9, "rotation_views": 1, "interreflection": 1.0, "mesh_spacing": 2.5}
     for name, seed in (("one", 7), ("two", 7), ("other", 8)):
         generate(PhantomSettings(**small, seed=seed), tmp_path / name)
-    one, two, other = (digest(tmp_path / name) for name in ("one", "two", "other"))
-    assert one == two
-    assert one.keys() == other.keys()
-    assert all(one[name] != other[name] for name in one if name.endswith((".png", ".ply")) and "seen" not in name)
+    first, second, other = (digest(tmp_path / name) for name in ("one", "two", "other"))
+    assert first == second
+    assert first.keys() == other.keys()
+    assert all(first[name] != other[name] for name in first if name.endswith((".png", ".ply")) and "seen" not in name)
 
 
 def test_nothing_is_replaced_or_left_half_written(phantom, tmp_path):
@@ -179,5 +160,5 @@ def test_importing_loads_nothing_heavy():
     code = (
         "import sys, coliags_plugin.phantom.generate;print(sorted({'open3d', 'torch', 'pycolmap'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.strip() == "[]"

@@ -1,0 +1,174 @@
+"""Geometry of phantoms: the colon's wall, its texture, the camera's paths, and what is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coliags_plugin.geometry.lenses.models import PinholeLens
+from coliags_plugin.phantom.colon import build_surface, grow_anatomy
+from coliags_plugin.phantom.mucosa import paint_mucosa
+from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
+from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
+from coliags_plugin.phantom.trajectory import NEAREST, camera_path, rotation, rotation_about, turn_away
+from tests.phantom.test_light import plane_at
+
+COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}
+
+
+@pytest.fixture(scope="module")
+def colon():
+    chosen = PhantomSettings(**COARSE)
+    anatomy = grow_anatomy(chosen)
+    surface = build_surface(anatomy, chosen)
+    return anatomy, surface, Tracer(surface)
+
+
+def test_colon_has_the_anatomy_it_claims(colon):
+    anatomy, surface, _ = colon
+    stations = np.array([fold.arc for fold in anatomy.folds])
+    assert 18 <= len(stations) <= 27 and len(anatomy.polyps) == 4
+    assert all(5.0 <= fold.height <= 8.1 and 2.0 <= fold.thickness <= 4.0 for fold in anatomy.folds)
+    # Half widths of a sixth to a third of the circumference: each crescent covers a third to two thirds.
+    assert all(np.pi / 3 <= fold.half_width <= 2 * np.pi / 3 for fold in anatomy.folds)
+    assert all(0.33 <= polyp.height / polyp.width <= 0.39 for polyp in anatomy.polyps)
+    assert np.isfinite(surface.vertices).all()
+    np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_normals_point_into_the_lumen_as_the_triangles_turn(colon):
+    anatomy, surface, _ = colon
+    middle = slice(10 * surface.columns, 80 * surface.columns)
+    centres, _ = anatomy.centre_line.at(np.repeat(surface.arc, surface.columns)[middle])
+    inward = ((centres - surface.vertices[middle]) * surface.normals[middle]).sum(axis=1)
+    assert (inward > 0.0).mean() > 0.9  # not on the far flanks of folds
+    corners = surface.vertices[surface.triangles[: 40 * surface.columns]]
+    turning = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    smooth = surface.normals[surface.triangles[: 40 * surface.columns, 0]]
+    assert ((turning * smooth).sum(axis=1) > 0.0).all()
+
+
+def test_rotation_minimising_frames_are_rotations(colon):
+    anatomy, _, _ = colon
+    frames = anatomy.centre_line.at(np.linspace(0.0, 230.0, 77))[1]
+    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
+
+
+def test_grid_place_agrees_with_barycentric_interpolation(colon):
+    _, surface, tracer = colon
+    generator = np.random.default_rng(0)
+    directions = np.concatenate([generator.uniform(-1, 1, (500, 2)), np.ones((500, 1))], axis=1).astype(np.float32)
+    pose = np.eye(4)
+    pose[:3, 3] = (0.0, 0.0, 20.0)
+    hits = tracer.cast(pose, directions)
+    hits = hits.only(hits.found)
+    row, column = surface.grid_coordinates(hits.triangle, hits.barycentric)
+    number = np.repeat(np.arange(surface.rows), surface.columns)[:, None].astype(np.float32)
+    np.testing.assert_allclose(row, tracer.interpolate(number, hits)[:, 0], atol=1e-3)
+    angle = np.tile(np.arange(surface.columns) * (2.0 * np.pi / surface.columns), surface.rows)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rotated = tracer.interpolate(around, hits)
+    apart = np.arctan2(rotated[:, 1], rotated[:, 0]) - column * (2 * np.pi / surface.columns)
+    np.testing.assert_allclose((apart + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=1e-3)
+
+
+def test_noise_fills_space_with_unit_variance():
+    noise = SolidNoise(stream(0, Purpose.RELIEF))
+    points = np.random.default_rng(1).uniform(-100.0, 100.0, (40_000, 3)).astype(np.float32)
+    layer = noise.layer(points, 3.0)
+    assert abs(layer.mean()) < 0.05 and layer.std() == pytest.approx(1.0, abs=0.06)
+    assert abs(np.corrcoef(layer, noise.layer(points, 3.0))[0, 1]) < 0.05
+
+
+def test_mucosa_has_the_albedo_asked_for_and_no_seam(colon):
+    anatomy, surface, _ = colon
+    mucosa = paint_mucosa(anatomy, surface, PhantomSettings(**COARSE))
+    mean = mucosa.albedo.mean(axis=(0, 1))
+    np.testing.assert_allclose(mean, PhantomSettings().albedo, rtol=0.15)
+    steps = np.abs(np.diff(mucosa.albedo, axis=1)).mean()
+    seam = np.abs(mucosa.albedo[:, 0] - mucosa.albedo[:, -1]).mean()
+    assert seam < 2.0 * steps
+    row, fine = np.full(7, 30.0, np.float32), np.full(7, 0.1, np.float32)
+    column = np.array([0.0, 1.0, 2.5, 3.0, 4.0, 5.0, 6.0], np.float32)
+    near, far = mucosa.sample(row, column, fine), mucosa.sample(row, column + surface.columns, fine)
+    np.testing.assert_allclose(near.albedo, far.albedo, atol=0.01)
+    # What a wide footprint loses in relief it gains in variance.
+    wide = mucosa.sample(row, column, np.full(7, 8.0, np.float32))
+    assert wide.slope_variance.mean() > near.slope_variance.mean()
+
+
+@pytest.mark.parametrize("light", ["c3vd", "strong"])
+@pytest.mark.parametrize("trajectory", ["pullback", "rotation"])
+def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, trajectory):
+    anatomy, _, tracer = colon
+    chosen = PhantomSettings(light=light, trajectory=trajectory, frames=60, **COARSE)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
+    rotations = poses[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations.transpose(0, 2, 1) @ rotations, np.broadcast_to(np.eye(3), (60, 3, 3)), atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0)
+    clearance = tracer.clearance(poses[:, :3, 3])
+    assert clearance.min() >= NEAREST
+    travelled = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+    if trajectory == "pullback":
+        assert 45.0 < travelled < 90.0
+        if light == "strong":
+            assert clearance.min() == pytest.approx(PRESETS["strong"].closest, abs=0.6)
+    else:
+        assert travelled < 20.0
+        looks = poses[:, :3, 2]
+        assert np.degrees(np.arccos(np.clip(looks @ looks[0], -1, 1))).max() > 20.0
+
+
+def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(colon):
+    anatomy, _, tracer = colon
+    chosen = PhantomSettings(frames=41, rotation_views=12, **COARSE)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
+    views = turn_away(poses, chosen)
+    assert len(views) == 12
+    clocks = []
+    for view in views:
+        assert view.frame % 8
+        np.testing.assert_array_equal(view.camera_to_world[:3, 3], poses[view.frame, :3, 3])
+        look = poses[view.frame, :3, :3].T @ view.camera_to_world[:3, 2]
+        assert np.degrees(np.arccos(look[2])) == pytest.approx(view.turn)
+        assert 15.0 <= view.turn <= 30.0
+        clocks.append(np.arctan2(look[1], look[0]))
+    assert {int((clock + np.pi) // (np.pi / 2)) for clock in clocks} == {0, 1, 2, 3}
+
+
+def test_where_the_camera_scans_rotation_views_go_on_outwards(colon):
+    anatomy, _, tracer = colon
+    chosen = PhantomSettings(frames=41, trajectory="rotation", **COARSE)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
+    middle = poses[:, :3, 2].mean(axis=0)
+    middle /= np.linalg.norm(middle)
+    for view in turn_away(poses, chosen):
+        before, after = poses[view.frame, :3, 2] @ middle, view.camera_to_world[:3, 2] @ middle
+        assert np.degrees(np.arccos(after) - np.arccos(before)) == pytest.approx(view.turn, abs=1e-3)
+
+
+def test_rotation_conventions():
+    # Yaw turns the look to the right (+x), pitch upwards (-y).
+    assert rotation(0.1, 0.0, 0.0)[0, 2] > 0.0
+    assert rotation(0.0, 0.1, 0.0)[1, 2] < 0.0
+    np.testing.assert_allclose(rotation_about(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
+    surface = plane_at(20.0)
+    tracer = Tracer(surface)
+    lens = PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19)
+    mask = np.ones((19, 25), bool)
+    mask[:, :3] = False
+    points = np.array([[0.0, 0.0, 20.0], [30.0, 0.0, 20.0], [0.0, 0.0, 30.0], [0.0, 0.0, -5.0], [-11.0, 0.0, 20.0]])
+    # Before the lens; out of frame; behind the plane; behind the camera; on an unlit pixel.
+    assert seen_from(points, [np.eye(4)], lens, mask, tracer).tolist() == [True, False, False, False, False]
+    aside = np.eye(4)
+    aside[0, 3] = 30.0
+    assert seen_from(points, [np.eye(4), aside], lens, mask, tracer).tolist() == [True, True, False, False, False]
+    assert not seen_from(points, [], lens, mask, tracer).any()
+    assert nearest_poses_first(aside, [np.eye(4), aside])[0] is aside
