@@ -156,8 +156,6 @@ def _encoded(light: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "V 3"]:
 
 #: Numbers of a vertex at most: position, w, colour. What follows them is not read one by one.
 _MOST_NUMBERS = 7
-#: Characters of a line of a triangle at most; polygons may have more.
-_LONGEST_TRIANGLE = 200
 
 
 def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
@@ -216,8 +214,6 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
     """Vertex indices as they stand, [F, 3], and the texture index of each first corner, [F]."""
     vertices, textures = list[tuple[int, int, int]](), list[int]()
     try:
-        if (quick := _triangles_alike(faces)) is not None:
-            return quick
         for face in faces:
             fields = [corner.split("/") for corner in face.split()]
             indices = [int(field[0]) for field in fields]
@@ -229,18 +225,3 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
     except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} has a face that is not indices", "an OBJ file") from error
     return corners, flags if len(flags) and flags.all() else None
-
-
-def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """Corners of faces that are all triangles of the form ``v`` or ``v/vt``, much faster; None of others."""
-    if max(map(len, faces), default=0) > _LONGEST_TRIANGLE:
-        return None
-    text = "\n".join(faces)
-    slashes = text.count("/")
-    if not faces or slashes not in (0, 3 * len(faces)) or "//" in text:
-        return None
-    numbers = np.array(text.replace("/", " ").split(), np.int64)
-    if len(numbers) != 3 * len(faces) + slashes:
-        return None
-    rows = numbers.reshape(len(faces), 3, -1)
-    return rows[:, :, 0], rows[:, 0, 1] if slashes and rows[:, 0, 1].all() else None
