@@ -246,7 +246,7 @@ def colmap_binary(target, count):
 
 
 def colmap_text(target, count):
-    colmap.write_text(target, a_trajectory(count))
+    colmap.write(target, a_trajectory(count), text=True)
 
 
 def video(target, count):

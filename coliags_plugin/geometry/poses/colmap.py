@@ -12,7 +12,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -325,19 +325,6 @@ def camera_to_world(images: Sequence[ColmapImage]) -> Float[np.ndarray, "N 4 4"]
     return inverse(rigid(rotations, np.array([image.translation for image in images])))
 
 
-def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a binary model of one PINHOLE camera and no points."""
-    _write(path, trajectory, text=False)
-
-
-def write_text(path: Path, trajectory: Trajectory) -> None:
-    """Write a text model as :func:`write`; without blanks in names, which COLMAP's reader would truncate."""
-    for name in trajectory.names_or_numbers():
-        if name.split() != [name]:
-            raise InputError(f"the image name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
-    _write(path, trajectory, text=True)
-
-
 def colmap_poses(camera_to_world: Float[np.ndarray, "N 4 4"]) -> list[pycolmap.Rigid3d]:
     """World-to-camera transforms of camera-to-world matrices. [N, 4, 4]"""
     import pycolmap
@@ -374,8 +361,11 @@ def posed_model(
     return model
 
 
-def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
+def write(path: Path, trajectory: Trajectory, text: bool = False) -> None:
+    """Write a model of one PINHOLE camera and no points; no text with blanks in names, which COLMAP would truncate."""
     intrinsics, names = trajectory.needed_intrinsics(path, "a COLMAP model"), trajectory.names_or_numbers()
+    if text and (blank := [name for name in names if name.split() != [name]]):
+        raise InputError(f"the image name '{blank[0]}'", "no blanks in a text model", "Write a binary one: colmap")
     refuse_repeated(names, str(path))
     others = sorted(file.name for file in path.iterdir() if file.name not in _MODEL_FILES) if path.is_dir() else []
     if others:
@@ -434,4 +424,4 @@ def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intri
 
 _KEEPS = frozenset({"names", "intrinsics"})
 FORMAT = Format("colmap", read, write, lambda path: model_suffix(path, _NEEDED) is not None, keeps=_KEEPS, folder=True)
-TEXT_FORMAT = Format("colmap-text", read, write_text, None, keeps=_KEEPS, folder=True)
+TEXT_FORMAT = Format("colmap-text", read, partial(write, text=True), None, keeps=_KEEPS, folder=True)

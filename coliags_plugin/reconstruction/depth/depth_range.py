@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -73,12 +74,10 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int)).tolist()
     with quiet_colmap(0):
         extract = feature_extractor(settings)
-        features: dict[int, Features] = {}
 
+        @lru_cache(maxsize=2 * len(_STEPS))
         def features_of(index: int) -> Features:
-            if index not in features:
-                features[index] = extract(*image_and_mask(frames[index]))
-            return features[index]
+            return extract(*image_and_mask(frames[index]))
 
         for index in with_progress(chosen, "find the depth range", progress):
             partners = [index + step for step in _STEPS if index + step < len(frames)]
@@ -89,8 +88,6 @@ def find_range(frames: Sequence[Frame], settings: FeatureSettings, progress: Pro
             ]
             if depths:
                 depths_by_frame[index] = _neighbourly(features_of(index).pixels, _agreed(np.stack(depths)))
-            for old in [key for key in features if key < index]:
-                del features[old]
     return _range_of(depths_by_frame, "points triangulated between frames")
 
 

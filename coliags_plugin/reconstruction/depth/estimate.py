@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -56,6 +57,7 @@ LEAST_MATCHED = 0.1
 _HELD, _HELD_PIXELS = 40, 12_000_000
 
 
+@dataclass
 class Estimation:
     """Estimation of the depth of a video of pinhole cameras, resumable at every frame of every pass.
 
@@ -63,24 +65,21 @@ class Estimation:
     sources themselves depends on no other image.
     """
 
-    def __init__(
-        self,
-        frames: Sequence[Frame],
-        sources: Sequence[int],
-        prior: LightPrior | FilePrior,
-        depth_range: DepthRange,
-        settings: DepthEstimationSettings,
-        work: WorkFolder,
-        jobs: int = 1,
-        progress: Progress | None = None,
-    ) -> None:
-        self.frames, self.prior, self.range, self.settings = frames, prior, depth_range, settings
-        self.sources = sources
-        self.work, self.jobs, self.progress = work, jobs, progress
-        camera = frames[0].camera
+    frames: Sequence[Frame]
+    sources: Sequence[int]
+    prior: LightPrior | FilePrior
+    range: DepthRange
+    settings: DepthEstimationSettings
+    work: WorkFolder
+    jobs: int = 1
+    progress: Progress | None = None
+    last: str = ""  # name of the last pass
+
+    def __post_init__(self) -> None:
+        """Start from the medians of the depth range."""
+        camera = self.frames[0].camera
         self.held = max(_HELD, _HELD_PIXELS // (camera.width * camera.height))
-        self.last = ""
-        self.medians: Sequence[float] = depth_range.medians
+        self.medians: Sequence[float] = self.range.medians
 
     def run(self) -> None:
         """Run all passes that are not done."""

@@ -87,10 +87,6 @@ class Rays:
         rows = (self.images, self.rows, self.pixels, self.centers, self.directions)
         return Rays(self.ids[lengths >= fewest], number[self.tracks[is_kept]], *(column[is_kept] for column in rows))
 
-    def at_least(self, fewest: int) -> Rays:
-        """The tracks of ``fewest`` observations or more."""
-        return self.only(np.ones(len(self.tracks), bool), fewest)
-
     @cached_property
     def starts(self) -> Int[np.ndarray, "N"]:
         """The first observation of each track."""
@@ -210,7 +206,8 @@ def _triangulate(model: pycolmap.Reconstruction, ids: Sequence[Int64[np.ndarray,
     pixels: list[Any] = [None] * len(ids)
     for number in model.reg_image_ids():
         pixels[number - 1] = [point.xy for point in model.images[number].points2D]
-    rays = Rays.of(model, ids, pixels).at_least(2)
+    rays = Rays.of(model, ids, pixels)
+    rays = rays.only(np.ones(len(rays.tracks), bool), 2)
     points = rays.triangulated()
     fits: Bool[np.ndarray, "K"] = rays.errors(model, points) <= max_error
     lengths = np.bincount(rays.tracks, fits, len(rays.ids))

@@ -119,19 +119,13 @@ def highlights(image: UInt8[np.ndarray, "H W 3"], settings: FeatureSettings) -> 
     """Specular highlights: pixels that are saturated or much brighter than their surroundings."""
     import cv2
 
-    brightest = brightness(image)
+    brightest = image.max(axis=2)
     if settings.highlight_level > 255:
         return np.zeros(brightest.shape, bool)
     # The window is wide enough that a highlight never fills half of it.
     surroundings = cv2.medianBlur(brightest, 2 * (max(image.shape[:2]) // 25) + 1).astype(np.float32)
     is_outlier = brightest > np.maximum(surroundings * settings.highlight_ratio, surroundings + 20.0)
     return np.asarray((brightest >= settings.highlight_level) | is_outlier)
-
-
-def brightness(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
-    """The largest of the three channels, many times as fast as by ``max``."""
-    red, green, blue = np.moveaxis(image, -1, 0)
-    return np.asarray(np.maximum(np.maximum(red, green), blue))
 
 
 #: glog's level FATAL.

@@ -130,11 +130,6 @@ class _Posed:
     pose: Float[np.ndarray, "3 4"]  # world to camera
 
     @property
-    def center(self) -> Float[np.ndarray, "3"]:
-        """Position of the camera, world."""
-        return np.asarray(-self.pose[:, :3].T @ self.pose[:, 3])
-
-    @property
     def depths(self) -> Float[np.ndarray, "K"]:
         """Depths of the points."""
         return np.asarray(self.points @ self.pose[2, :3] + self.pose[2, 3])
@@ -250,7 +245,8 @@ def _same(sightings: Sequence[_Sighting], camera: _Posed) -> list[_Sighting]:
     similarities = [sighting.similarity for sighting in sightings]
     scales = np.log([similarity.scale for similarity in similarities])
     rotations = Rotation.from_matrix(np.array([similarity.rotation for similarity in similarities]))
-    places = np.array([similarity.points(camera.center[None])[0] for similarity in similarities])
+    center = -camera.pose[:, :3].T @ camera.pose[:, 3]
+    places = np.array([similarity.points(center[None])[0] for similarity in similarities])
     depth = float(np.median(camera.depths))
     sets = []
     for index in range(len(similarities)):

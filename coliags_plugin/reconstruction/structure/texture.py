@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from coliags_plugin.core.arrays import dilated
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, brightness, highlights
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, highlights
 
 #: Brightness, of 255, that is added before the logarithm, so that noise in the dark is not amplified without bound.
 _DARK_OFFSET = 4.0
@@ -46,7 +46,7 @@ def wall_textures(
     around = cv2.GaussianBlur(log * weight, (0, 0), _FILL) / np.maximum(cv2.GaussianBlur(weight, (0, 0), _FILL), 1e-3)
     log = cv2.GaussianBlur(np.where(excluded, around, log), (0, 0), _DENOISING)
     detail, deviation = _normalised(log, _DETAIL)
-    flat = (deviation < _NOISE) | (image[..., 1] > _OVEREXPOSED) | (brightness(image) < _BLACK)
+    flat = (deviation < _NOISE) | (image[..., 1] > _OVEREXPOSED) | (image.max(axis=2) < _BLACK)
     usable = ~(excluded | dilated(flat, _MARGIN))
     usable[:_EDGE] = usable[-_EDGE:] = usable[:, :_EDGE] = usable[:, -_EDGE:] = False
     return detail, _normalised(log, _FOLDS)[0], usable

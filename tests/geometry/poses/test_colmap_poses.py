@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.nerfstudio import camera_of
+from coliags_plugin.datamanagers.reading.transforms import camera_of
 from coliags_plugin.geometry.poses import colmap, nerfstudio
 from tests.geometry.poses.winding import PINHOLE, winding
 
@@ -24,7 +24,7 @@ ORDER = [1, 0, 2, 3]
 def model(request, tmp_path):
     """A written model of four poses, and what was written."""
     trajectory = winding(4, names=NAMES, intrinsics=PINHOLE)
-    (colmap.write if request.param == "binary" else colmap.write_text)(tmp_path / "model", trajectory)
+    colmap.write(tmp_path / "model", trajectory, text=request.param == "text")
     return tmp_path / "model", trajectory
 
 
@@ -72,7 +72,7 @@ def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_pa
 
 
 def test_a_count_in_the_header_that_is_not_that_of_the_images_is_told(tmp_path, caplog):
-    colmap.write_text(tmp_path / "model", winding(4, names=NAMES, intrinsics=PINHOLE))
+    colmap.write(tmp_path / "model", winding(4, names=NAMES, intrinsics=PINHOLE), text=True)
     colmap.read(tmp_path / "model")
     assert not caplog.messages
     lines = (tmp_path / "model" / "images.txt").read_text().splitlines()
@@ -187,7 +187,7 @@ def test_models_that_are_none(tmp_path, images, cameras, message):
 def test_names_with_blanks_are_for_binary_models(tmp_path):
     trajectory = winding(1, names=("with blank.png",), intrinsics=PINHOLE)
     with pytest.raises(InputError, match=r"'with blank.png'. Expected no blanks"):
-        colmap.write_text(tmp_path / "text", trajectory)
+        colmap.write(tmp_path / "text", trajectory, text=True)
     colmap.write(tmp_path / "binary", trajectory)
     assert colmap.read(tmp_path / "binary").names == trajectory.names == tuple(by_pycolmap(tmp_path / "binary"))
 
