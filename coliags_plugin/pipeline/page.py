@@ -396,16 +396,16 @@ def _without_pose(contents: Contents, states: FrameStates) -> Iterator[Block]:
     ]
     columns = [Column("Why"), Column("What", words=True), Column("Frames"), Column("Share", unit="% of the video")]
     yield _table_of(columns, rows, "reasons")
-    stretches = [one for one in states.stretches() if one.state.style is None]
-    longest = sorted(stretches, key=lambda one: one.first - one.last)[:_LISTED]
+    stretches = [(stretch, state) for stretch, state in states.stretches() if state.style is None]
+    longest = sorted(stretches, key=lambda pair: -pair[0].count)[:_LISTED]
     listed: list[list[Value]] = [
         [
-            f"{one.first} to {one.last}" if one.last > one.first else str(one.first),
-            clock(contents, one.first),
-            one.last - one.first + 1,
-            one.state.why or one.state.what,
+            f"{stretch.first} to {stretch.last}" if stretch.count > 1 else str(stretch.first),
+            clock(contents, stretch.first),
+            stretch.count,
+            state.why or state.what,
         ]
-        for one in sorted(longest, key=lambda one: one.first)
+        for stretch, state in sorted(longest, key=lambda pair: pair[0].first)
     ]
     table = _table_of([Column(key, words=key != "Number") for key in ("Frames", "From", "Number", "Why")], listed)
     shown = f"the {_LISTED} longest of {len(stretches)}" if len(stretches) > _LISTED else str(len(stretches))

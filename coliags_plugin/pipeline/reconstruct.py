@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,7 +18,7 @@ from coliags_plugin.engine.data_formats import find_format, recognised
 from coliags_plugin.engine.task_queue import make_executor
 from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.pipeline.contents import figures_as
-from coliags_plugin.pipeline.frame_sources import FrameSource, Span, chosen_frames, frame_source, opened_recording
+from coliags_plugin.pipeline.frame_sources import FrameSource, Span, frame_source, opened_recording
 from coliags_plugin.pipeline.jobs import StageJobs, Workers
 from coliags_plugin.pipeline.joins import find_joins
 from coliags_plugin.pipeline.page import write_page
@@ -28,14 +27,13 @@ from coliags_plugin.pipeline.stages import (
     LOCK_FILE,
     PAGE_FILE,
     Record,
-    Stage,
     StageRecord,
     check_options,
     run_stages,
     wait_for_workers,
 )
-from coliags_plugin.pipeline.steps import StageContext, identity_of, stages_of
-from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, survey_and_cut
+from coliags_plugin.pipeline.steps import StageContext, stages_of, survey_stage
+from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reporting.numbers import counted, duration, file_size
 
@@ -73,12 +71,8 @@ def reconstruct(
         settings = settings.model_copy(update={"sfm": sfm})
         video = frame_source(source, Span(settings.frames.first, settings.frames.last))
         frames, seconds, size = forecast(video, settings)
-        log.info(
-            "%d frames of use: about %s of a CPU core and %s of disk, by a patient's clip",
-            frames,
-            duration(seconds),
-            file_size(size),
-        )
+        needs = f"about {duration(seconds)} of a CPU core and {file_size(size)} of disk"
+        log.info("%d frames of use: %s, by a patient's clip", frames, needs)
     else:
         _refuse_unused(source, settings, mask)
     context = StageContext(out, source, settings, mask, data_format, device, progress)
@@ -124,30 +118,16 @@ def _segments(context: StageContext, record: Record, overwrite: bool) -> list[tu
 
     Returns contexts of the segments and their frames, first the one in which most is followed.
     """
-    out, settings, chosen = context.root, context.settings, context.settings.frames
-    cutting = chosen.model_dump(include={"first", "last", "every", "segment", "deinterlace"})
-    options: dict[str, Any] = {"source": identity_of(context.source), "frames": cutting}
-    if frame_source(context.source, Span(chosen.first, chosen.last)).expected > chosen.segment * chosen.every:
-        options["least_submap"] = settings.least_submap
-
-    def work() -> StageRecord:
-        source = chosen_frames(context.source, chosen)
-        survey, video = survey_and_cut(source, chosen, settings.least_submap, context.progress)
-        survey.write(out)
-        summary = f"{counted(video.frames, 'frame')} in {counted(len(video.segments), 'segment')}"
-        files = {SURVEY_FILE: "sharpness and motion of every frame"}
-        return StageRecord(summary, files, figures=video.model_dump(mode="json"))
-
+    out, settings, stages = context.root, context.settings, [survey_stage(context)]
     if not (out / SURVEY_FILE).is_file() or not record.stages.keys() - {"survey", "joins"}:
         record.forget(["survey"])
-    stages = [Stage("survey", work, options)]
     check_options(stages, record, overwrite, list(record.stages))
     run_stages(stages, record)
     video, survey = figures_as(record.stages, "survey", Video, out), Survey.read(out)
     segments = []
     for segment in sorted(video.segments, key=lambda span: -survey.part(span.first, span.last).followed.sum()):
         span = {"first": segment.first, "last": segment.last, "deinterlace": video.deinterlace}
-        of_segment = settings.model_copy(update={"frames": chosen.model_copy(update=span)})
+        of_segment = settings.model_copy(update={"frames": settings.frames.model_copy(update=span)})
         segments.append((replace(context, segment=segment.name, settings=of_segment), segment.count))
     return segments
 

@@ -17,12 +17,12 @@ from coliags_plugin.datamanagers.colmap import find_models
 from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.geometry.poses import colmap
-from coliags_plugin.pipeline.frame_sources import Span, frame_source
+from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source
 from coliags_plugin.pipeline.frames import IMAGES, read_blurred, read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FEWEST, ReconstructionSettings
 from coliags_plugin.pipeline.stages import Stage, StageRecord
-from coliags_plugin.pipeline.survey import Survey
-from coliags_plugin.reporting.numbers import area_text
+from coliags_plugin.pipeline.survey import SURVEY_FILE, Survey, Video, cut, survey_video
+from coliags_plugin.reporting.numbers import area_text, counted
 
 if TYPE_CHECKING:
     import torch
@@ -214,6 +214,39 @@ def identity_of(path: Path) -> Mapping[str, Any]:
     """Name and size of a file or folder: enough to notice that it is another one."""
     files = sorted(path.glob("[!.]*")) if path.is_dir() else [path]
     return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}
+
+
+def survey_stage(context: StageContext) -> Stage:
+    """The stage before those of all segments."""
+    frames = context.settings.frames
+    cutting = frames.model_dump(include={"first", "last", "every", "segment", "deinterlace"})
+    options: dict[str, Any] = {"source": identity_of(context.source), "frames": cutting}
+    if frame_source(context.source, Span(frames.first, frames.last)).expected > frames.segment * frames.every:
+        options["least_submap"] = context.settings.least_submap
+    return Stage("survey", partial(make_survey, context), options)
+
+
+def make_survey(context: StageContext) -> StageRecord:
+    """Look at every frame of the video once, and cut it into segments."""
+    settings = context.settings
+    source = chosen_frames(context.source, settings.frames)
+    survey = survey_video(source, context.progress)
+    survey.write(context.root)
+    segments, skipped = cut(survey, settings.frames, settings.least_submap)
+    height, width = survey.size
+    video = Video(
+        source=source.path.name,
+        rate=source.rate,
+        frames=len(survey),
+        size=(width, height),
+        first=source.span.first,
+        deinterlace=source.span.deinterlace,
+        segments=tuple(segments),
+        skipped=tuple(skipped),
+    )
+    summary = f"{counted(video.frames, 'frame')} in {counted(len(segments), 'segment')}"
+    files = {SURVEY_FILE: "sharpness and motion of every frame"}
+    return StageRecord(summary, files, figures=video.model_dump(mode="json"))
 
 
 def make_frames(context: StageContext) -> StageRecord:

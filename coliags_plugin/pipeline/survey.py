@@ -38,7 +38,7 @@ _MOST_FRAMES = 6_000_000
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What is known of each frame of a video.
+    """Measures of each frame of a video.
 
     Attributes:
         sharpness: Root mean square of the Laplacian over the mean brightness; 0 without any texture. [N]
@@ -79,13 +79,14 @@ class Survey:
     def read(cls, folder: Path) -> Survey:
         """Read ``survey.npz``; InputError where it is damaged."""
         arrays = read_arrays(folder / SURVEY_FILE, MADE, (*_ARRAYS, "size", "first", "mask"), ["times"])
-        own, mask = {name: arrays[name] for name in (*_ARRAYS, "times") if name in arrays}, arrays["mask"]
+        by_frame, mask = {name: arrays[name] for name in (*_ARRAYS, "times") if name in arrays}, arrays["mask"]
         shapes = {name: array.shape for name, array in arrays.items() if name != "mask"}
-        expected = dict.fromkeys(own, (len(np.ravel(own["sharpness"])),)) | {"size": (2,), "first": ()}
-        if shapes != expected or any(array.dtype.kind not in "fiu" for array in own.values()) or mask.dtype != bool:
+        expected = dict.fromkeys(by_frame, (len(np.ravel(by_frame["sharpness"])),)) | {"size": (2,), "first": ()}
+        are_numbers = all(array.dtype.kind in "fiu" for array in by_frame.values())
+        if shapes != expected or not are_numbers or mask.dtype != bool:
             raise InputError(f"{folder / SURVEY_FILE} has {shapes}", "a number for each frame")
         height, width = arrays["size"].tolist()
-        return cls(**own, size=(height, width), mask=mask if mask.size else None, first=int(arrays["first"]))
+        return cls(**by_frame, size=(height, width), mask=mask if mask.size else None, first=int(arrays["first"]))
 
 
 class FrameSurvey:
@@ -210,9 +211,9 @@ class Video(BaseModel):
     @model_validator(mode="after")
     def _within_the_video(self) -> Self:
         stretches: list[Stretch] = [*self.segments, *self.skipped]
-        for one in stretches:
-            if not self.first <= one.first <= one.last < self.stop:
-                raise ValueError(f"frames {one.first} to {one.last}, not of {self.first} to {self.stop - 1}")
+        for stretch in stretches:
+            if not self.first <= stretch.first <= stretch.last < self.stop:
+                raise ValueError(f"frames {stretch.first} to {stretch.last}, not of {self.first} to {self.stop - 1}")
         if len({segment.name for segment in self.segments}) < len(self.segments):
             raise ValueError("two segments have the same name")
         return self
@@ -223,35 +224,15 @@ class Video(BaseModel):
         return self.first + self.frames
 
 
-def survey_and_cut(
-    source: FrameSource, settings: FrameSettings, least: int, progress: Progress | None
-) -> tuple[Survey, Video]:
-    """Look at all frames of a video and cut it into segments of ``least`` frames or more."""
-    survey, span = survey_video(source, progress), source.span
-    segments, skipped = cut(survey, settings, least)
-    height, width = survey.size
-    video = Video(
-        source=source.path.name,
-        rate=source.rate,
-        frames=len(survey),
-        size=(width, height),
-        first=span.first,
-        deinterlace=span.deinterlace,
-        segments=tuple(segments),
-        skipped=tuple(skipped),
-    )
-    return survey, video
-
-
 def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segment], list[Skipped]]:
     """Segments in order, and what is left out: where nothing is followed for long, and what is shorter than ``least``.
 
     A video that is not longer than a segment is one, whatever it shows. Segments that follow each other without a gap
     share at most ``OVERLAP`` frames, times ``settings.every``.
     """
-    began = survey.first
+    first_frame = survey.first
     if len(survey) <= settings.segment * settings.every:
-        return [Segment(began, began + len(survey) - 1, "")], []
+        return [Segment(first_frame, first_frame + len(survey) - 1, "")], []
     flat = survey.sharpness <= _FLAT * np.median(survey.sharpness)
     lost = flat | (survey.followed < _NOTHING)
     lost[0] = flat[0]
@@ -259,16 +240,16 @@ def cut(survey: Survey, settings: FrameSettings, least: int) -> tuple[list[Segme
     gaps = [(first, stop) for first, stop in edges.reshape(-1, 2).tolist() if stop - first > _LONGEST_LOSS]
     bounds = [0, *(place for gap in gaps for place in gap), len(survey)]
     skipped = [(first, stop - 1, "nothing of the frame before is seen, or no texture") for first, stop in gaps]
-    kept: list[tuple[int, int]] = []
+    used: list[tuple[int, int]] = []
     for start, stop in zip(bounds[::2], bounds[1::2], strict=True):
         if 0 < stop - start < least * settings.every:
             skipped.append((start, stop - 1, f"fewer than {least} frames of use between such stretches"))
         elif stop > start:
-            kept += _split(survey, start, stop, settings)
-    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(kept), len(skipped))
+            used += _split(survey, start, stop, settings)
+    log.info("%d frames in %d segments, %d stretches left out", len(survey), len(used), len(skipped))
     return (
-        [Segment(began + one, began + last, f"segment-{number:03d}") for number, (one, last) in enumerate(kept)],
-        [Skipped(began + one, began + last, why) for one, last, why in sorted(skipped)],
+        [Segment(first_frame + a, first_frame + b, f"segment-{number:03d}") for number, (a, b) in enumerate(used)],
+        [Skipped(first_frame + a, first_frame + b, why) for a, b, why in sorted(skipped)],
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.pipeline.contents import Contents, SubmapContents
 from coliags_plugin.pipeline.frame_selection import THINNED
+from coliags_plugin.pipeline.survey import Stretch
 from coliags_plugin.reporting.charts import COLORS
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import Template
@@ -40,19 +41,11 @@ _CURVES = {
 
 @dataclass(frozen=True)
 class State:
-    """What became of frames."""
+    """State of a frame: its sub-map, or why it has no pose."""
 
     what: str  # for people; of a sub-map its name
     why: str = ""
     style: int | None = None  # colour index of a sub-map; None: no pose
-
-
-class Stretch(NamedTuple):
-    """Frames that follow each other and share a state."""
-
-    first: int
-    last: int  # inclusive
-    state: State
 
 
 class FrameStates:
@@ -101,7 +94,7 @@ class FrameStates:
         counts = {states[code]: count for code, count in Counter(self._codes[place].tolist()).items()}
         return Counter({state: count for state, count in counts.items() if state.style is None})
 
-    def stretches(self, columns: int | None = None) -> Iterator[Stretch]:
+    def stretches(self, columns: int | None = None) -> Iterator[tuple[Stretch, State]]:
         """Runs of one state, along the video; with the commonest state in each of so many columns of a long one."""
         codes, states = self._codes, list(self._states)
         if columns is not None and len(codes) > columns:
@@ -110,7 +103,7 @@ class FrameStates:
                 column[:] = Counter(column.tolist()).most_common(1)[0][0]
         edges = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist(), len(codes)]
         for start, stop in pairwise(edges):
-            yield Stretch(self._first + start, self._first + stop - 1, states[int(codes[start])])
+            yield Stretch(self._first + start, self._first + stop - 1), states[int(codes[start])]
 
 
 def styles(contents: Contents) -> dict[str, int]:
@@ -162,8 +155,8 @@ def timeline(contents: Contents, states: FrameStates) -> Template:
         return {"left": percent(first), "width": round(percent(last + 1) - percent(first), 3), "title": title}
 
     ribbon = [
-        {**bar(one.first, one.last, one.state.what, one.state.why), "style": one.state.style}
-        for one in states.stretches(_COLUMNS)
+        {**bar(stretch.first, stretch.last, state.what, state.why), "style": state.style}
+        for stretch, state in states.stretches(_COLUMNS)
     ]
     segments = [
         {
