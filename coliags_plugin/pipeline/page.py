@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -23,11 +23,9 @@ from coliags_plugin.pipeline.timeline import (
     FrameStates,
     clock,
     clock_span,
-    picture_near,
     span_text,
-    styles,
-    submap_between,
     timeline,
+    why_apart,
 )
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.image_files import EncodedImage
@@ -70,12 +68,6 @@ _TIMELINE = (
     "From left to right, the video. Each colour is a sub-map, whose parts share one frame of reference; grey has no "
     "pose. Brackets are segments, dashed where they failed. Point at a place for frames and reasons."
 )
-_MAP = (
-    "The sub-maps by their first frames, as wide as they are long in time, but for those too short for that. A solid "
-    "line joins two whose place and scale to each other are known, a dashed one says why they are not. Sub-maps with "
-    "the same letter are in one frame of reference."
-)
-_NO_SUBMAP = Paragraph("No sub-map was reconstructed.", hint=False)
 #: What to do where the poses of a sub-map are suspect.
 _SUSPECT = (
     "there the surface may be bent or torn. Compare the held-out views, and see check.html. Better poses may come from "
@@ -97,10 +89,9 @@ def write_page(out: Path, record: Record | None = None, scene: Path | None = Non
     states = FrameStates(contents)
     sections = [
         Section("Scenes", list(_scenes(contents))),
-        Section("Map of the sub-maps", list(_map(contents, states))),
         Section("Depth and light", list(_pictures(contents))),
         *_views(contents),
-        Section("Sub-maps", [submap_table(contents) if contents.submaps else _NO_SUBMAP]),
+        Section("Sub-maps", list(_submaps(contents, states))),
     ]
     if contents.has_frames:
         sections.insert(0, Section("Time line", [Paragraph(_TIMELINE), timeline(contents, states)]))
@@ -183,54 +174,34 @@ def _enumerated(items: Sequence[str]) -> str:
     return f"{', '.join(items[:_NAMED])}{rest}"
 
 
-def _map(contents: Contents, states: FrameStates) -> Iterator[Block]:
-    """The sub-maps one after the other, connected where they are joined, and the joins in a table."""
-    submaps = [submap for submap in contents.submaps if submap.names]
-    if len(submaps) > 1:
-        colors, groups, blocks = styles(contents), _groups(contents), list[dict[str, Any]]()
-        for before, submap in zip([None, *submaps], submaps, strict=False):
-            middle = list(submap.names)[len(submap.names) // 2]
-            texts = [
-                clock_span(contents, submap.first, submap.last),
-                counted(len(submap.names), "frame"),
-                _area_of(submap),
-                f"{_seen_of(submap)} seen" if "seen" in submap.figures else "",
-                "too few frames" if not submap.stages else "failed" if submap.failure else "",
-            ]
-            blocks.append(
-                {
-                    "name": submap.name,
-                    "group": groups.get(submap.key, ""),
-                    "style": colors[submap.name],
-                    "share": round((submap.last - submap.first + 1) / contents.video.frames, 5),
-                    "image": picture_near(contents, middle, middle),
-                    "texts": list(filter(None, texts)),
-                    "link": None if before is None else submap_between(contents, states, before, submap),
-                }
-            )
-        yield Paragraph(_MAP)
-        yield Template("submaps.html", {"blocks": blocks})
-    if contents.joins:
-        rows: list[list[Value | TableCell]] = [
-            [
-                " and ".join("/".join(filter(None, (name, Path(model).name))) for name, model in join.keys),
-                "joined" if join.joined else "apart",
-                join.frames,
-                join.rotation_deg if join.joined else None,
-                100.0 * join.position if join.joined else None,
-                join.reason,
-            ]
-            for join in contents.joins
+def _joins(contents: Contents, states: FrameStates) -> Iterator[Block]:
+    """Joins of segments, and why other sub-maps that follow each other are apart."""
+    columns = [
+        Column("Sub-maps"),
+        Column("Result", words=True),
+        Column("Shared frames"),
+        Column("Rotation", unit="degrees"),
+        Column("Position", unit="% of the depth"),
+        Column("Why apart", words=True),
+    ]
+    rows: list[list[Value | TableCell]] = [
+        [
+            " and ".join("/".join(filter(None, (name, Path(model).name))) for name, model in join.keys),
+            "joined" if join.joined else "apart",
+            join.frames,
+            join.rotation_deg if join.joined else None,
+            100.0 * join.position if join.joined else None,
+            join.reason,
         ]
-        columns = [
-            Column("Sub-maps"),
-            Column("Result", words=True),
-            Column("Shared frames"),
-            Column("Rotation", unit="degrees"),
-            Column("Position", unit="% of the depth"),
-            Column("Why apart", words=True),
-        ]
-        yield Folded("Joins of segments", [_table_of(columns, rows, "joins")], is_open=len(rows) <= _NAMED)
+        for join in contents.joins
+    ]
+    compared = [join.segments for join in contents.joins]
+    for submap, following in pairwise(submap for submap in contents.submaps if submap.names):
+        if (submap.segment, following.segment) not in compared:
+            why = why_apart(contents, states, submap, following)
+            rows.append([f"{submap.name} and {following.name}", "apart", None, None, None, why])
+    if rows:
+        yield Folded("Joins of sub-maps", [_table_of(columns, rows, "joins")], is_open=len(rows) <= _NAMED)
 
 
 def _groups(contents: Contents) -> dict[ModelKey, str]:
@@ -312,6 +283,15 @@ def _views(contents: Contents) -> list[Section]:
         told = Paragraph(f"Of {len(by_psnr)} sub-maps, the {_SUBMAPS // 2} with the lowest and with the highest PSNR.")
         return [replace(section[0], blocks=[told, *section[0].blocks])]
     return section
+
+
+def _submaps(contents: Contents, states: FrameStates) -> Iterator[Block]:
+    """Figures of the sub-maps, and their joins."""
+    if contents.submaps:
+        yield submap_table(contents)
+        yield from _joins(contents, states)
+    else:
+        yield Paragraph("No sub-map was reconstructed.", hint=False)
 
 
 def submap_table(contents: Contents) -> Table:

@@ -28,7 +28,6 @@ _COLUMNS, _BINS, _PICTURES = 2000, 600, 24
 _WIDTH = 144
 #: Steps of the time axis, seconds, and most of its ticks.
 _STEPS, _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200), 9
-_NO_COMMON = "no frame has a pose in both"
 #: Percentile of a curve at which its axis ends.
 _TOP = 99.0
 #: Titles of the survey's arrays, with units.
@@ -223,22 +222,13 @@ def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
         yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
 
 
-def submap_between(
-    contents: Contents, states: FrameStates, submap: SubmapContents, following: SubmapContents
-) -> tuple[bool, str]:
-    """Whether a sub-map and the one that follows it are joined, and how well, or why they are not, as far as known."""
-    between = [join for join in contents.joins if {submap.segment, following.segment} == set(join.segments)]
-    for join in between:
-        if {submap.key, following.key} == set(join.keys):
-            turn, apart = f"cameras turned by {join.rotation_deg:.2g} degrees", f"{100.0 * join.position:.2g} %"
-            how = f"{counted(join.frames, 'shared frame')}, {turn}, {apart} of the depth apart"
-            return join.joined, how if join.joined else join.reason
-    if between and not any(join.joined for join in between):
-        return False, between[0].reason  # of the models that share most frames
+def why_apart(contents: Contents, states: FrameStates, submap: SubmapContents, following: SubmapContents) -> str:
+    """Why a sub-map and the one that follows it along the video are not joined, as far as known."""
     for segment in contents.segments:
         place = segment.places.get(submap.last)
         if segment.span.name == submap.segment == following.segment and place is not None and not place.joined:
-            return False, place.reason
-    gap = max(0, following.first - submap.last - 1)
+            return place.reason
+    if (gap := following.first - submap.last - 1) <= 0:
+        return "no frame has a pose in both"
     why = [f", most: {state.why}" for state, _ in states.reasons(submap.last + 1, following.first).most_common(1)]
-    return False, f"{counted(gap, 'frame')} without a pose in between{''.join(why)}" if gap else _NO_COMMON
+    return f"{counted(gap, 'frame')} without a pose in between{''.join(why)}"

@@ -108,10 +108,9 @@ def test_the_page_tells_what_came_out(out):
         assert fact in text
     assert f"segment-002/poses failed: {FAILURE}" in text
     assert "the poses of segment-000/0 (well), segment-001/0 (well): there the surface may be bent" in text
-    assert "joined: 5 shared frames, cameras turned by 0.5 degrees, 2 % of the depth apart" in text
     assert "12 frames between them" in text and "washed with water" in text
-    assert text.count('<div class="link joined"') == 1 and text.count('<div class="link"') == 4
-    assert text.count('title="one frame of reference') == 2
+    assert text.count("<span>joined</span>") == 1 and text.count("<span>apart</span>") == 5
+    assert text.count("<span>A</span>") == 2, "two are in one frame of reference"
     assert "segment-001: frames 26 to 57, 0:02 to 0:05; 31 of 32 used posed; 3 sub-maps" in text
     assert "segment-001/submap-1/check.html" in text
     assert str(out) not in text
@@ -122,12 +121,10 @@ def test_two_segments_may_be_joined_at_several_models(out):
     apart = join(pair, ["sparse/1", "sparse/0"], reason="scales differ by 30 %")
     change_video(out, joins=[apart, *JOINS])
     text = page_of(out)
-    assert "1 of 2 places between segments" in text
-    assert "<span>joined: 5 shared frames" in text and "scales differ by 30 %" in text
-    change_video(out, joins=[join(pair, ["sparse/0", "sparse/1"], similarity(2)), apart])
-    assert "<span>no frame has a pose in both</span>" in page_of(out)
-    change_video(out, joins=[apart])
-    assert "<span>scales differ by 30 %</span>" in page_of(out)
+    assert "1 of 2 places between segments" in text and "scales differ by 30 %" in text
+    change_video(out, joins=[])
+    assert text.count("no frame has a pose in both") == 4
+    assert page_of(out).count("no frame has a pose in both") == 5
 
 
 def test_the_page_is_one_file_without_anything_from_elsewhere(either):
@@ -144,8 +141,8 @@ def test_a_short_video_is_a_long_one_of_one_segment(out, short):
     long, text = page_of(out), page_of(short)
     heads = re.findall(r"<h2>([^<]*)", text)
     assert heads == re.findall(r"<h2>([^<]*)", long)
-    assert heads[:5] == ["Time line", "Scenes", "Map of the sub-maps", "Depth and light", "Held-out views"]
-    assert heads[5:] == ["Sub-maps", "Frames without a pose", "Stages and files"]
+    assert heads[:4] == ["Time line", "Scenes", "Depth and light", "Held-out views"]
+    assert heads[4:] == ["Sub-maps", "Frames without a pose", "Stages and files"]
     for kind in ("recorded", "depth", "flattened light"):
         assert text.count(f'<div class="name">{kind}</div>') == 1
     assert text.index("sub-map 0, 0:00 to 0:01</option>") < text.index("sub-map 1, ")
