@@ -20,10 +20,13 @@ from coliags_plugin.pipeline.joins import ModelKey
 from coliags_plugin.pipeline.stages import PAGE_FILE, Record, StageRecord
 from coliags_plugin.pipeline.steps import PICTURES, SCENE
 from coliags_plugin.pipeline.timeline import (
-    FrameStates,
+    State,
     clock,
     clock_span,
+    frame_states,
+    reasons,
     span_text,
+    stretches,
     timeline,
     why_apart,
 )
@@ -86,7 +89,7 @@ def write_page(out: Path, record: Record | None = None, scene: Path | None = Non
         InputError: ``out`` is of no reconstruction, or its record is damaged; or the page cannot be written.
     """
     contents = read_contents(out, record, scene)
-    states = FrameStates(contents)
+    states = frame_states(contents)
     sections = [
         Section("Scenes", list(_scenes(contents))),
         Section("Depth and light", list(_pictures(contents))),
@@ -156,9 +159,9 @@ def remarks(contents: Contents) -> list[str]:
         elif name.rpartition("/")[2] != "check":
             warnings += [f"{name}: {warning}" for warning in stage.warnings]
     if contents.has_frames and not contents.posed:
-        reasons = Counter(segment.failure for segment in contents.segments)
-        reasons += Counter(skipped.why for skipped in contents.video.skipped)
-        why = "".join(f": {reason}" for reason, _ in reasons.most_common(1))
+        causes = Counter(segment.failure for segment in contents.segments)
+        causes += Counter(skipped.why for skipped in contents.video.skipped)
+        why = "".join(f": {cause}" for cause, _ in causes.most_common(1))
         failures.insert(0, f"no frame of this video has a pose{why}")
     suspect = [submap for submap in contents.submaps if "check" in submap.stages and submap.stages["check"].warnings]
     if suspect:
@@ -174,7 +177,7 @@ def _enumerated(items: Sequence[str]) -> str:
     return f"{', '.join(items[:_NAMED])}{rest}"
 
 
-def _joins(contents: Contents, states: FrameStates) -> Iterator[Block]:
+def _joins(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
     """Joins of segments, and why other sub-maps that follow each other are apart."""
     columns = [
         Column("Sub-maps"),
@@ -285,7 +288,7 @@ def _views(contents: Contents) -> list[Section]:
     return section
 
 
-def _submaps(contents: Contents, states: FrameStates) -> Iterator[Block]:
+def _submaps(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
     """Figures of the sub-maps, and their joins."""
     if contents.submaps:
         yield submap_table(contents)
@@ -363,21 +366,21 @@ def _table_of(columns: Sequence[Column], rows: Iterable[Sequence[Value | TableCe
     return Table("", columns, [dict(zip(keys, row, strict=True)) for row in rows], name=name)
 
 
-def _without_pose(contents: Contents, states: FrameStates) -> Iterator[Block]:
+def _without_pose(contents: Contents, states: Sequence[State]) -> Iterator[Block]:
     """Reasons by how many frames they concern, and the stretches."""
-    reasons = states.reasons(contents.video.first, contents.video.stop).most_common()
-    if not reasons:
+    counts = reasons(states).most_common()
+    if not counts:
         yield Paragraph("Every frame has a pose.", hint=False)
         return
-    shares = [100.0 * count / contents.video.frames for _, count in reasons]
+    shares = [100.0 * count / contents.video.frames for _, count in counts]
     rows: list[list[Value | TableCell]] = [
         [state.why or state.what, state.what, count, TableCell(f"{share:.1f}", share)]
-        for (state, count), share in zip(reasons, shares, strict=True)
+        for (state, count), share in zip(counts, shares, strict=True)
     ]
     columns = [Column("Why"), Column("What", words=True), Column("Frames"), Column("Share", unit="% of the video")]
     yield _table_of(columns, rows, "reasons")
-    stretches = [(stretch, state) for stretch, state in states.stretches() if state.style is None]
-    longest = sorted(stretches, key=lambda pair: -pair[0].count)[:_LISTED]
+    without = [(stretch, state) for stretch, state in stretches(contents, states) if state.style is None]
+    longest = sorted(without, key=lambda pair: -pair[0].count)[:_LISTED]
     listed: list[list[Value]] = [
         [
             f"{stretch.first} to {stretch.last}" if stretch.count > 1 else str(stretch.first),
@@ -388,7 +391,7 @@ def _without_pose(contents: Contents, states: FrameStates) -> Iterator[Block]:
         for stretch, state in sorted(longest, key=lambda pair: pair[0].first)
     ]
     table = _table_of([Column(key, words=key != "Number") for key in ("Frames", "From", "Number", "Why")], listed)
-    shown = f"the {_LISTED} longest of {len(stretches)}" if len(stretches) > _LISTED else str(len(stretches))
+    shown = f"the {_LISTED} longest of {len(without)}" if len(without) > _LISTED else str(len(without))
     yield Folded(f"Stretches without a pose ({shown})", [replace(table, name="stretches")])
 
 

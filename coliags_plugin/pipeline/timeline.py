@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -47,62 +47,54 @@ class State:
     style: int | None = None  # colour index of a sub-map; None: no pose
 
 
-class FrameStates:
+def frame_states(contents: Contents) -> list[State]:
     """The state of each frame of a video.
 
     Frames that were not used, since of every n only one is, have the state of the used one before them. A frame that
     two sub-maps have posed belongs to the earlier one.
     """
+    video, colors = contents.video, styles(contents)
+    states: list[State | None] = [None] * video.frames
+    for skipped in video.skipped:
+        place = slice(skipped.first - video.first, skipped.last + 1 - video.first)
+        states[place] = [State("left out", skipped.why)] * skipped.count
+    for segment in contents.segments:
+        span, unknown = segment.span, State("no pose", segment.failure or "not among those that were posed")
+        of_used = dict.fromkeys(segment.used, unknown)
+        of_used |= {frame: State("no pose", why) for frame, why in segment.lost.items() if why != THINNED}
+        for submap in segment.submaps:
+            of_used |= dict.fromkeys(submap.names, State(submap.name, "", colors[submap.name]))
+        frames = sorted(frame for frame in of_used if span.first <= frame <= span.last) or [span.first]
+        # An earlier segment that shares frames with this one keeps those that it has posed.
+        for frame, start, stop in zip(frames, [span.first, *frames[1:]], [*frames[1:], span.last + 1], strict=True):
+            state = of_used.get(frame, unknown)
+            for index in range(start - video.first, stop - video.first):
+                earlier = states[index]
+                if earlier is None or (earlier.style is None and state.style is not None):
+                    states[index] = state
+    return [state or State("left out", "in no segment") for state in states]
 
-    def __init__(self, contents: Contents) -> None:
-        video, colors = contents.video, styles(contents)
-        self._first, self._states, self._codes = video.first, dict[State, int](), np.full(video.frames, -1)
-        posed = np.zeros(video.frames, bool)
-        for skipped in video.skipped:
-            self._codes[self._place(skipped.first, skipped.last)] = self._code(State("left out", skipped.why))
-        for segment in contents.segments:
-            span, unknown = segment.span, State("no pose", segment.failure or "not among those that were posed")
-            states = dict.fromkeys(segment.used, unknown)
-            states |= {frame: State("no pose", why) for frame, why in segment.lost.items() if why != THINNED}
-            for submap in segment.submaps:
-                states |= dict.fromkeys(submap.names, State(submap.name, "", colors[submap.name]))
-            frames = sorted(frame for frame in states if span.first <= frame <= span.last) or [span.first]
-            # An earlier segment that shares frames with this one keeps those that it has posed.
-            for frame, start, stop in zip(frames, [span.first, *frames[1:]], [*frames[1:], span.last + 1], strict=True):
-                state, place = states.get(frame, unknown), self._place(start, stop - 1)
-                free = self._codes[place] < 0 if state.style is None else ~posed[place]
-                self._codes[place][free] = self._code(state)
-                posed[place] |= state.style is not None
-        self._codes[self._codes < 0] = self._code(State("left out", "in no segment"))
 
-    def _place(self, first: int, last: int) -> slice:
-        return slice(first - self._first, last + 1 - self._first)
+def reasons(states: Sequence[State]) -> Counter[State]:
+    """Number of frames in each state without a pose."""
+    return Counter(state for state in states if state.style is None)
 
-    def _code(self, state: State) -> int:
-        return self._states.setdefault(state, len(self._states))
 
-    @property
-    def of_frames(self) -> list[State]:
-        """States in the order of the frames."""
-        states = list(self._states)
-        return [states[code] for code in self._codes]
+def stretches(contents: Contents, states: Sequence[State]) -> Iterator[tuple[Stretch, State]]:
+    """Runs of one state, along the video."""
+    first = contents.video.first
+    for state, run in groupby(states):
+        last = first + sum(1 for _ in run) - 1
+        yield Stretch(first, last), state
+        first = last + 1
 
-    def reasons(self, first: int, stop: int) -> Counter[State]:
-        """Number of frames in each state without a pose, of the frames from ``first`` up to ``stop``."""
-        states, place = list(self._states), self._place(first, max(first, stop) - 1)
-        counts = {states[code]: count for code, count in Counter(self._codes[place].tolist()).items()}
-        return Counter({state: count for state, count in counts.items() if state.style is None})
 
-    def stretches(self, columns: int | None = None) -> Iterator[tuple[Stretch, State]]:
-        """Runs of one state, along the video; with the commonest state in each of so many columns of a long one."""
-        codes, states = self._codes, list(self._states)
-        if columns is not None and len(codes) > columns:
-            codes = codes.copy()
-            for column in np.array_split(codes, columns):  # views
-                column[:] = Counter(column.tolist()).most_common(1)[0][0]
-        edges = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist(), len(codes)]
-        for start, stop in pairwise(edges):
-            yield Stretch(self._first + start, self._first + stop - 1), states[int(codes[start])]
+def _in_columns(states: Sequence[State]) -> list[State]:
+    """The states of a long video with the commonest one in each of 2,000 columns, for a page of bounded size."""
+    if len(states) <= _COLUMNS:
+        return list(states)
+    columns = ([states[index] for index in column] for column in np.array_split(np.arange(len(states)), _COLUMNS))
+    return [state for column in columns for state in [Counter(column).most_common(1)[0][0]] * len(column)]
 
 
 def styles(contents: Contents) -> dict[str, int]:
@@ -142,7 +134,7 @@ def picture_near(contents: Contents, first: int, last: int) -> EncodedImage | No
     return None
 
 
-def timeline(contents: Contents, states: FrameStates) -> Template:
+def timeline(contents: Contents, states: Sequence[State]) -> Template:
     """The time line: pictures, ribbon of sub-maps, segments and curves over one axis of time and frames."""
     video = contents.video
 
@@ -155,7 +147,7 @@ def timeline(contents: Contents, states: FrameStates) -> Template:
 
     ribbon = [
         {**bar(stretch.first, stretch.last, state.what, state.why), "style": state.style}
-        for stretch, state in states.stretches(_COLUMNS)
+        for stretch, state in stretches(contents, _in_columns(states))
     ]
     segments = [
         {
@@ -222,13 +214,14 @@ def _curves(contents: Contents) -> Iterator[dict[str, Any]]:
         yield {"title": title, "unit": unit, "top": f"{top:.2g}" if top < 100.0 else "100", "path": path}
 
 
-def why_apart(contents: Contents, states: FrameStates, submap: SubmapContents, following: SubmapContents) -> str:
+def why_apart(contents: Contents, states: Sequence[State], submap: SubmapContents, following: SubmapContents) -> str:
     """Why a sub-map and the one that follows it along the video are not joined, as far as known."""
     for segment in contents.segments:
         place = segment.places.get(submap.last)
         if segment.span.name == submap.segment == following.segment and place is not None and not place.joined:
             return place.reason
-    if (gap := following.first - submap.last - 1) <= 0:
+    first, stop = (frame - contents.video.first for frame in (submap.last + 1, following.first))
+    if first >= stop:
         return "no frame has a pose in both"
-    why = [f", most: {state.why}" for state, _ in states.reasons(submap.last + 1, following.first).most_common(1)]
-    return f"{counted(gap, 'frame')} without a pose in between{''.join(why)}"
+    why = [f", most: {state.why}" for state, _ in reasons(states[first:stop]).most_common(1)]
+    return f"{counted(stop - first, 'frame')} without a pose in between{''.join(why)}"

@@ -18,7 +18,7 @@ from coliags_plugin.pipeline.contents import common_frames, read_contents
 from coliags_plugin.pipeline.page import held_out_text, remarks, submap_table, write_page
 from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.pipeline.survey import Survey
-from coliags_plugin.pipeline.timeline import FrameStates, clock, timeline
+from coliags_plugin.pipeline.timeline import clock, frame_states, timeline
 from coliags_plugin.reporting.text_formats import terminal_text
 from tests.pipeline.reconstructions import (
     FAILURE,
@@ -49,7 +49,7 @@ def page_of(out, **options):
 
 
 def states_of(out):
-    return FrameStates(read_contents(out)).of_frames
+    return frame_states(read_contents(out))
 
 
 def test_sub_maps_have_the_numbers_of_the_video_in_its_order(out):
@@ -199,7 +199,7 @@ def test_what_failed_and_what_is_suspect_is_said_with_what_to_do(short):
 
 
 def test_the_time_line_has_one_axis(out):
-    values = timeline(read_contents(out), FrameStates(read_contents(out))).values
+    values = timeline(read_contents(out), frame_states(read_contents(out))).values
     assert sum(bar["width"] for bar in values["ribbon"]) == pytest.approx(100.0)
     assert [bar["left"] for row in values["rows"] for bar in row] == [0.0, 70.0, 26.0]
     assert len(values["thumbs"]) == 24 and sum(thumb["image"] is not None for thumb in values["thumbs"]) == 14
@@ -216,7 +216,7 @@ def test_times_are_those_of_frames_where_the_rate_varies(out):
     replace(Survey.read(out), times=times).write(out)
     contents = read_contents(out)
     assert [clock(contents, frame) for frame in (0, 49, 50, 99)] == ["0:00", "0:04", "1:05", "1:09"]
-    ticks = timeline(contents, FrameStates(contents)).values["ticks"]
+    ticks = timeline(contents, frame_states(contents)).values["ticks"]
     assert [tick["texts"] for tick in (ticks[0], ticks[-1])] == [["0:00", "0"], ["1:00", "50"]]
     assert "100 frames, 1 min 10 s" in page_of(out)
 
@@ -251,7 +251,7 @@ def test_a_long_video_has_a_time_line_of_bounded_size(out):
     write_frames(out / "segment-000", kept)
     change_video(out, frames=frames, segments=[span("segment-000", 0, frames - 1)], skipped=[], joins=[])
     contents = read_contents(out)
-    assert len(timeline(contents, FrameStates(contents)).values["ribbon"]) <= 2000
+    assert len(timeline(contents, frame_states(contents)).values["ribbon"]) <= 2000
     (out / "survey.npz").unlink()
     text = page_of(out)
     assert len(text) < 1_000_000
