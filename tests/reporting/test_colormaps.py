@@ -57,9 +57,9 @@ def test_depth_error_image():
 
 
 def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_rendered():
-    error, known = depth_error(np.array([[1.0, np.nan, np.inf]]), np.array([[np.nan, 2.0, 2.0]]))
+    error, valid = depth_error(np.array([[1.0, np.nan, np.inf]]), np.array([[np.nan, 2.0, 2.0]]))
     np.testing.assert_array_equal(error, [[0.0, np.inf, np.inf]])
-    np.testing.assert_array_equal(known, [[False, True, True]])
+    np.testing.assert_array_equal(valid, [[False, True, True]])
 
 
 def test_rgb_error_image():

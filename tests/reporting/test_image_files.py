@@ -47,9 +47,9 @@ def test_tiff_keeps_float32_nan_and_infinity(tmp_path):
     depth[0, 0], depth[1, 1], depth[2, 2] = np.nan, np.inf, np.float32(1e-30)
     path = tmp_path / "d.tiff"
     write_depth_tiff(path, torch.from_numpy(depth).requires_grad_())
-    for found in (read_depth_tiff(path), tifffile.imread(path)):
-        assert found.dtype == np.float32
-        np.testing.assert_array_equal(found, depth)
+    for stored in (read_depth_tiff(path), tifffile.imread(path)):
+        assert stored.dtype == np.float32
+        np.testing.assert_array_equal(stored, depth)
     write_depth_tiff(path, np.full((2, 3), 0.1))  # float64 is rounded
     np.testing.assert_array_equal(read_depth_tiff(path), np.full((2, 3), np.float32(0.1)))
 

@@ -111,7 +111,7 @@ def tables_of(blocks):
 
 
 def said(table):
-    """What every rendering must say of the shown cells: rank, text, spread, stars, and mark of the footnote."""
+    """Rank, text, spread, stars and mark of the footnote of the shown cells, which every format must have."""
     table = table.only_shown()
     marks = {text: f"[{note.mark}]" for text, note in table.footnotes.items()}
     return [
@@ -190,7 +190,7 @@ def test_every_kind_of_block_is_written_in_every_format(kind):
 
 
 def test_latex_is_tables_and_comments(report):
-    """Nothing but comments stands between the tables, so that the file can be included anywhere."""
+    """Text between the tables is comments alone, so that the file can be included anywhere."""
     text = latex_text(report)
     outside = re.sub(r"\\begin\{table\}.*?\\end\{table\}", "", text, flags=re.DOTALL)
     assert all(not line or line.startswith("%") for line in outside.splitlines())
@@ -229,8 +229,8 @@ def test_html_page(tmp_path):
     text = (tmp_path / "page.html").read_text()
     body = re.sub(r"<(style|script)>.*?</\1>", "", text, flags=re.S).replace(" hidden", ' hidden=""')
     tree = ET.fromstring(re.sub(r"(<meta[^>]*|<img[^>]*)>", r"\1/>", body.split("\n", 1)[1]))
-    said = " ".join(" ".join(tree.itertext()).split())
-    assert "A & b" in said and "3.142 mm²" in said and "why <so>" in said and "empty" not in said
+    words = " ".join(" ".join(tree.itertext()).split())
+    assert "A & b" in words and "3.142 mm²" in words and "why <so>" in words and "empty" not in words
     assert [each.text for each in tree.iter("h2")] == ["Tables", "Found", "Files", "Recorded", "Seen", "Images"]
     assert [each.text for each in tree.iter("h3")] == ["Nested", "Two"]
     assert tree.find(".//span[@class='best']").text == "31.20" and tree.find(".//span[@class='second']").text == "30.1"
@@ -248,7 +248,7 @@ def test_html_page(tmp_path):
 def test_notebooks_show_what_print_shows_and_text_shows_nothing_there(monkeypatch):
     shown = []
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-    monkeypatch.setattr("rich.jupyter.display", lambda *given: shown.append(given))
+    monkeypatch.setattr("rich.jupyter.display", lambda *displayed: shown.append(displayed))
     assert "31.46" in str(PLAIN) and shown == []
     assert PLAIN._repr_html_() == html_blocks([PLAIN])
 

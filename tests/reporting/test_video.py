@@ -24,10 +24,10 @@ def test_frames_come_back_in_order_and_color(tmp_path, monkeypatch, codec):
     monkeypatch.setattr(video, "CODECS", {codec: video.CODECS[codec]})
     frames = ramp(9, 48, 64)
     write_video(iter(frames), tmp_path / "run 12:30" / "v.mp4", fps=12.5)
-    fps, found = read_back(tmp_path / "run 12:30" / "v.mp4")
+    fps, decoded = read_back(tmp_path / "run 12:30" / "v.mp4")
     assert fps == pytest.approx(12.5, rel=1e-3)
-    assert len(found) == 9
-    for wrote, read in zip(frames, found, strict=True):
+    assert len(decoded) == 9
+    for wrote, read in zip(frames, decoded, strict=True):
         assert np.abs(wrote.astype(float) - read).mean() < 6
     assert [file.name for file in (tmp_path / "run 12:30").iterdir()] == ["v.mp4"]
 
@@ -35,9 +35,9 @@ def test_frames_come_back_in_order_and_color(tmp_path, monkeypatch, codec):
 def test_odd_sizes_lose_no_line(tmp_path):
     frames = [torch.from_numpy(frame) for frame in ramp(3, 47, 63)]
     write_video(frames, tmp_path / "v.mp4", fps=10)
-    _, found = read_back(tmp_path / "v.mp4")
-    assert [frame.shape for frame in found] == [(48, 64, 3)] * 3
-    assert np.abs(found[2][-1].astype(float) - found[2][20]).mean() < 6
+    _, decoded = read_back(tmp_path / "v.mp4")
+    assert [frame.shape for frame in decoded] == [(48, 64, 3)] * 3
+    assert np.abs(decoded[2][-1].astype(float) - decoded[2][20]).mean() < 6
 
 
 def test_an_existing_video_stays_when_frames_fail(tmp_path):
@@ -64,9 +64,9 @@ def test_refusals(tmp_path, monkeypatch):
         ("v.mp4", [frames[0], frames[1][:40]], 10, "frame 1 is 64 x 40 px"),
         ("v.mp4", [frames[0] / 255.0], 10, "frame 0 is float64"),
     ]
-    for name, given, fps, message in cases:
+    for name, images, fps, message in cases:
         with pytest.raises(InputError, match=message):
-            write_video(given, tmp_path / name, fps)
+            write_video(images, tmp_path / name, fps)
     monkeypatch.setattr(video, "CODECS", {})
     with pytest.raises(InputError, match="PNG"):
         write_video(frames, tmp_path / "v.mp4", fps=10)

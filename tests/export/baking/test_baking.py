@@ -24,7 +24,7 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def some_gaussians(count: int, scales: int = 3, seed: int = 0) -> Gaussians:
-    """So many at random, within 10 mm of the origin."""
+    """Random Gaussians within 10 mm of the origin."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
@@ -47,24 +47,24 @@ def test_harmonics_reproduce_colours_of_their_own_kind():
     views = []
     for seed in range(60):
         directions = torch.nn.functional.normalize(random(5, 3, seed=seed + 1), dim=1)
-        seen = (basis(directions, 3)[..., None] * true).sum(1) + 0.5
-        views.append(SeenColors(torch.tensor([2, 3, 5, 8, 9]), torch.rand(5) + 0.5, directions, seen))
-    kept = torch.tensor([2, 5, 9])
-    found = fit_harmonics(views, kept, torch.full((3, 3), 0.3), 3)
+        rgb = (basis(directions, 3)[..., None] * true).sum(1) + 0.5
+        views.append(SeenColors(torch.tensor([2, 3, 5, 8, 9]), torch.rand(5) + 0.5, directions, rgb))
+    slots = torch.tensor([2, 5, 9])
+    fitted = fit_harmonics(views, slots, torch.full((3, 3), 0.3), 3)
     directions = torch.nn.functional.normalize(random(3, 3, seed=99), dim=1)
     expected = colors(true[[0, 2, 4]], directions, 3)
-    torch.testing.assert_close(colors(found, directions, 3), expected, atol=0.05, rtol=0)
+    torch.testing.assert_close(colors(fitted, directions, 3), expected, atol=0.05, rtol=0)
     # The ridge costs little where views abound.
-    assert (found - true[[0, 2, 4]]).norm() < 0.2 * true[[0, 2, 4]].norm()
+    assert (fitted - true[[0, 2, 4]]).norm() < 0.2 * true[[0, 2, 4]].norm()
 
 
 def test_one_view_gives_its_colour_and_none_the_mean():
     direction = torch.tensor([[0.0, 0.6, 0.8]])
     view = SeenColors(torch.tensor([4]), torch.ones(1), direction, torch.tensor([[0.9, 0.2, 0.1]]))
-    found = fit_harmonics([view], torch.tensor([4, 7]), torch.tensor([[0.9, 0.2, 0.1], [0.1, 0.7, 0.4]]), 3)
-    torch.testing.assert_close(colors(found[:1], direction, 3), torch.tensor([[0.9, 0.2, 0.1]]), atol=1e-4, rtol=0)
-    torch.testing.assert_close(colors(found[1:], direction, 3), torch.tensor([[0.1, 0.7, 0.4]]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(found[1, 1:], torch.zeros(15, 3))
+    fitted = fit_harmonics([view], torch.tensor([4, 7]), torch.tensor([[0.9, 0.2, 0.1], [0.1, 0.7, 0.4]]), 3)
+    torch.testing.assert_close(colors(fitted[:1], direction, 3), torch.tensor([[0.9, 0.2, 0.1]]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(colors(fitted[1:], direction, 3), torch.tensor([[0.1, 0.7, 0.4]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(fitted[1, 1:], torch.zeros(15, 3))
 
 
 def test_blending_weights_add_up_to_alpha():

@@ -15,6 +15,7 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
+from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.engine.rendering import render_view
@@ -73,8 +74,8 @@ def test_anchors_are_baked(anchors, wall, tmp_path, few_steps, capsys):
 
 def test_several_formats_are_of_one_baking(anchors, tmp_path, few_steps):
     exported = anchors.export(tmp_path / "wall.any", "ply", "spz", measure=False)
-    assert [one.file.name for one in exported] == ["wall.ply", "wall.spz"]
-    first, second = (read_splats(one.file) for one in exported)
+    assert [part.file.name for part in exported] == ["wall.ply", "wall.spz"]
+    first, second = (read_splats(part.file) for part in exported)
     assert len(first) == len(second) and "dB" not in exported[0].text
     np.testing.assert_allclose(first.means, second.means, atol=2e-4)
 
@@ -106,14 +107,14 @@ def test_distillation_comes_nearer_to_the_frames(anchors, monkeypatch):
 def test_a_fit_of_so_many_steps_is_the_same_again(anchors):
     trained = anchors.load()
     first, second = (field_of_cloud(bake(trained, None)[0]) for _ in range(2))
-    assert [distillation.distil(one, trained, None, math.inf, 5) for one in (first, second)] == [5, 5]
+    assert [distillation.distil(field, trained, None, math.inf, 5) for field in (first, second)] == [5, 5]
     for name, values in first.state_dict().items():
         assert torch.equal(values, second.state_dict()[name])
 
 
 @pytest.mark.thorough
 def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatch):
-    """As those of frames do, here of the run's own, which a colour that is the same from everywhere cannot."""
+    """Renderings of the run are the frames: colours that are the same from everywhere cannot follow them."""
     trained = run_of("pr-endo").load()
     frames = trained.scene.train
     for index, frame in enumerate(frames):
@@ -121,14 +122,14 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatc
         image = (255.0 * rgb.detach()).round().to(torch.uint8)
         frames[index] = Frame.of(name=frame.name, index=frame.index, camera=frame.camera, image=image)
     monkeypatch.setattr(distillation, "STEPS", 60)
-    between, made = [], []
+    between, clouds = [], []
     for kind in (ExplicitGaussians, AttenuatedGaussians):
         field = field_of_cloud(bake(trained, None, degree=0, kind=kind)[0])
         distillation.distil(field, trained, None, seconds=600.0)
-        made.append(cloud_of_field(field))
-        between.append(export_cost(trained, made[-1], None)["test"]["psnr_between"])
+        clouds.append(cloud_of_field(field))
+        between.append(export_cost(trained, clouds[-1], None)["test"]["psnr_between"])
     assert between[1] > between[0] + 3.0
-    assert made[0].attenuation is None and np.median(made[1].attenuation[:, 1]) > 0.0
+    assert clouds[0].attenuation is None and np.median(clouds[1].attenuation[:, 1]) > 0.0
 
 
 def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(run_of):
@@ -137,9 +138,9 @@ def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(run_of):
     cloud = cloud_of_field(trained.model.field)
     assert distillation.best_frame(field_of_cloud(cloud), trained, None) == 0
     before = trained.scene.train[0].camera.center.numpy().astype(np.float32) + np.float32([0.0, 0.0, 0.3])
-    one = cloud.part(np.arange(len(cloud)) == 0)
-    shape = {"means": before[None], "scales": np.full_like(one.scales, 0.1), "opacities": np.float32([0.9])}
-    blob = replace(one, **shape, harmonics=one.harmonics + np.float32(10.0))
+    first = cloud.part(np.arange(len(cloud)) == 0)
+    shape = {"means": before[None], "scales": np.full_like(first.scales, 0.1), "opacities": np.float32([0.9])}
+    blob = replace(first, **shape, harmonics=first.harmonics + np.float32(10.0))
     both = SplatCloud(**{name: np.concatenate([getattr(cloud, name), getattr(blob, name)]) for name in PARTS})
     assert distillation.best_frame(field_of_cloud(both), trained, None) == 1
 
@@ -152,14 +153,10 @@ def test_surfels_are_exported_thin_and_come_back_as_surfels(run_of, wall, tmp_pa
     assert thinnest.min() > 0
     # A file of 2DGS has two scales: its import is a run of surfels.
     field = trained.load().model.field
-    scales, count = field.scales.detach().numpy(), len(field.means)
-    data = (tmp_path / "wall.ply").read_bytes()
-    header, _, body = data.partition(b"end_header\n")
-    names = [line.split()[-1] for line in header.split(b"\n") if line.startswith(b"property")]
-    rows = np.frombuffer(body, "<f4").reshape(count, len(names))
-    kept = [index for index, name in enumerate(names) if name != b"scale_2"]
-    header = header.replace(b"property float scale_2\n", b"")
-    (tmp_path / "discs.ply").write_bytes(header + b"end_header\n" + rows[:, kept].tobytes())
+    scales = field.scales.detach().numpy()
+    columns = read_vertices(tmp_path / "wall.ply")
+    del columns["scale_2"]
+    write_ply(tmp_path / "discs.ply", columns)
     again = cp.import_splats(tmp_path / "discs.ply", wall, tmp_path / "discs")
     assert again.method == "2dgs"
     np.testing.assert_allclose(again.load().model.field.scales.detach().numpy(), scales, atol=1e-5)
@@ -177,9 +174,9 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(run_of, method):
     camera = replace(camera, camera_to_world=camera.camera_to_world.float())
     field = trained.model.field
     with torch.no_grad():
-        own, held = field.gaussians(camera), field.gaussians_in_light(camera, LightOfCamera(camera))
-    assert torch.equal(own.means, held.means) and torch.equal(own.opacities, held.opacities)
-    torch.testing.assert_close(held.colors, own.colors, atol=1e-5, rtol=1e-4)
+        moving, fixed = field.gaussians(camera), field.gaussians_in_light(camera, LightOfCamera(camera))
+    assert torch.equal(moving.means, fixed.means) and torch.equal(moving.opacities, fixed.opacities)
+    torch.testing.assert_close(fixed.colors, moving.colors, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -241,11 +238,6 @@ def test_exports_that_cannot_be(run_of, anchors, tmp_path, capsys, few_steps):
 def test_imports_that_cannot_be(wall, tmp_path, capsys):
     good, output = tmp_path / "good.ply", tmp_path / "run"
     write_splats(good, random_cloud(5), "ply")
-    (tmp_path / "bad.ply").write_bytes(
-        b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
-        b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
-    )
-    assert "compressed PLY" in refused(capsys, "import", tmp_path / "bad.ply", "--data", wall, "--output", output)
     assert "no reader" in refused(capsys, "import", tmp_path / "a.glb", "--data", wall, "--output", output)
     assert "cannot read" in refused(capsys, "import", tmp_path / "a.ply", "--data", wall, "--output", output)
     refused(capsys, "import", good, "--data", tmp_path / "nowhere", "--output", output)
@@ -258,16 +250,16 @@ def test_imports_that_cannot_be(wall, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "seen"),
+    ("change", "text"),
     [
         (lambda cloud: {"means": cloud.means - np.float32(5000)}, "0 % of the Gaussians lie in the view of a"),
         (lambda cloud: {"means": cloud.means / 1000, "scales": cloud.scales / 1000}, "(of the Gaussians|show nothing)"),
         (lambda cloud: {"opacities": np.full_like(cloud.opacities, 1e-6)}, "2 of 2 views of it show nothing"),
     ],
 )
-def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, seen):
+def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, text):
     cloud = random_cloud(200)
     write_splats(tmp_path / "far.ply", replace(cloud, **change(cloud)), "ply")
     with caplog.at_level(logging.WARNING):
         cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
-    assert re.search(f"{seen}.*world frame and unit", caplog.text)
+    assert re.search(f"{text}.*world frame and unit", caplog.text)

@@ -60,7 +60,7 @@ def attenuated(cloud):
 
 
 def page_of(*layers):
-    path = CameraPath(FRAMES, [one.camera for one in FRAMES], frozenset({"f0", "f2"}))
+    path = CameraPath(FRAMES, [frame.camera for frame in FRAMES], frozenset({"f0", "f2"}))
     return page_html("a <scene>", layers, path, 1, 20.0, 0.3, 0.2)
 
 
@@ -77,7 +77,11 @@ def test_a_page_holds_the_path_the_pictures_and_nothing_from_elsewhere():
     text = page_of(gaussians(cloud_of(10, 0), "ten </script>"))
     data = data_of(text)
     assert "<title>a &lt;scene&gt;</title>" in text and text.count("</script>") == 2
-    assert [(one["name"], one["held_out"]) for one in data["frames"]] == [("f0", False), ("f1", True), ("f2", False)]
+    assert [(entry["name"], entry["held_out"]) for entry in data["frames"]] == [
+        ("f0", False),
+        ("f1", True),
+        ("f2", False),
+    ]
     assert data["start"] == 1 and data["camera"]["fy"] == 118.0
     np.testing.assert_allclose(data["frames"][1]["center"], [4.0, 2.0, -18.0])
     jpeg = np.frombuffer(b64decode(data["frames"][2]["picture"].partition(",")[2]), np.uint8)
@@ -124,17 +128,17 @@ def test_a_mesh_is_quantised_in_its_box():
 
 
 def drawn(browser, path):
-    """What the canvas shows, and the lens it is drawn with, once Gaussians are sorted."""
+    """Pixels of the canvas, once Gaussians are sorted."""
     browser.run(
         "new Promise(done => { const wait = () => byId('canvas').dataset.drawn === 'true' ? done()"
         " : setTimeout(wait, 50); wait(); })"
     )
     browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     browser.screenshot(path)
-    left, top, wide, high = browser.run(
+    across, down, wide, high = browser.run(
         "(b => [b.left, b.top, b.width, b.height])(byId('canvas').getBoundingClientRect())"
     )
-    return read_rgb(path)[round(top) : round(top + high), round(left) : round(left + wide)]
+    return read_rgb(path)[round(down) : round(down + high), round(across) : round(across + wide)]
 
 
 def as_canvas(camera, shape):
@@ -162,13 +166,14 @@ def test_a_browser_draws_what_our_renderer_draws(browser, tmp_path, degree, ligh
     for index in (1, 2):
         if index != 1:
             browser.run(f"(s => (s.value = {index}, s.dispatchEvent(new Event('input'))))(byId('frame'))")
-        seen = drawn(browser, tmp_path / "seen.png")
-        scale, camera = as_canvas(FRAMES[index].camera, seen.shape)
+        pixels = drawn(browser, tmp_path / "seen.png")
+        scale, camera = as_canvas(FRAMES[index].camera, pixels.shape)
         renderer = TorchRenderer(TorchRendererSettings(eps2d=0.3 * max(1.0, scale**2)))
         true = renderer.draw(field_of_cloud(cloud).gaussians(camera), camera, ("rgb", "alpha")).rgb.detach()
-        error = seen / 255.0 - true.clamp(0.0, 1.0).numpy()
+        error = pixels / 255.0 - true.clamp(0.0, 1.0).numpy()
         assert -10.0 * np.log10(np.mean(error**2)) > 34.0
     assert browser.run("byId('name').textContent") == "f2"
+    assert all(url.startswith((page.resolve().as_uri(), "blob:")) for url in browser.requests())
     assert [one for one in browser.errors() if "ReadPixels" not in one] == []
 
 
@@ -184,15 +189,15 @@ def test_layers_path_and_looking_around(browser, tmp_path, width):
     drawn(browser, tmp_path / "seen.png")
     browser.run("document.querySelectorAll('input[name=layer]')[1].click()")
     browser.run("(s => (s.value = 0, s.dispatchEvent(new Event('input'))))(byId('frame'))")
-    seen = drawn(browser, tmp_path / "seen.png") if width >= 500 else None
+    shown = drawn(browser, tmp_path / "seen.png") if width >= 500 else None
     assert browser.run("byId('about').textContent") == "6 triangles"
     assert browser.run("byId('legend').textContent") == "red wall"
     assert browser.run("byId('legend').querySelector('i').style.background") == "rgb(250, 10, 30)"
-    if seen is not None:
-        _, camera = as_canvas(FRAMES[0].camera, seen.shape)
+    if shown is not None:
+        _, camera = as_canvas(FRAMES[0].camera, shown.shape)
         pixels, _ = camera.project(torch.tensor([[1.0, 1.0, 8.0]]))
         column, row = pixels[0].int().tolist()
-        np.testing.assert_allclose(seen[row, column], (250, 10, 30), atol=2)
+        np.testing.assert_allclose(shown[row, column], (250, 10, 30), atol=2)
     browser.run("byId('play').click()")
     browser.run(
         "new Promise(done => { const look = () => byId('play').textContent === 'Play' ? done()"

@@ -31,10 +31,10 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     assert run("view", anchors.path, "--output", page, "--size", "4.5MB") == 0
     text = page.read_text(encoding="utf-8")
     assert len(text.encode()) < 4_500_000
-    told, written = capsys.readouterr().out.strip().splitlines()
-    assert written == f"written: {page}" and told.partition(", ")[2] in text
+    summary, written = capsys.readouterr().out.strip().splitlines()
+    assert written == f"written: {page}" and summary.partition(", ")[2] in text
     assert re.search(
-        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", told
+        r"step 2; ([\d,]+) of \1 Gaussians; recorded light; \d+\.\d\d dB in that light on 2 held-out", summary
     )
     assert "<title>coliags on wall</title>" in text
     assert 'id="scene">{"layers":[{"about":"step 2; ' in text

@@ -42,8 +42,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connecti
 @pytest.fixture(scope="module")
 def viewer(anchors):
     write_mesh(anchors.path / "mesh" / "mesh.ply", TriangleMesh(np.eye(3), np.array([[0, 1, 2]])))
-    with anchors.view(port=0) as one:
-        yield one
+    with anchors.view(port=0) as served:
+        yield served
 
 
 @contextmanager
@@ -71,7 +71,7 @@ def browsers(camera, width=WIDTH, height=HEIGHT):
 
 
 def assert_like(picture, expected):
-    """As far as JPEG keeps it."""
+    """Pictures are equal, as far as JPEG keeps them."""
     assert picture.shape == expected.shape
     assert np.abs(picture.astype(float) - as_array(expected)).mean() < 4.0
 
@@ -92,15 +92,15 @@ def test_a_browser_starts_at_the_first_training_frame(viewer):
     camera = viewer.trained.scene.train[0].camera
     with ViserClient(viewer.port) as client:
         client.look(camera)
-        said = {
+        messages = {
             name: client.wait_for(f"SetCamera{name}Message") for name in ("Position", "LookAt", "UpDirection", "Fov")
         }
     center, axis = as_array(camera.center), as_array(camera.optical_axis)
-    np.testing.assert_allclose(said["Position"]["position"], center, atol=1e-6)
-    towards = np.subtract(said["LookAt"]["look_at"], center)
+    np.testing.assert_allclose(messages["Position"]["position"], center, atol=1e-6)
+    towards = np.subtract(messages["LookAt"]["look_at"], center)
     np.testing.assert_allclose(towards / np.linalg.norm(towards), axis, atol=1e-6)
     assert np.linalg.norm(towards) == pytest.approx(20.0 - center[2], rel=0.1)  # the wall is at z = 20 mm
-    assert said["Fov"]["fov"] == pytest.approx(2 * np.arctan(0.5 * camera.height / camera.fy))
+    assert messages["Fov"]["fov"] == pytest.approx(2 * np.arctan(0.5 * camera.height / camera.fy))
 
 
 def test_pictures_are_what_the_runs_renderer_draws(viewer):
@@ -118,12 +118,12 @@ def test_pictures_are_what_the_runs_renderer_draws(viewer):
         camera = trained.scene.train[-1].camera
         client.look(camera)
         client.picture()  # of the moving camera
-        own = render_view(trained, browsers(camera)).rgb
-        assert_like(newest(client), eight_bit(own))
+        expected = render_view(trained, browsers(camera)).rgb
+        assert_like(newest(client), eight_bit(expected))
         client.set("Light", "flattened")
         flat = render_view(flatten(trained), browsers(camera)).rgb
         assert_like(newest(client), eight_bit(flat))
-        assert (flat - own).abs().max() > 0.02
+        assert (flat - expected).abs().max() > 0.02
 
 
 def test_a_moving_camera_gets_small_pictures_and_one_that_rests_the_whole(viewer, monkeypatch):

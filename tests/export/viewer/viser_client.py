@@ -87,13 +87,13 @@ class ViserClient:
         """Messages of one packet, arrays in their places."""
         data = self._socket.recv(timeout=max(0.0, seconds))
         size, packed = (int.from_bytes(data[at : at + 8], "little") for at in (0, 8))
-        found = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], size))
+        packet = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], size))
         buffers, at = [], 16 + packed
-        for length in found["binaryBufferLengths"]:
+        for length in packet["binaryBufferLengths"]:
             at += -at % 8
             buffers.append(data[at : at + length])
             at += length
-        return [_filled(message, buffers) for message in found["messages"]]
+        return [_filled(message, buffers) for message in packet["messages"]]
 
 
 def _filled(value: Any, buffers: list[bytes]) -> Any:

@@ -40,7 +40,7 @@ DEFAULTS = CoverageSettings()
 
 
 def solid_angle(lens) -> float:
-    """Of the image of a centred pinhole camera."""
+    """Solid angle of the image of a centred pinhole camera."""
     x, y = 0.5 * lens.width / lens.fx, 0.5 * lens.height / lens.fy
     return 4.0 * np.arctan(x * y / np.sqrt(1.0 + x * x + y * y))
 
@@ -83,10 +83,10 @@ def test_an_occluder_hides_its_shadow():
     back, front = plane(40.0, 30.0), plane(20.0, 5.0)
     mesh = joined(back, front)
     views = see_faces(mesh, [view_at((0, 0, 0), lens=pinhole(300, 300, 150.0))], CoverageSettings(rays=100_000))
-    seen = views.seen[: len(back)]
+    visible = views.seen[: len(back)]
     inner = np.abs(back.centers[:, :2]).max(axis=1)
-    assert not seen[inner < 10.0 - 0.5].any()
-    assert seen[(inner > 10.0 + 0.5) & (inner < 29.0)].all()
+    assert not visible[inner < 10.0 - 0.5].any()
+    assert visible[(inner > 10.0 + 0.5) & (inner < 29.0)].all()
     assert views.seen[len(back) :].all()
 
 
@@ -131,17 +131,17 @@ def test_masked_pixels_see_nothing():
     mask = np.zeros((lens.height, lens.width), bool)
     mask[:, : lens.width // 2] = True
     mesh = plane(40.0, 5.0, 1.0)
-    seen = see_faces(mesh, [view_at((0, 0, 0), lens=lens, mask=mask)], DEFAULTS).seen
-    assert seen[mesh.centers[:, 0] < -1.0].all() and not seen[mesh.centers[:, 0] > 1.0].any()
+    visible = see_faces(mesh, [view_at((0, 0, 0), lens=lens, mask=mask)], DEFAULTS).seen
+    assert visible[mesh.centers[:, 0] < -1.0].all() and not visible[mesh.centers[:, 0] > 1.0].any()
 
 
 def test_levels_tell_a_glance_darkness_and_distance_apart():
     mesh, options = plane(40.0, 5.0, 2.0), CoverageSettings(glance_frames=2, far=50.0, dark=0.2, grazing=60.0)
 
     def level(*views):
-        found = np.unique(classify(see_faces(mesh, views, options), options))
-        assert len(found) == 1
-        return Level(found[0])
+        levels = np.unique(classify(see_faces(mesh, views, options), options))
+        assert len(levels) == 1
+        return Level(levels[0])
 
     good, dark, far = view_at((0, 0, 0), grey=100), view_at((0, 0, 0), grey=20), view_at((0, 0, -20), grey=100)
     slanted = view_at((60, 0, 15), (-60, 0, 25), grey=100, lens=pinhole(focal=200.0))
@@ -150,8 +150,8 @@ def test_levels_tell_a_glance_darkness_and_distance_apart():
     assert level(good) == Level.GLANCE and level(good, dark) == Level.GLANCE
     assert level(dark, dark) == Level.POOR and level(far, far) == Level.POOR
     assert level(view_at((0, 0, 0), (0, 0, -1))) == Level.UNSEEN
-    found = classify(see_faces(mesh, [slanted], near_slant), near_slant)
-    assert set(found) == {Level.GLANCE}
+    levels = classify(see_faces(mesh, [slanted], near_slant), near_slant)
+    assert set(levels) == {Level.GLANCE}
 
 
 def test_input_that_cannot_be_measured_is_refused():
@@ -298,12 +298,12 @@ def test_a_section_ends_where_less_than_half_was_seen_but_not_at_a_gap_within_it
     arc = np.repeat(np.arange(100) + 0.5, 4)
     areas = np.ones(400)
     share = np.tile(np.arange(4), 100)
-    seen = (arc > 20.0) & (arc < 70.0)
-    section = find_section(arc, areas, seen)
+    shown = (arc > 20.0) & (arc < 70.0)
+    section = find_section(arc, areas, shown)
     assert (section.start, section.end) == pytest.approx((20.0, 70.0), abs=1.01)
-    gap = seen & ~((arc > 40.0) & (arc < 60.0))
+    gap = shown & ~((arc > 40.0) & (arc < 60.0))
     assert find_section(arc, areas, gap) == section
-    quarter = seen | ((arc >= 70.0) & (share == 0))
+    quarter = shown | ((arc >= 70.0) & (share == 0))
     assert find_section(arc, areas, quarter).end < 75.0
     assert section.holds(np.array([19.0, 45.0, 72.0])).tolist() == [False, True, False]
     with pytest.raises(NoLumenError, match="half of the wall"):

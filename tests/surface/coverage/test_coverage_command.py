@@ -74,27 +74,27 @@ def test_the_true_mesh_has_its_true_coverage(recorded, tmp_path):
     # The truth counts wall at any distance.
     settings = CoverageSettings(rays=lens.width * lens.height, max_distance=500.0)
     mesh = read_mesh(true_mesh(recorded))
-    made = measure_scene(scene, mesh, tmp_path / "made", settings)
+    measured = measure_scene(scene, mesh, tmp_path / "made", settings)
     true = np.load(recorded / "truth" / "mesh_seen.npz")["face_seen_by_any_frame"]
-    seen, areas = made.coverage.level[~made.coverage.guessed] != Level.UNSEEN, mesh.areas
+    in_view, areas = measured.coverage.level[~measured.coverage.guessed] != Level.UNSEEN, mesh.areas
     # Only triangles between the rays, seen by their centroids, differ.
-    assert areas[true & ~seen].sum() < 2e-3 * areas[~seen].sum()
-    assert areas[~true & ~seen].sum() > 0.9 * areas[~true].sum()
+    assert areas[true & ~in_view].sum() < 2e-3 * areas[~in_view].sum()
+    assert areas[~true & ~in_view].sum() > 0.9 * areas[~true].sum()
 
 
 def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     # Wall that nobody saw is cut out, as in a reconstruction.
-    seen = np.load(phantom / "truth" / "mesh_seen.npz")["face_seen_by_any_frame"]
+    in_view = np.load(phantom / "truth" / "mesh_seen.npz")["face_seen_by_any_frame"]
     wall, out = tmp_path / "wall.ply", tmp_path / "out"
-    write_mesh(wall, read_mesh(true_mesh(phantom)).part(seen))
+    write_mesh(wall, read_mesh(true_mesh(phantom)).part(in_view))
     assert run("coverage", phantom, "--mesh", wall, "--output", out, "--set", "rays=8000") == 0
     printed = capsys.readouterr().out
     assert RESEARCH_USE in printed and printed.splitlines()[-1] == f"written: {out}"
-    found = json.loads((out / "coverage.json").read_text())
-    assert sum(found["shares"].values()) == pytest.approx(1.0)
-    assert found["guessed_share"] > 0.05 and found["note"] == RESEARCH_USE
+    values = json.loads((out / "coverage.json").read_text())
+    assert sum(values["shares"].values()) == pytest.approx(1.0)
+    assert values["guessed_share"] > 0.05 and values["note"] == RESEARCH_USE
     rows = list(csv.DictReader((out / "regions.csv").open()))
-    areas = [region["area"] for region in found["regions"]]
+    areas = [region["area"] for region in values["regions"]]
     assert [float(row["area_mm2"]) for row in rows] == pytest.approx(areas, abs=1e-3)
     assert len(rows) >= 1 and all(float(row["diameter_mm"]) > 5.0 for row in rows)
     page = (out / "coverage.html").read_text()
@@ -105,13 +105,13 @@ def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
 
 def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
     mesh, out = true_mesh(phantom), tmp_path / "out"
-    for arguments, told in (
+    for arguments, message in (
         ((phantom,), "is not a run folder"),
         ((phantom, "--mesh", tmp_path / "none.ply", "--output", out), "none.ply"),
         ((phantom, "--mesh", mesh, "--output", out, "--set", "farr=3"), "'farr'"),
         ((tmp_path / "gone", "--mesh", mesh, "--output", out), "gone"),
     ):
-        assert told in refused(capsys, "coverage", *arguments), arguments
+        assert message in refused(capsys, "coverage", *arguments), arguments
     assert not out.exists()
 
 
@@ -132,17 +132,19 @@ def test_of_a_short_video_the_seen_wall_is_written_and_why_there_is_no_section(p
     write_mesh(wall, whole.part((local[:, 0] > 5.0) & (local[:, 2] > 5.0) & (local[:, 2] < 25.0)))
     assert run("coverage", phantom, "--mesh", wall, "--output", out, "--set", "rays=8000") == 0
     printed = capsys.readouterr().out
-    found = json.loads((out / "coverage.json").read_text())
-    assert found["unit"] == "mm" and 0.0 < found["seen_area"] <= found["area"] and sum(found["shares"].values())
-    assert f"none ({found['no_section']})" in printed and found["section"] is found["regions"] is found["seen"] is None
+    values = json.loads((out / "coverage.json").read_text())
+    assert values["unit"] == "mm" and 0.0 < values["seen_area"] <= values["area"] and sum(values["shares"].values())
+    assert (
+        f"none ({values['no_section']})" in printed and values["section"] is values["regions"] is values["seen"] is None
+    )
     page = (out / "coverage.html").read_text()
-    assert html.escape(found["no_section"]) in page.replace("&#39;", "&#x27;") and RESEARCH_USE in page
+    assert html.escape(values["no_section"]) in page.replace("&#39;", "&#x27;") and RESEARCH_USE in page
     assert {file.name for file in out.iterdir()} == {"coverage.html", "coverage.json", "coverage.ply", "map.png"}
 
 
 @pytest.mark.thorough
 def test_a_scene_of_unknown_unit_has_its_areas_in_square_units(phantom, tmp_path):
     scene = replace(open_recording(phantom), provenance=Provenance(unit="unknown"))
-    made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "out", CoverageSettings(rays=8000))
-    assert made.values["unit"] == "unknown" and made.values["settings"]["far"] is None
-    assert "square units" in made.summary and "unit of length is unknown" in made.values["no_section"]
+    measured = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "out", CoverageSettings(rays=8000))
+    assert measured.values["unit"] == "unknown" and measured.values["settings"]["far"] is None
+    assert "square units" in measured.summary and "unit of length is unknown" in measured.values["no_section"]

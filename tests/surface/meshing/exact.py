@@ -50,8 +50,8 @@ def exact_run(frames: int = 17, square: bool = False, scene: Scene | None = None
     """A run on the wall, 160x120, with such a model."""
     scene = scene or wall_scene(frames, 160, 120)
     config = SimpleNamespace()
-    made = ExactModel(square, **model)
-    return TrainedRun(RunFolder(Path("run")), config, "exact", scene, made, 100, torch.device("cpu"), 0, {})
+    renderer = ExactModel(square, **model)
+    return TrainedRun(RunFolder(Path("run")), config, "exact", scene, renderer, 100, torch.device("cpu"), 0, {})
 
 
 def with_provenance(scene: Scene, **provenance) -> Scene:

@@ -49,8 +49,8 @@ def test_a_texture_of_a_wall():
     size = np.sqrt(fused.mesh.areas.sum() / 0.6) / 0.25
     assert image.shape == (int(np.ceil(size)), int(np.ceil(size)), 3)
     u, v = corners.mean(axis=1).T
-    found = image[(len(image) * (1.0 - v)).astype(int), (len(image) * u).astype(int)] / 255.0
-    apart = np.abs(found - wall_color(torch.from_numpy(fused.mesh.centers)).numpy())
+    sampled = image[(len(image) * (1.0 - v)).astype(int), (len(image) * u).astype(int)] / 255.0
+    apart = np.abs(sampled - wall_color(torch.from_numpy(fused.mesh.centers)).numpy())
     assert apart.mean() < 0.02 and np.quantile(apart, 0.999) < 0.06
     assert fuse_run(run, MeshSettings(voxel_size=1.0)).texture is None
 
@@ -108,10 +108,10 @@ def test_transparent_views_have_no_surface():
 @pytest.mark.thorough
 def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     run = exact_run()
-    asked = []
+    calls = []
 
     def held(name, model, cameras):
-        asked.append((name, len(cameras)))
+        calls.append((name, len(cameras)))
         return "light"
 
     def dark(model, camera, light, wants):
@@ -122,7 +122,7 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     monkeypatch.setattr(views, "held_light", held)
     monkeypatch.setattr(views, "render_held", dark)
     mesh = fuse_run(run, MeshSettings(color="flattened")).mesh
-    assert asked == [("flattened", len(run.scene.train))]
+    assert calls == [("flattened", len(run.scene.train))]
     assert set(np.unique(mesh.colors)) == {51}
     plain = fuse_run(run).mesh
     # open3d's threads leave the order of vertices open.
@@ -141,9 +141,9 @@ def test_too_few_views_and_methods_without_depth_are_refused():
 
 def test_incidence_on_a_wall():
     camera = camera_at(0.0, 0.0, 0.0, 60, 40, yaw=0.4)
-    found = incidence_cosines(depth_of(camera, square=False), camera)
+    cosines = incidence_cosines(depth_of(camera, square=False), camera)
     rays = camera.rays()
-    assert torch.allclose(found, rays[..., 2].abs() / rays.norm(dim=-1))
+    assert torch.allclose(cosines, rays[..., 2].abs() / rays.norm(dim=-1))
 
 
 def test_incidence_at_a_jump():
@@ -205,41 +205,41 @@ def truth(tmp_path_factory):
 
 
 def test_files_and_figures(truth, tmp_path):
-    made = mesh_run(exact_run(), tmp_path / "mesh", SETTINGS, truth=truth)
+    meshed = mesh_run(exact_run(), tmp_path / "mesh", SETTINGS, truth=truth)
     names = {"mesh.ply", "mesh.obj", "mesh.glb", "mesh.json", "comparison.png", "mesh_error.ply", "truth_error.ply"}
-    assert {path.name for path in made.folder.iterdir()} == names
-    summary = json.loads((made.folder / "mesh.json").read_text())
+    assert {path.name for path in meshed.folder.iterdir()} == names
+    summary = json.loads((meshed.folder / "mesh.json").read_text())
     assert (summary["method"], summary["unit"], summary["views"], summary["step"]) == ("exact", "mm", 14, 100)
     assert summary["holes_closed"] == 0
-    assert summary["triangles"] == len(made.mesh) == len(read_mesh(made.folder / "mesh.ply"))
+    assert summary["triangles"] == len(meshed.mesh) == len(read_mesh(meshed.folder / "mesh.ply"))
     assert summary["settings"]["voxel_size"] == 0.4
-    assert summary["area"] == pytest.approx(made.mesh.areas.sum())
-    compared = made.comparison
+    assert summary["area"] == pytest.approx(meshed.mesh.areas.sum())
+    compared = meshed.comparison
     assert summary["comparison"]["chamfer"] == compared.chamfer
     assert summary["comparison"]["scores"][1]["f"] == compared.f_at(1.0) > 0.98
     assert compared.accuracy.mean < 0.01 and compared.normal_error < 1.0
     assert "cast" in compared.seen_by
     assert f"{compared.chamfer:.3f} mm" in terminal_text(comparison_blocks(compared))
-    errors = read_mesh(made.folder / "truth_error.ply")
+    errors = read_mesh(meshed.folder / "truth_error.ply")
     corner = np.abs(errors.vertices[:, :2]).min(axis=1) > 29
     assert (errors.colors[corner] == 128).all(), "what was not seen is grey"
-    assert read_rgb(made.folder / "comparison.png").shape[2] == 3
+    assert read_rgb(meshed.folder / "comparison.png").shape[2] == 3
 
 
 def test_without_truth(tmp_path):
-    made = mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, formats=("obj",))
-    assert {path.name for path in made.folder.iterdir()} == {"mesh.obj", "mesh.json"}
-    assert made.comparison is None
-    assert json.loads((made.folder / "mesh.json").read_text())["comparison"] is None
+    meshed = mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, formats=("obj",))
+    assert {path.name for path in meshed.folder.iterdir()} == {"mesh.obj", "mesh.json"}
+    assert meshed.comparison is None
+    assert json.loads((meshed.folder / "mesh.json").read_text())["comparison"] is None
 
 
 def test_with_a_texture(tmp_path):
-    made = mesh_run(exact_run(frames=9), tmp_path / "mesh", MeshSettings(voxel_size=1.0, texture=2.0))
+    meshed = mesh_run(exact_run(frames=9), tmp_path / "mesh", MeshSettings(voxel_size=1.0, texture=2.0))
     names = {"mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.glb", "mesh.json"}
-    assert {path.name for path in made.folder.iterdir()} == names
-    size = json.loads((made.folder / "mesh.json").read_text())["texture"]
-    assert read_rgb(made.folder / "mesh.png").shape == (size, size, 3)
-    assert read_mesh(made.folder / "mesh.ply").colors is not None, "PLY keeps colours at vertices"
+    assert {path.name for path in meshed.folder.iterdir()} == names
+    size = json.loads((meshed.folder / "mesh.json").read_text())["texture"]
+    assert read_rgb(meshed.folder / "mesh.png").shape == (size, size, 3)
+    assert read_mesh(meshed.folder / "mesh.ply").colors is not None, "PLY keeps colours at vertices"
 
 
 @pytest.mark.thorough
@@ -248,9 +248,9 @@ def test_truth_beside_the_scene_is_found(tmp_path):
     write_mesh(tmp_path / "scene/truth/mesh.ply", wall_mesh())
     np.savez(tmp_path / "scene/truth/mesh_seen.npz", face_seen=np.abs(wall_mesh().centers[:, :2]).max(axis=1) < 5)
     scene = replace(wall_scene(9, 160, 120), folder=tmp_path / "scene")
-    made = mesh_run(exact_run(scene=scene), tmp_path / "mesh", SETTINGS)
-    assert made.comparison.seen_area == pytest.approx(100.0, rel=0.15)
-    assert made.comparison.scores[0].recall == 1.0
+    meshed = mesh_run(exact_run(scene=scene), tmp_path / "mesh", SETTINGS)
+    assert meshed.comparison.seen_area == pytest.approx(100.0, rel=0.15)
+    assert meshed.comparison.scores[0].recall == 1.0
 
 
 def test_what_is_there_is_not_replaced_unless_told(tmp_path):
@@ -285,18 +285,18 @@ def test_truth_of_another_unit_is_refused(tmp_path):
 
 @pytest.mark.thorough
 def test_a_scene_of_unknown_scale(truth, tmp_path):
-    """Its unit is said, and truth in mm is only that of a scene with the same poses."""
+    """Figures name its unit, and truth in mm is only that of a scene with the same poses."""
     folder = write_wall(tmp_path / "wall", 9, 160, 120)
     run = exact_run(scene=with_provenance(wall_scene(9, 160, 120), unit="unknown"))
     with pytest.raises(InputError, match="unknown scale"):
         mesh_run(run, tmp_path / "mesh", SETTINGS, truth=truth)
-    made = mesh_run(run, tmp_path / "mesh", SETTINGS, formats=("ply",))
-    assert json.loads((made.folder / "mesh.json").read_text())["unit"] == "unknown"
+    meshed = mesh_run(run, tmp_path / "mesh", SETTINGS, formats=("ply",))
+    assert json.loads((meshed.folder / "mesh.json").read_text())["unit"] == "unknown"
     (folder / "truth").mkdir()
     write_mesh(folder / "truth/mesh.ply", wall_mesh())
-    made = mesh_run(run, tmp_path / "compared", SETTINGS, formats=("ply",), truth=folder)
-    assert made.comparison.f_at(0.5) > 0.9
-    assert made.comparison.unit == "mm", "the unit that the scene shares with that of the truth"
+    meshed = mesh_run(run, tmp_path / "compared", SETTINGS, formats=("ply",), truth=folder)
+    assert meshed.comparison.f_at(0.5) > 0.9
+    assert meshed.comparison.unit == "mm", "the unit that the scene shares with that of the truth"
     write_unit(folder, "unknown")
     compared = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder).comparison
     printed = terminal_text(comparison_blocks(compared))
@@ -316,11 +316,11 @@ def test_a_scene_of_unknown_scale(truth, tmp_path):
 def test_first_hits_are_what_the_views_see():
     frames = wall_scene(9, 160, 120).train[:1]
     mesh = wall_mesh()
-    seen = first_hits(mesh, frames)
+    hit = first_hits(mesh, frames)
     camera = frames[0].camera
     pixels, _ = camera.project(torch.from_numpy(mesh.centers))
     inside = ((pixels > 4) & (pixels < torch.tensor([156, 116]))).all(dim=1).numpy()
     outside = ((pixels < -4) | (pixels > torch.tensor([164, 124]))).any(dim=1).numpy()
-    assert seen[inside].all() and not seen[outside].any()
+    assert hit[inside].all() and not hit[outside].any()
     hidden = frames[0].with_maps(mask=torch.zeros(120, 160, dtype=torch.bool))
     assert not first_hits(mesh, [hidden]).any()
