@@ -194,7 +194,7 @@ def test_opacities_and_scales_that_were_activated_are_told(tmp_path, caplog, act
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"),
+    ("lines", "text"),
     [
         (("element chunk 1", "property float min_x", "element vertex 256", "property uint packed_position"), "compres"),
         (("element vertex 1", "property float x", "property float f_offset_0"), "anchors"),

@@ -39,7 +39,7 @@ def test_a_small_hole_is_closed_as_the_wall_about_it():
 
 
 def test_the_wall_goes_on_as_it_bends():
-    """The surface is a sphere of 15 mm: the middle of the hole is 0.1 mm off the plane of its rim, and less off the sphere."""
+    """The middle of the hole in a sphere of 15 mm is 0.1 mm off the plane of its rim, and less off the sphere."""
     x, y = WHOLE.vertices[:, :2].T
     bent = replace(WHOLE, vertices=np.stack([x, y, 5.0 + np.sqrt(15.0**2 - x**2 - y**2)], axis=1).astype(np.float32))
     closed, count = close_holes(without(bent, (0.0, 0.0), radius=2.0), 20.0, [view()])
