@@ -27,9 +27,8 @@ SPILLED = 8
 #: Types of arguments that are not tables of float32.
 TYPES = {
     **dict.fromkeys(("columns", "rows", "width", "height", "channels", "count", "anchors", "tiles"), "i32"),
-    **dict.fromkeys(("fx", "fy", "cx", "cy", "near_plane", "sharpness", "slack", "ellipse_slack", "eps2d"), "fp32"),
-    **dict.fromkeys(("surfel_filter", "alpha_min", "alpha_max", "transmittance_min", "sigmas"), "fp32"),
-    **dict.fromkeys(("x_min", "x_max", "y_min", "y_max"), "fp32"),
+    **dict.fromkeys(("fx", "fy", "cx", "cy", "near_plane", "sharpness"), "fp32"),
+    **dict.fromkeys(("alpha_min", "alpha_max", "transmittance_min", "sigmas"), "fp32"),
     **dict.fromkeys(("gaussian", "counts", "boxes"), "*i32"),
     **dict.fromkeys(("starts", "order", "ends", "sources", "visible_sources"), "*i64"),
     "visible": "*i1",
@@ -68,8 +67,24 @@ def of_renderer():
         variant = ".".join(str(blocks[name]) for name in ("CHANNELS", "EMIT") if name in blocks)
         name = f"{kernel.__module__.rsplit('.')[-1]}.{kernel.__name__}.{variant}"
         of_surfels = kernel.__module__.endswith("surfel_projection")
-        types = TYPES | {"tiles": "*i32"} | ({"of_pose": "*fp64"} if of_surfels else {})
+        sums = "*fp64" if of_surfels else "*fp32"
+        types = TYPES | {"tiles": "*i32", "of_pose": sums} | structures(geometry, sums)
         yield name, kernel, types, blocks | everything, {"num_warps": warps, "enable_fp_fusion": True}
+
+
+def structures(geometry, sums):
+    """Types of the arguments that are named tuples; ``sums`` is that of the sums of the pose's gradient."""
+    tables = ["*fp32"] * 4
+    return {
+        **dict.fromkeys(("gaussians", "surfels"), geometry.Tables(*tables, "*fp32")),
+        **dict.fromkeys(("of_gaussians", "of_surfels"), geometry.Tables(*tables, sums)),
+        **dict.fromkeys(("projected", "of_projected"), geometry.Projected(*tables, "*fp32")),
+        "extents": geometry.Extents("*fp32", "*fp32", "*i32"),
+        "view": geometry.View("i32", *["fp32"] * 5),
+        "slope_limits": ("fp32",) * 4,
+        "cuts": geometry.Cuts(*["fp32"] * 4),
+        "grid": geometry.Grid(*["i32"] * 4),
+    }
 
 
 def of_decoding():

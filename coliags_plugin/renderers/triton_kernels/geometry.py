@@ -1,9 +1,11 @@
-"""Device functions of projection: vectors, cameras, rotations, and the tiles that an ellipse touches.
+"""Arguments and device functions of projection: vectors, cameras, rotations, and the tiles that an ellipse touches.
 
 A vector of a block of Gaussians is a tuple of its coordinates.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import triton
 import triton.language as tl
@@ -14,6 +16,63 @@ WARPS = 2
 #: Columns of the outlines that binning reads: an ellipse's centre, its whitening (u_xx, u_yx, u_yy), cov_xy / cov_xx
 #: and cov_xy / cov_yy, the squared Mahalanobis distance at its rim; centre and squared radius of a circle.
 OUTLINE_COLUMNS = tl.constexpr(11)
+
+
+class Tables(NamedTuple):
+    """Gaussians or surfels and the pose they are seen from, or the gradients of these."""
+
+    means: Any  # [N, 3]
+    quats: Any  # w first [N, 4]
+    scales: Any  # [N, 3], surfels [N, 2]
+    opacities: Any  # [N]
+    pose: Any  # camera_to_world [4, 4]; of gradients one sum for each program [programs, 3, 4]
+
+
+class Projected(NamedTuple):
+    """Outputs of the projection with gradients, or these gradients."""
+
+    means2d: Any  # pixels [N, 2]
+    shapes: Any  # whitenings of 3D Gaussians [N, 3]; of surfels see ``surfel_projection.SHAPE_COLUMNS`` [N, 8]
+    depths: Any  # z-depths [N]
+    log_opacities: Any  # 0 where not drawn [N]
+    normals: Any  # camera axes, towards the camera; unused without WITH_NORMALS [N, 3]
+
+
+class Extents(NamedTuple):
+    """Outputs of the projection without gradients, for binning."""
+
+    radii: Any  # pixels; 0 where not drawn [N]
+    outlines: Any  # see OUTLINE_COLUMNS [N, 11]
+    boxes: Any  # first and last column, first and last row of tiles, int32; none where not drawn [N, 4]
+
+
+class View(NamedTuple):
+    """Number of Gaussians, intrinsics in pixels, and z-depth of the near plane."""
+
+    count: Any
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+    near_plane: Any
+
+
+class Grid(NamedTuple):
+    """Size of the image in pixels, and in tiles."""
+
+    width: Any
+    height: Any
+    columns: Any
+    rows: Any
+
+
+class Cuts(NamedTuple):
+    """Thresholds of the projection; ``low_pass`` is added to an ellipse's variances, ``slack`` to its reach."""
+
+    low_pass: Any  # square pixels
+    alpha_min: Any
+    slack: Any  # squared standard deviations
+    surfel_filter: Any = 0.0  # pixels
 
 
 @triton.jit
@@ -183,12 +242,13 @@ def filtered(row_x, row_y, eps2d):
 
 
 @triton.jit
-def store_tiles(boxes, row, here, drawn, left, right, top, bottom, columns, rows, SIZE: tl.constexpr):
+def store_tiles(boxes, row, here, drawn, box, grid, SIZE: tl.constexpr):
     """Write first and last column and row of the tiles that a box in pixels touches; none where not drawn."""
-    tl.store(boxes + 4 * row, tl.where(drawn, _tile(left, columns, SIZE), 0), here)
-    tl.store(boxes + 4 * row + 1, tl.where(drawn, _tile(right, columns, SIZE), -1), here)
-    tl.store(boxes + 4 * row + 2, tl.where(drawn, _tile(top, rows, SIZE), 0), here)
-    tl.store(boxes + 4 * row + 3, tl.where(drawn, _tile(bottom, rows, SIZE), -1), here)
+    left, right, top, bottom = box
+    tl.store(boxes + 4 * row, tl.where(drawn, _tile(left, grid.columns, SIZE), 0), here)
+    tl.store(boxes + 4 * row + 1, tl.where(drawn, _tile(right, grid.columns, SIZE), -1), here)
+    tl.store(boxes + 4 * row + 2, tl.where(drawn, _tile(top, grid.rows, SIZE), 0), here)
+    tl.store(boxes + 4 * row + 3, tl.where(drawn, _tile(bottom, grid.rows, SIZE), -1), here)
 
 
 @triton.jit

@@ -18,7 +18,17 @@ from coliags_plugin.renderers.stages import Placed
 from coliags_plugin.renderers.tiles import ELLIPSE_SLACK, RADIUS_SLACK, TileGrid, TilePairs
 from coliags_plugin.renderers.triton_kernels import projection, surfel_projection
 from coliags_plugin.renderers.triton_kernels.binning import find_pairs
-from coliags_plugin.renderers.triton_kernels.geometry import BLOCK, OUTLINE_COLUMNS, WARPS
+from coliags_plugin.renderers.triton_kernels.geometry import (
+    BLOCK,
+    OUTLINE_COLUMNS,
+    WARPS,
+    Cuts,
+    Extents,
+    Grid,
+    Projected,
+    Tables,
+    View,
+)
 
 
 def place_gaussians(
@@ -67,26 +77,31 @@ class _Gaussians(torch.autograd.Function):
         cuts: CutSettings,
         grid: TileGrid,
     ) -> tuple[Tensor | None, ...]:
-        given = (means, quats, scales, opacities, pose)
-        limits = slope_limits(camera.fx, camera.cx, camera.width), slope_limits(camera.fy, camera.cy, camera.height)
-        ctx.view = (len(means), camera.fx, camera.fy, camera.near_plane, *limits[0], *limits[1])
-        means2d, whitenings = means.new_empty(len(means), 2), torch.empty_like(means)
-        log_opacities, depths = torch.empty_like(opacities), torch.empty_like(opacities)
-        normals = torch.empty_like(means) if with_normals else None
-        extents = _extents(means)
-        outputs = (means2d, whitenings, depths, log_opacities, means if normals is None else normals)
-        count, fx, fy, *rest = ctx.view
-        projection.forward[_programs(count)](
-            *(*given, *outputs, *extents, count, fx, fy, camera.cx, camera.cy, *rest, cuts.eps2d, cuts.alpha_min),
-            *(RADIUS_SLACK, grid.width, grid.height, grid.columns, grid.rows),
+        gaussians, extents = Tables(means, quats, scales, opacities, pose), _extents(means)
+        ctx.view = _view(means, camera)
+        ctx.slope_limits = (
+            *slope_limits(camera.fx, camera.cx, camera.width),
+            *slope_limits(camera.fy, camera.cy, camera.height),
+        )
+        projected = Projected(
+            means.new_empty(len(means), 2),
+            torch.empty_like(means),
+            torch.empty_like(opacities),
+            torch.empty_like(opacities),
+            torch.empty_like(means) if with_normals else means,
+        )
+        projection.forward[_programs(len(means))](
+            *(gaussians, projected, extents, ctx.view, ctx.slope_limits),
+            *(Cuts(cuts.eps2d, cuts.alpha_min, RADIUS_SLACK), _grid(grid)),
             WITH_NORMALS=with_normals,
             SIZE=grid.size,
             **_OPTIONS,
         )
         ctx.with_normals = with_normals
-        ctx.save_for_backward(*given, whitenings, extents[2])
+        ctx.save_for_backward(*gaussians, projected.shapes, extents.boxes)
         ctx.mark_non_differentiable(*extents)
-        return means2d, whitenings, log_opacities, depths, normals, *extents
+        normals = projected.normals if with_normals else None
+        return projected.means2d, projected.shapes, projected.log_opacities, projected.depths, normals, *extents
 
     @staticmethod
     @once_differentiable
@@ -99,27 +114,26 @@ class _Gaussians(torch.autograd.Function):
         of_normals: Tensor | None,
         *_: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        saved = ctx.saved_tensors
-        means = saved[0]
-        found = [torch.empty_like(tensor) for tensor in saved[:4]]
-        of_pose = _pose_sums(means)
-        outer = _contiguous(of_means2d, of_whitenings, of_depths, of_log_opacities, of_normals, otherwise=means)
-        projection.backward[_programs(len(means))](
-            *(*saved, *outer, *found, of_pose, *ctx.view), WITH_NORMALS=ctx.with_normals, **_OPTIONS
+        *tables, whitenings, boxes = ctx.saved_tensors
+        gaussians = Tables(*tables)
+        of_gaussians = Tables(*map(torch.empty_like, tables[:4]), _pose_sums(gaussians.means))
+        given = (of_means2d, of_whitenings, of_depths, of_log_opacities, of_normals)
+        of_projected = Projected(*_contiguous(*given, otherwise=gaussians.means))
+        projection.backward[_programs(len(gaussians.means))](
+            *(gaussians, whitenings, boxes, of_projected, of_gaussians, ctx.view, ctx.slope_limits),
+            WITH_NORMALS=ctx.with_normals,
+            **_OPTIONS,
         )
-        return *found, _of_pose(of_pose), None, None, None, None
+        return *of_gaussians[:4], _of_pose(of_gaussians.pose), None, None, None, None
 
 
 class _Centers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, pose: Tensor, camera: Camera) -> Tensor:
         ctx.save_for_backward(means, pose)
-        ctx.view = (len(means), camera.fx, camera.fy, camera.near_plane)
+        ctx.view = _view(means, camera)
         means2d = means.new_empty(len(means), 2)
-        count, fx, fy, near_plane = ctx.view
-        surfel_projection.centers[_programs(count)](
-            means, pose, means2d, count, fx, fy, camera.cx, camera.cy, near_plane, **_OPTIONS
-        )
+        surfel_projection.centers[_programs(len(means))](means, pose, means2d, ctx.view, **_OPTIONS)
         return means2d
 
     @staticmethod
@@ -128,7 +142,7 @@ class _Centers(torch.autograd.Function):
         means, pose = ctx.saved_tensors
         of_means, of_pose = torch.empty_like(means), _pose_sums(means, torch.float64)
         surfel_projection.centers_backward[_programs(len(means))](
-            means, pose, of_means2d.contiguous(), of_means, of_pose, *ctx.view, **_OPTIONS
+            means, pose, of_means2d.contiguous(), of_means, of_pose, ctx.view, **_OPTIONS
         )
         return of_means, _of_pose(of_pose), None
 
@@ -147,33 +161,39 @@ class _Surfels(torch.autograd.Function):
         cuts: CutSettings,
         grid: TileGrid,
     ) -> tuple[Tensor, ...]:
-        given = (means, quats, scales, opacities, pose)
-        ctx.view = (len(means), camera.fx, camera.fy, camera.near_plane)
-        shapes = means.new_empty(len(means), surfel_projection.SHAPE_COLUMNS.value)
-        depths, log_opacities = torch.empty_like(opacities), torch.empty_like(opacities)
-        normals, extents = torch.empty_like(means), _extents(means)
-        surfel_projection.forward[_programs(len(means))](
-            *(*given, means2d, shapes, depths, log_opacities, normals, *extents, *ctx.view, cuts.alpha_min),
-            *(RADIUS_SLACK, ELLIPSE_SLACK, cuts.surfel_filter, grid.width, grid.height, grid.columns, grid.rows),
-            SIZE=grid.size,
-            **_OPTIONS,
+        surfels, extents = Tables(means, quats, scales, opacities, pose), _extents(means)
+        ctx.view = _view(means, camera)
+        projected = Projected(
+            means2d,
+            means.new_empty(len(means), surfel_projection.SHAPE_COLUMNS.value),
+            torch.empty_like(opacities),
+            torch.empty_like(opacities),
+            torch.empty_like(means),
         )
-        ctx.save_for_backward(*given, extents[2])
-        ctx.mark_non_differentiable(depths, *extents)
-        return shapes, log_opacities, normals, depths, *extents
+        limits = Cuts(ELLIPSE_SLACK, cuts.alpha_min, RADIUS_SLACK, cuts.surfel_filter)
+        surfel_projection.forward[_programs(len(means))](
+            surfels, projected, extents, ctx.view, limits, _grid(grid), SIZE=grid.size, **_OPTIONS
+        )
+        ctx.save_for_backward(*surfels, extents.boxes)
+        ctx.mark_non_differentiable(projected.depths, *extents)
+        return projected.shapes, projected.log_opacities, projected.normals, projected.depths, *extents
 
     @staticmethod
     @once_differentiable
     def backward(
         ctx: Any, of_shapes: Tensor, of_log_opacities: Tensor, of_normals: Tensor, *_: Tensor
     ) -> tuple[Tensor | None, ...]:
-        saved = ctx.saved_tensors
-        means = saved[0]
-        found = [means.new_empty(len(means), 2), *(torch.empty_like(tensor) for tensor in saved[:4])]
-        of_pose = _pose_sums(means, torch.float64)
-        outer = _contiguous(of_shapes, of_log_opacities, of_normals, otherwise=means)
-        surfel_projection.backward[_programs(len(means))](*saved, *outer, *found, of_pose, *ctx.view, **_OPTIONS)
-        return *found, _of_pose(of_pose), None, None, None
+        *tables, boxes = ctx.saved_tensors
+        surfels = Tables(*tables)
+        of_surfels = Tables(*map(torch.empty_like, tables[:4]), _pose_sums(surfels.means, torch.float64))
+        of_means2d = surfels.means.new_empty(len(surfels.means), 2)
+        # Centres and depths have gradients of their own.
+        given = (None, of_shapes, None, of_log_opacities, of_normals)
+        of_projected = Projected(*_contiguous(*given, otherwise=surfels.means))
+        surfel_projection.backward[_programs(len(of_means2d))](
+            surfels, boxes, of_projected, of_means2d, of_surfels, ctx.view, **_OPTIONS
+        )
+        return of_means2d, *of_surfels[:4], _of_pose(of_surfels.pose), None, None, None
 
 
 #: Options of every launch here. Fused multiply-adds are no less accurate.
@@ -184,11 +204,19 @@ def _programs(count: int) -> tuple[int]:
     return (-(-count // BLOCK),)
 
 
-def _extents(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Radii, outlines and boxes of tiles, to be written."""
+def _view(means: Tensor, camera: Camera) -> View:
+    return View(len(means), camera.fx, camera.fy, camera.cx, camera.cy, camera.near_plane)
+
+
+def _grid(grid: TileGrid) -> Grid:
+    return Grid(grid.width, grid.height, grid.columns, grid.rows)
+
+
+def _extents(means: Tensor) -> Extents:
+    """Extents to be written."""
     count = len(means)
     boxes = torch.empty(count, 4, dtype=torch.int32, device=means.device)
-    return means.new_empty(count), means.new_empty(count, OUTLINE_COLUMNS.value), boxes
+    return Extents(means.new_empty(count), means.new_empty(count, OUTLINE_COLUMNS.value), boxes)
 
 
 def _contiguous(*gradients: Tensor | None, otherwise: Tensor) -> Iterable[Tensor]:

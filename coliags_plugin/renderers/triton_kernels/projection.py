@@ -28,14 +28,15 @@ from coliags_plugin.renderers.triton_kernels.geometry import (
 
 
 @triton.jit
-def _project(means, quats, scales, axes, row, here, fx, fy, near_plane, slope_limits):
+def _project(gaussians, axes, row, here, view, slope_limits):
     """All that does not depend on opacity.
 
     Returns whether in front; offset in world axes and place in camera axes; x / z and y / z, clamped, and whether they
     are not; quaternion, its inverse length and the columns of its rotation; scales; the rows of J C^T, and of J C^T R.
     """
     right, down, forward, _ = axes
-    in_front, offset, place = in_camera(load_rows(means, row, here), axes, near_plane, here)
+    fx, fy = view.fx, view.fy
+    in_front, offset, place = in_camera(load_rows(gaussians.means, row, here), axes, view.near_plane, here)
     x, y, z = place
     x_min, x_max, y_min, y_max = slope_limits
     slope_x = tl.minimum(tl.maximum(x / z, x_min), x_max)
@@ -43,11 +44,11 @@ def _project(means, quats, scales, axes, row, here, fx, fy, near_plane, slope_li
     free = (slope_x == x / z, slope_y == y / z)
     image_x = times(fx / z, plus(right, times(-slope_x, forward)))
     image_y = times(fy / z, plus(down, times(-slope_y, forward)))
-    quaternion, inverse_norm = load_quaternion(quats, row, here, tl.float32)
+    quaternion, inverse_norm = load_quaternion(gaussians.quats, row, here, tl.float32)
     first, second, third = rotation_columns(quaternion)
     local_x = (dot(image_x, first), dot(image_x, second), dot(image_x, third))
     local_y = (dot(image_y, first), dot(image_y, second), dot(image_y, third))
-    scale = load_rows(scales, row, here)
+    scale = load_rows(gaussians.scales, row, here)
     turned = (quaternion, inverse_norm, (first, second, third))
     return in_front, offset, place, (slope_x, slope_y), free, turned, scale, (image_x, image_y), (local_x, local_y)
 
@@ -62,44 +63,44 @@ def _shortest(columns, scale, offset):
 
 @triton.jit
 def forward(
-    means, quats, scales, opacities, pose, means2d, whitenings, depths, log_opacities, normals, radii, outlines, boxes,
-    count, fx, fy, cx, cy, near_plane, x_min, x_max, y_min, y_max, eps2d, alpha_min, slack,
-    width, height, columns, rows,
+    gaussians, projected, extents, view, slope_limits, cuts, grid,
     WITH_NORMALS: tl.constexpr, SIZE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Project 3D Gaussians; log(opacity) and radius are 0 where nothing is drawn."""
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = row < count
-    axes = load_pose(pose, tl.float32)
-    in_front, offset, place, _, _, turned, scale, _, local = _project(
-        means, quats, scales, axes, row, here, fx, fy, near_plane, (x_min, x_max, y_min, y_max)
-    )
-    x, y, z = place
-    mean_x, mean_y = fx * x / z + cx, fy * y / z + cy
-    outline, xx, yy = filtered(multiplied(local[0], scale), multiplied(local[1], scale), eps2d)
+    """Project 3D Gaussians; log(opacity) and radius are 0 where nothing is drawn.
 
-    opacity = tl.load(opacities + row, here, 0.0)
-    tau = 2.0 * tl.log(opacity / alpha_min)
-    left, right, top, bottom = 0.5 - mean_x, width - 0.5 - mean_x, 0.5 - mean_y, height - 0.5 - mean_y
+    Arguments are ``Tables``, ``Projected`` and ``Extents`` to write, ``View``, least and largest x / z, then y / z, and
+    ``Cuts`` and ``Grid`` of ``geometry``.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = row < view.count
+    axes = load_pose(gaussians.pose, tl.float32)
+    in_front, offset, place, _, _, turned, scale, _, local = _project(gaussians, axes, row, here, view, slope_limits)
+    x, y, z = place
+    mean_x, mean_y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    outline, xx, yy = filtered(multiplied(local[0], scale), multiplied(local[1], scale), cuts.low_pass)
+
+    opacity = tl.load(gaussians.opacities + row, here, 0.0)
+    tau = 2.0 * tl.log(opacity / cuts.alpha_min)
+    left, right, top, bottom = 0.5 - mean_x, grid.width - 0.5 - mean_x, 0.5 - mean_y, grid.height - 0.5 - mean_y
     nearest = squared_distance_to_box(outline, left, right, top, bottom)
     drawn = in_front & (tau >= 0.0) & (nearest <= tau)
     radius = tl.ceil(tl.sqrt(tl.maximum(tau, 0.0) * tl.maximum(xx, yy)))
-    tl.store(radii + row, tl.where(drawn, radius, 0.0), here)
-    tl.store(log_opacities + row, tl.log(tl.where(drawn, opacity, 1.0)), here)
-    tl.store(depths + row, z, here)
-    tl.store(means2d + 2 * row, mean_x, here)
-    tl.store(means2d + 2 * row + 1, mean_y, here)
-    store_rows(whitenings, row, here, (outline[0], outline[1], outline[2]))
+    tl.store(extents.radii + row, tl.where(drawn, radius, 0.0), here)
+    tl.store(projected.log_opacities + row, tl.log(tl.where(drawn, opacity, 1.0)), here)
+    tl.store(projected.depths + row, z, here)
+    tl.store(projected.means2d + 2 * row, mean_x, here)
+    tl.store(projected.means2d + 2 * row + 1, mean_y, here)
+    store_rows(projected.shapes, row, here, (outline[0], outline[1], outline[2]))
     if WITH_NORMALS:
         _, _, axis, sign = _shortest(turned[2], scale, offset)
-        store_rows(normals, row, here, times(sign, (dot(axis, axes[0]), dot(axis, axes[1]), dot(axis, axes[2]))))
+        normal = times(sign, (dot(axis, axes[0]), dot(axis, axes[1]), dot(axis, axes[2])))
+        store_rows(projected.normals, row, here, normal)
 
-    reach = tl.maximum(tau, 0.0) + slack
+    reach = tl.maximum(tau, 0.0) + cuts.slack
     half_x, half_y = tl.sqrt(reach * xx), tl.sqrt(reach * yy)
-    store_tiles(
-        boxes, row, here, drawn, mean_x - half_x, mean_x + half_x, mean_y - half_y, mean_y + half_y, columns, rows, SIZE
-    )
-    entry = outlines + OUTLINE_COLUMNS * row
+    box = (mean_x - half_x, mean_x + half_x, mean_y - half_y, mean_y + half_y)
+    store_tiles(extents.boxes, row, here, drawn, box, grid, SIZE)
+    entry = extents.outlines + OUTLINE_COLUMNS * row
     tl.store(entry, mean_x, here)
     tl.store(entry + 1, mean_y, here)
     for column in tl.static_range(5):
@@ -110,18 +111,17 @@ def forward(
 
 @triton.jit
 def backward(
-    means, quats, scales, opacities, pose, whitenings, boxes, of_means2d, of_whitenings, of_depths, of_log_opacities,
-    of_normals, of_means, of_quats, of_scales, of_opacities, of_pose,
-    count, fx, fy, near_plane, x_min, x_max, y_min, y_max,
+    gaussians, whitenings, boxes, of_projected, of_gaussians, view, slope_limits,
     WITH_NORMALS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the Gaussians, and sums of those of the pose."""
+    """Write ``of_gaussians``, of the pose sums, from ``of_projected`` and the outputs of :func:`forward`."""
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = row < count
-    axes = load_pose(pose, tl.float32)
+    here = row < view.count
+    fx, fy = view.fx, view.fy
+    axes = load_pose(gaussians.pose, tl.float32)
     right, down, forward_axis, _ = axes
     in_front, offset, place, slopes, free, turned, scale, image, local = _project(
-        means, quats, scales, axes, row, here, fx, fy, near_plane, (x_min, x_max, y_min, y_max)
+        gaussians, axes, row, here, view, slope_limits
     )
     quaternion, inverse_norm, columns = turned
     x, y, z = place
@@ -129,7 +129,7 @@ def backward(
     # dL/dSigma from dL/dU, for Sigma = (U^T U)^-1: with A the lower triangle of dL/dU U^T, its diagonal halved, minus
     # U^T A U made symmetric.
     u_xx, u_yx, u_yy = load_rows(whitenings, row, here)
-    of_u_xx, of_u_yx, of_u_yy = load_rows(of_whitenings, row, here)
+    of_u_xx, of_u_yx, of_u_yy = load_rows(of_projected.shapes, row, here)
     a_xx, a_yx, a_yy = of_u_xx * u_xx, of_u_yx * u_xx, of_u_yx * u_yx + of_u_yy * u_yy
     twice_xx = -(a_xx * u_xx * u_xx + 2.0 * a_yx * u_xx * u_yx + a_yy * u_yx * u_yx)
     of_xy = -u_yy * (a_yx * u_xx + a_yy * u_yx)
@@ -153,14 +153,14 @@ def backward(
     to_forward = plus(times(-slopes[0], to_right), times(-slopes[1], to_down))
     of_slope_x = tl.where(free[0], -dot(forward_axis, to_right), 0.0)
     of_slope_y = tl.where(free[1], -dot(forward_axis, to_down), 0.0)
-    of_x = (fx * tl.load(of_means2d + 2 * row, here, 0.0) + of_slope_x) / z
-    of_y = (fy * tl.load(of_means2d + 2 * row + 1, here, 0.0) + of_slope_y) / z
+    of_x = (fx * tl.load(of_projected.means2d + 2 * row, here, 0.0) + of_slope_x) / z
+    of_y = (fy * tl.load(of_projected.means2d + 2 * row + 1, here, 0.0) + of_slope_y) / z
     lost = of_x * x + of_y * y + dot(image_x, of_image_x) + dot(image_y, of_image_y)
-    of_z = tl.load(of_depths + row, here, 0.0) - lost / z
+    of_z = tl.load(of_projected.depths + row, here, 0.0) - lost / z
 
     if WITH_NORMALS:
         is_second, is_third, axis, sign = _shortest(columns, scale, offset)
-        of_normal = times(sign, load_rows(of_normals, row, here))
+        of_normal = times(sign, load_rows(of_projected.normals, row, here))
         of_axis = combined(of_normal, right, down, forward_axis)
         of_third = plus(of_third, times(is_third.to(tl.float32), of_axis))
         of_second = plus(of_second, times((is_second & ~is_third).to(tl.float32), of_axis))
@@ -171,18 +171,19 @@ def backward(
     nothing = (0.0, 0.0, 0.0)
     of_mean = chosen(in_front, combined((of_x, of_y, of_z), right, down, forward_axis), nothing)
     store_pose_sums(
-        of_pose,
+        of_gaussians.pose,
         chosen(in_front, plus(times(of_x, offset), to_right), nothing),
         chosen(in_front, plus(times(of_y, offset), to_down), nothing),
         chosen(in_front, plus(times(of_z, offset), to_forward), nothing),
         times(-1.0, of_mean),
     )
-    store_rows(of_means, row, here, of_mean)
-    store_rows(of_scales, row, here, chosen(in_front, of_scale, nothing))
+    store_rows(of_gaussians.means, row, here, of_mean)
+    store_rows(of_gaussians.scales, row, here, chosen(in_front, of_scale, nothing))
     store_quaternion_gradient(
-        of_quats, row, here, quaternion, inverse_norm, chosen(in_front, of_first, nothing),
+        of_gaussians.quats, row, here, quaternion, inverse_norm, chosen(in_front, of_first, nothing),
         chosen(in_front, of_second, nothing), chosen(in_front, of_third, nothing),
     )  # fmt: skip
     drawn = tl.load(boxes + 4 * row, here, 0) <= tl.load(boxes + 4 * row + 1, here, -1)
-    of_log_opacity = tl.load(of_log_opacities + row, here, 0.0)
-    tl.store(of_opacities + row, tl.where(drawn, of_log_opacity / tl.load(opacities + row, here, 1.0), 0.0), here)
+    of_log_opacity = tl.load(of_projected.log_opacities + row, here, 0.0)
+    of_opacity = tl.where(drawn, of_log_opacity / tl.load(gaussians.opacities + row, here, 1.0), 0.0)
+    tl.store(of_gaussians.opacities + row, of_opacity, here)
