@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Generic, Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -29,6 +29,8 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
     primitive: ClassVar[str]
     #: Elements that strategies add and remove: ``anchors`` or ``gaussians``; ``none`` where the size is fixed.
     elements: ClassVar[str] = "none"
+    #: Parameter groups with one row per element.
+    row_parameters: ClassVar[tuple[str, ...]] = ()
     #: Whether the lamp is modelled apart from the tissue, so that :meth:`with_lamp` can exchange it after training.
     lamp_is_apart: ClassVar[bool] = False
 
@@ -82,6 +84,15 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
         World frame, of either sign; the first are differentiable. [N, 3], [N, 3]
         """
         return None
+
+    def rows_added(self, positions: Float[Tensor, "B 3"], parents: Int[Tensor, "B"]) -> None:
+        """Called after a strategy appended rows to ``row_parameters``: their positions, and the rows they come from.
+
+        Extends what elements have besides parameters, in scene units.
+        """
+
+    def rows_kept(self, keep: Bool[Tensor, "M"]) -> None:
+        """Called after a strategy kept only some rows of ``row_parameters``."""
 
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Called before each training step, counted from 1, by fields that change over the run.

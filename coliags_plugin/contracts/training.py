@@ -24,13 +24,9 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Target
 from coliags_plugin.core.settings import Settings, SettingsT, refuse_zero_ends
 
-#: Field, or what a strategy uses of one.
-FieldT = TypeVar("FieldT", default=Any)
-FieldT_co = TypeVar("FieldT_co", covariant=True, default=Field)
-
 
 @dataclass(frozen=True)
-class TrainingStep(Generic[FieldT_co]):
+class TrainingStep:
     """One training step, as passed to losses and strategies.
 
     Attributes:
@@ -43,16 +39,16 @@ class TrainingStep(Generic[FieldT_co]):
 
     output: RenderOutput
     target: Target
-    model: TrainedModel[FieldT_co]
+    model: TrainedModel
     step: int
     schedule: Schedule
 
 
-class TrainedModel(TypingProtocol[FieldT_co]):
+class TrainedModel(TypingProtocol):
     """Interface of the model that losses and strategies may use."""
 
     @property
-    def field(self) -> FieldT_co:
+    def field(self) -> Field:
         """The :class:`Field`."""
 
     @property
@@ -85,7 +81,7 @@ class ParameterRows(TypingProtocol):
         """Replace the values of a group and reset their moments. [M, ...]"""
 
 
-class Strategy(ABC, Generic[SettingsT, FieldT]):
+class Strategy(ABC, Generic[SettingsT]):
     """Densification and pruning of a field between optimizer steps, with its own counters.
 
     Args:
@@ -111,10 +107,10 @@ class Strategy(ABC, Generic[SettingsT, FieldT]):
     def plan(self) -> str:
         """One sentence for the log: the steps at which it grows or prunes, or why it will not."""
 
-    def before_step(self, step: int, field: FieldT, rows: ParameterRows) -> None:
+    def before_step(self, step: int, field: Any, rows: ParameterRows) -> None:
         """Called before step ``step`` renders."""
 
-    def after_backward(self, step: TrainingStep[FieldT], rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Called after ``backward`` and before the optimisers step.
 
         Returns:
@@ -122,7 +118,7 @@ class Strategy(ABC, Generic[SettingsT, FieldT]):
         """
         return {}
 
-    def after_step(self, step: TrainingStep[FieldT], rows: ParameterRows) -> dict[str, int]:
+    def after_step(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Called after the optimisers have stepped; returns like :meth:`after_backward`."""
         return {}
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pydantic import Field as Option
 from torch import Tensor, nn
 from typing_extensions import Self
@@ -69,8 +69,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
     Settings: ClassVar[type[Settings]] = AnchorFieldSettings
     primitive: ClassVar[str] = "gaussians3d"
     elements: ClassVar[str] = "anchors"
-    #: Parameter groups with one row per anchor, for strategies that add and remove anchors.
-    anchor_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
+    row_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
 
     anchors: Tensor
     normals: Tensor | None
@@ -145,6 +144,17 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
             **self.geometry_head.parameter_groups(),
             **self.appearance_head.parameter_groups(),
         }
+
+    def rows_added(self, positions: Float[Tensor, "B 3"], parents: Int[Tensor, "B"]) -> None:
+        """Add the positions of new anchors, and their parents' normals."""
+        self.anchors = torch.cat([self.anchors, positions])
+        if self.normals is not None:
+            self.normals = torch.cat([self.normals, self.normals[parents]])
+
+    def rows_kept(self, keep: Bool[Tensor, "M"]) -> None:
+        """Keep the positions and normals of some anchors."""
+        self.anchors = self.anchors[keep]
+        self.normals = None if self.normals is None else self.normals[keep]
 
     @property
     def knows_lamp(self) -> bool:

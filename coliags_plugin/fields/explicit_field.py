@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pydantic import Field as Option
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
@@ -51,10 +51,9 @@ class ReferenceNormals(nn.Module):
         references.of_rows.copy_(references.normals)
         return references
 
-    def extend(self, means: Float[Tensor, "N 3"]) -> None:
-        """Add the references of Gaussians that were appended: ``means`` are the centres of all, scene units."""
-        born = means[len(self.of_rows) :]
-        _, nearest = cKDTree(self.points.cpu().numpy()).query(born.cpu().numpy(), workers=-1)
+    def extend(self, means: Float[Tensor, "B 3"]) -> None:
+        """Add the references of Gaussians that were appended, from their centres, scene units."""
+        _, nearest = cKDTree(self.points.cpu().numpy()).query(means.cpu().numpy(), workers=-1)
         chosen = torch.from_numpy(np.asarray(nearest)).to(self.normals.device)
         self.of_rows = torch.cat([self.of_rows, self.normals[chosen]])
 
@@ -79,7 +78,7 @@ class ExplicitField(GaussianField[ExplicitT]):
     """One Gaussian per initial point, each with its own mean, covariance and opacity; subclasses add their colours."""
 
     elements: ClassVar[str] = "gaussians"
-    #: Parameter groups, each with one row per Gaussian; named as in gsplat.
+    #: Named as in gsplat.
     row_parameters: ClassVar[tuple[str, ...]] = ("means", "scales", "quats", "opacities")
     #: Buffers that the host reads at every step: they stay on the CPU.
     host_buffers: ClassVar[tuple[str, ...]] = ()
@@ -127,13 +126,13 @@ class ExplicitField(GaussianField[ExplicitT]):
         """One group for each kind of parameter."""
         return {name: [self.get_parameter(name)] for name in self.row_parameters}
 
-    def rows_added(self) -> None:
-        """Extend what rows have besides parameters, after a strategy appended rows to these."""
+    def rows_added(self, positions: Float[Tensor, "B 3"], parents: Int[Tensor, "B"]) -> None:
+        """Add the reference normals of new Gaussians."""
         if self.references is not None:
-            self.references.extend(self.means.detach())
+            self.references.extend(positions)
 
     def rows_kept(self, keep: Bool[Tensor, "N"]) -> None:
-        """Remove from what rows have besides parameters the rows that a strategy removed from these."""
+        """Keep the reference normals of some Gaussians."""
         if self.references is not None:
             self.references.keep(keep)
 

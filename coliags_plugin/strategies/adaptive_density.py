@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -40,30 +40,11 @@ class AdaptiveDensitySettings(Settings):
     prune_above: int = Field(default=0, ge=0)  # an event prunes only where more Gaussians than this would stay
 
 
-class ExplicitRows(Protocol):
-    """Protocol of fields of explicit Gaussians for adaptive density control.
+class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
+    """Clones small and splits large Gaussians whose image gradients stay large; prunes faint and oversized ones.
 
-    Attributes:
-        means, scales, quats, opacities: As in :class:`coliags_plugin.fields.explicit_field.ExplicitField`: log scales,
-            opacity logits. [N, 3], [N, 3] or [N, 2], [N, 4], [N]
-        row_parameters: Names of the parameter groups with one row per Gaussian.
+    The field is an ``ExplicitField``, or one with its means, scales, quaternions and opacities.
     """
-
-    means: Tensor
-    scales: Tensor
-    quats: Tensor
-    opacities: Tensor
-    row_parameters: ClassVar[tuple[str, ...]]
-
-    def rows_added(self) -> None:
-        """Called after rows were appended to the parameters."""
-
-    def rows_kept(self, keep: Tensor) -> None:
-        """Called after rows were removed from the parameters. [N]"""
-
-
-class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
-    """Clones small and splits large Gaussians whose image gradients stay large; prunes faint and oversized ones."""
 
     Settings: ClassVar[type[Settings]] = AdaptiveDensitySettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"gaussians"})
@@ -93,11 +74,11 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         return f"this run clones, splits and prunes {steps_text(events)}, and resets opacities {steps_text(resets)}"
 
     @torch.no_grad()
-    def after_backward(self, step: TrainingStep[ExplicitRows], rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Accumulate statistics; at event steps densify, prune, and reset opacities."""
         if step.step >= self.until:
             return {}
-        field = step.model.field
+        field: Any = step.model.field
         if len(self.drawn) != len(field.means):
             self._forget(field.means)
         self._count(step.output)
@@ -123,7 +104,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         self.drawn.index_add_(0, slots, (splats.radii > 0).to(self.drawn.dtype))
         self.largest_radius[slots] = torch.maximum(self.largest_radius[slots], splats.radii)
 
-    def _densify(self, field: ExplicitRows, rows: ParameterRows) -> int:
+    def _densify(self, field: Any, rows: ParameterRows) -> int:
         """Clone and split Gaussians; returns the increase in their number."""
         before = len(field.means)
         wanted = self.gradient_sum / self.drawn.clamp_min(1.0) >= self.settings.gradient_threshold
@@ -137,7 +118,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         born["means"][parts] += self._shifts(born["scales"][parts], born["quats"][parts])
         born["scales"][parts] -= math.log(_SPLIT_SHRINK)
         rows.add_rows(born)
-        field.rows_added()
+        field.rows_added(born["means"], parents)
         self._extend(len(parents))
         keep = torch.ones(len(field.means), dtype=torch.bool, device=field.means.device)
         keep[splits] = False
@@ -154,7 +135,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         axes = rotation_matrices(nn.functional.normalize(quats, dim=1))[:, :, : scales.shape[1]]
         return (axes @ (points[:, : scales.shape[1]] * deviations)[..., None]).squeeze(-1)
 
-    def _prune(self, field: ExplicitRows, rows: ParameterRows, step: int) -> int:
+    def _prune(self, field: Any, rows: ParameterRows, step: int) -> int:
         """Remove transparent and, after the first reset, oversized Gaussians; returns their number."""
         options = self.settings
         gone = field.opacities.sigmoid() < options.min_opacity
@@ -173,7 +154,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
             {name: torch.cat([value, value.new_zeros(count)]) for name, value in self.state_dict().items()}
         )
 
-    def _keep(self, field: ExplicitRows, rows: ParameterRows, keep: Tensor) -> None:
+    def _keep(self, field: Any, rows: ParameterRows, keep: Tensor) -> None:
         if keep.all():
             return
         self.load_state_dict({name: value[keep] for name, value in self.state_dict().items()})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -32,38 +32,13 @@ class AnchorGrowthSettings(Settings):
     max_scale: float | None = Field(default=4.0, gt=0)  # cap on base scales at every event, times the spacing
 
 
-class Anchors(Protocol):
-    """Protocol of fields of anchors for anchor growth.
-
-    Attributes:
-        anchors: Positions, scene units. [M, 3]
-        normals: Of the wall at the anchors; None where none are used. [M, 3]
-        offsets, features, scalings: One row per anchor, as in :class:`coliags_plugin.fields.anchors.AnchorField`.
-            [M, K, 3], [M, F], [M, 6]
-        spacing: Initial spacing of the anchors, scene units. []
-        voxel_size: Scene units. []
-        anchor_parameters: Names of the parameter groups with one row per anchor.
-    """
-
-    anchors: Tensor
-    normals: Tensor | None
-    offsets: Tensor
-    features: Tensor
-    scalings: Tensor
-    spacing: Tensor
-    voxel_size: Tensor
-    anchor_parameters: ClassVar[tuple[str, ...]]
-
-    def child_positions(self) -> Tensor:
-        """Positions of the children, scene units. [M, K, 3]"""
-
-
-class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
+class AnchorGrowth(Strategy[AnchorGrowthSettings]):
     """Adds anchors where children's image gradients stay large and removes anchors that stay transparent.
 
     Statistics and thresholds are Scaffold-GS's; the grid cells, the initialisation of new anchors and the limit per
     event are this package's, because the published ones rely on cells finer than the spacing of the initial points
-    (docs/methods.md 4.3). Only anchors visible in the view are counted, as in Scaffold-GS.
+    (docs/methods.md 4.3). Only anchors visible in the view are counted, as in Scaffold-GS. The field is an
+    ``AnchorField``, or one with its anchors, offsets, features, scalings, spacing, voxel size and child positions.
     """
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
@@ -94,11 +69,11 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         return f"this run grows and prunes anchors {steps_text(events)}"
 
     @torch.no_grad()
-    def after_backward(self, step: TrainingStep[Anchors], rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Accumulate statistics; at event steps grow and prune."""
         if not self.statistics_from < step.step < self.until:
             return {}
-        field = step.model.field
+        field: Any = step.model.field
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)
         self._count(step.output, children)
@@ -125,7 +100,7 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         self.gradient_sum.index_add_(0, gaussians.source_index, lengths)
         self.drawn.index_add_(0, gaussians.source_index, (output.drawn.radii > 0).to(self.drawn.dtype))
 
-    def _grow(self, field: Anchors, rows: ParameterRows, children: int, most_births: int) -> int:
+    def _grow(self, field: Any, rows: ParameterRows, children: int, most_births: int) -> int:
         options = self.settings
         ready = self.drawn > self.every * options.success_share * 0.5
         gradient = self.gradient_sum / self.drawn.clamp_min(1.0)
@@ -145,19 +120,17 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         self._resize(len(field.anchors), children, field.anchors.device)
         return len(field.anchors) - first_count
 
-    def _add(self, field: Anchors, rows: ParameterRows, positions: Tensor, parents: Tensor, cell: float) -> None:
+    def _add(self, field: Any, rows: ParameterRows, positions: Tensor, parents: Tensor, cell: float) -> None:
         """Append anchors with their parents' features, normals and Adam second moments, at most the size of a cell."""
-        field.anchors = torch.cat([field.anchors, positions])
-        if field.normals is not None:
-            field.normals = torch.cat([field.normals, field.normals[parents]])
         born = {
             "offsets": field.offsets.new_zeros(len(parents), *field.offsets.shape[1:]),
             "features": field.features[parents],
             "scalings": field.scalings[parents].clamp_max(math.log(cell)),
         }
         rows.add_rows(born, parents)
+        field.rows_added(positions, parents)
 
-    def _prune(self, field: Anchors, rows: ParameterRows, children: int) -> int:
+    def _prune(self, field: Any, rows: ParameterRows, children: int) -> int:
         options = self.settings
         if options.max_scale is not None:
             field.scalings[:, 3:].clamp_(max=math.log(options.max_scale * float(field.spacing)))
@@ -171,10 +144,8 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         keep_children = keep.repeat_interleave(children)
         self.opacity_sum, self.seen = self.opacity_sum[keep], self.seen[keep]
         self.gradient_sum, self.drawn = self.gradient_sum[keep_children], self.drawn[keep_children]
-        field.anchors = field.anchors[keep]
-        if field.normals is not None:
-            field.normals = field.normals[keep]
-        rows.keep_rows(field.anchor_parameters, keep)
+        rows.keep_rows(field.row_parameters, keep)
+        field.rows_kept(keep)
         return int(faint.sum())
 
 

@@ -110,7 +110,7 @@ def test_a_birth_stands_where_its_candidate_stood_and_looks_like_its_parent():
 
 def test_adam_moves_a_birth_no_faster_than_its_parent():
     field, rows, *_ = grow_once(1.0, levels=1)
-    for name in field.anchor_parameters:
+    for name in field.row_parameters:
         parameter = getattr(field, name)
         assert rows.adam[name].param_groups[0]["params"] == [parameter]
         moments = rows.adam[name].state[parameter]

@@ -116,7 +116,7 @@ class _Gaussians(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         *tables, whitenings, boxes = ctx.saved_tensors
         gaussians = Tables(*tables)
-        of_gaussians = Tables(*map(torch.empty_like, tables[:4]), _pose_sums(gaussians.means))
+        of_gaussians = Tables(*[*map(torch.empty_like, tables[:4]), _pose_sums(gaussians.means)])
         given = (of_means2d, of_whitenings, of_depths, of_log_opacities, of_normals)
         of_projected = Projected(*_contiguous(*given, otherwise=gaussians.means))
         projection.backward[_programs(len(gaussians.means))](
@@ -185,7 +185,7 @@ class _Surfels(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         *tables, boxes = ctx.saved_tensors
         surfels = Tables(*tables)
-        of_surfels = Tables(*map(torch.empty_like, tables[:4]), _pose_sums(surfels.means, torch.float64))
+        of_surfels = Tables(*[*map(torch.empty_like, tables[:4]), _pose_sums(surfels.means, torch.float64)])
         of_means2d = surfels.means.new_empty(len(surfels.means), 2)
         # Centres and depths have gradients of their own.
         given = (None, of_shapes, None, of_log_opacities, of_normals)
