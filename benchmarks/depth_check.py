@@ -66,32 +66,32 @@ def samples(estimate: Frame, truth: Frame) -> np.ndarray:
         columns, rows = np.floor(truth.sparse_depth.pixels.double().numpy() * factor).astype(int).T
         places = rows.clip(0, camera.height - 1), columns.clip(0, camera.width - 1)
         true = truth.sparse_depth.depth.numpy()
-    found = np.stack([depth[places], true, stated[places]], axis=-1).reshape(-1, 3).astype(np.float64)
-    return found[np.nan_to_num(found[:, 1]) > 0.0]
+    values = np.stack([depth[places], true, stated[places]], axis=-1).reshape(-1, 3).astype(np.float64)
+    return values[np.nan_to_num(values[:, 1]) > 0.0]
 
 
 def errors(what: str, estimated: np.ndarray, true: np.ndarray, confidence: np.ndarray) -> dict[str, Any]:
     """Errors of one set of pixels, and their mean confidence; NaN in the estimate: there is none."""
-    known = np.isfinite(estimated)
-    relative = estimated[known] / true[known] - 1.0
+    has_estimate = np.isfinite(estimated)
+    relative = estimated[has_estimate] / true[has_estimate] - 1.0
     size = np.abs(relative)
-    row = {"pixels": what, "of truth %": 100.0 * known.mean() if len(known) else np.nan}
+    row = {"pixels": what, "of truth %": 100.0 * has_estimate.mean() if len(has_estimate) else np.nan}
     shares = {"median %": np.median, "90th %": lambda values: np.quantile(values, 0.9)}
     row |= {name: 100.0 * float(of(size)) if len(size) else np.nan for name, of in shares.items()}
     row["within 5 %"] = 100.0 * float((size < WITHIN).mean()) if len(size) else np.nan
-    row["stated %"] = 100.0 * float(confidence[known].mean()) if len(size) else np.nan
+    row["stated %"] = 100.0 * float(confidence[has_estimate].mean()) if len(size) else np.nan
     row["bias %"] = 100.0 * float(np.median(relative)) if len(size) else np.nan
-    row["median length"] = float(np.median(size * true[known])) if len(size) else np.nan
+    row["median length"] = float(np.median(size * true[has_estimate])) if len(size) else np.nan
     return row
 
 
-def rows_of(found: np.ndarray) -> list[dict[str, Any]]:
+def rows_of(values: np.ndarray) -> list[dict[str, Any]]:
     """Errors as they are; times the median of true / estimated depth; and of each bin of confidence, scaled."""
-    estimated, true, confidence = found.T
-    known = np.isfinite(estimated)
-    if not known.any():
+    estimated, true, confidence = values.T
+    has_estimate = np.isfinite(estimated)
+    if not has_estimate.any():
         raise InputError("no pixel has both an estimate and a truth", "depth of the same frames")
-    scale = float(np.median(true[known] / estimated[known]))
+    scale = float(np.median(true[has_estimate] / estimated[has_estimate]))
     rows = [errors("all", estimated, true, confidence)]
     rows.append(errors(f"all, times {scale:.4g}", scale * estimated, true, confidence))
     if (confidence != 1.0).any():

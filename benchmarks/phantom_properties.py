@@ -15,6 +15,8 @@ import numpy as np
 import tyro
 from machine import markdown_table
 
+from coliags_plugin.geometry.meshes.files import read_mesh
+
 #: Grey level of 255 from which a channel counts as saturated.
 SATURATED = 250
 
@@ -31,16 +33,16 @@ def properties(folder: Path) -> dict[str, str]:
     """The row of one phantom."""
     with (folder / "truth" / "gain.csv").open() as file:
         gain = np.array([float(row["gain_g"]) for row in csv.DictReader(file)])
-    poses = np.load(folder / "truth" / "camera_to_world.npy")
+    poses, wall = np.load(folder / "truth" / "camera_to_world.npy"), read_mesh(folder / "truth" / "mesh.ply")
     nearest, middle, saturated = [], [], []
     for path in sorted((folder / "images").iterdir()):
         image = cv2.imread(str(path))
         depth = cv2.imread(str(folder / "depths" / path.name.replace("color", "depth")), cv2.IMREAD_UNCHANGED)
-        known = depth[(depth > 0) & (depth < 65535)] * (100.0 / 65535.0)
-        nearest.append(known.min())
-        middle.append(np.median(known))
+        clear = depth[(depth > 0) & (depth < 65535)] * (100.0 / 65535.0)
+        nearest.append(clear.min())
+        middle.append(np.median(clear))
         saturated.append(100.0 * (image >= SATURATED).any(axis=2).mean())
-    seen = [(cv2.imread(str(path), 0) > 0).mean() for path in sorted((folder / "rotation" / "seen").glob("*.png"))]
+    shares = [(cv2.imread(str(path), 0) > 0).mean() for path in sorted((folder / "rotation" / "seen").glob("*.png"))]
     settings = json.loads((folder / "phantom.json").read_text())["settings"]
     looks = poses[:, :3, 2]
     mean = looks.mean(axis=0) / np.linalg.norm(looks.mean(axis=0))
@@ -50,24 +52,15 @@ def properties(folder: Path) -> dict[str, str]:
         "light": settings["light"],
         "gain": settings["gain"],
         "gain swing": f"{gain.max() / gain.min():.2f}",
-        "wall to camera, mm": f"{_clearance(folder, poses[:, :3, 3]):.1f}",
+        "wall to camera, mm": f"{wall.rays.distance(poses[:, :3, 3]).min():.1f}",
         "nearest surface, mm": f"{min(nearest):.1f}",
         "median depth, mm (range over frames)": f"{np.median(middle):.0f} ({min(middle):.0f} to {max(middle):.0f})",
         "saturated pixels, % (largest of a frame)": f"{np.mean(saturated):.1f} ({max(saturated):.0f})",
         "viewing direction from its mean, degrees": f"{np.degrees(np.arccos(np.clip(looks @ mean, -1, 1))).max():.0f}",
         "largest step, mm": f"{np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max():.2f}",
         "largest turn per frame, degrees": f"{np.degrees(np.arccos(np.clip(0.5 * (turns - 1.0), -1, 1))).max():.1f}",
-        "rotation views seen, %": f"{100.0 * np.mean(seen):.0f}" if seen else "",
+        "rotation views seen, %": f"{100.0 * np.mean(shares):.0f}" if shares else "",
     }
-
-
-def _clearance(folder: Path, centers: np.ndarray) -> float:
-    """Smallest distance of the camera to the wall, mm."""
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.t.io.read_triangle_mesh(str(folder / "truth" / "mesh.ply")))
-    return float(scene.compute_distance(open3d.core.Tensor(centers.astype(np.float32))).numpy().min())
 
 
 if __name__ == "__main__":

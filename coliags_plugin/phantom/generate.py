@@ -23,6 +23,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.geometry.poses.alignment import umeyama
+from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.phantom.colon import ColonSurface, WallMotion, build_surface, frame_times, grow_anatomy, wall_motion
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
@@ -51,59 +52,57 @@ _FITTED = 4000
 
 @dataclass(frozen=True)
 class PreparedPhantom:
-    """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the frames."""
+    """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the images.
+
+    There are N images: the T frames of the sequence, and then the rotation views.
+    """
 
     settings: PhantomSettings  # resolved
     layout: Layout
     world: World
     sensor: Sensor
-    poses: Float[np.ndarray, "T 4 4"]  # of the sequence
     rotation_views: list[RotationView]  # test views with rotated cameras
-    indirect: list[IndirectLight | None]  # for the sequence and then the rotation views
-    gains: Float[np.ndarray, "T 3"]  # red, green, blue gain of every frame of the sequence
-    rotation_gains: Float[np.ndarray, "V 3"]  # of the rotation views
+    poses: Float[np.ndarray, "N 4 4"]  # camera-to-world of every image
+    frames: list[int]  # frame of the sequence at whose place and time each image is
+    indirect: list[IndirectLight | None]  # of every image
+    gains: Float[np.ndarray, "N 3"]  # red, green, blue gain of every image
     motion: WallMotion | None  # of the wall; None if it is rigid
 
     @property
     def is_training(self) -> Bool[np.ndarray, "T"]:
-        """Which frames of the sequence are not held out."""
-        return np.array([not self.layout.is_test(index) for index in range(len(self.poses))])
+        """Return which frames of the sequence are not held out."""
+        return np.array([not self.layout.is_test(index) for index in range(self.settings.frames)])
 
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
         """Poses of the frames that are not held out."""
-        return list(self.poses[self.is_training])
+        return list(self.poses[: self.settings.frames][self.is_training])
 
     @property
     def given_poses(self) -> Float[np.ndarray, "N 4 4"]:
-        """Poses that methods are given, with the errors of a tracker: the sequence's and then the rotation views'."""
-        poses = np.stack([*self.poses, *(view.camera_to_world for view in self.rotation_views)])
+        """Poses of the images that methods are given, with the errors of a tracker."""
         if not any(self.settings.pose_noise):
-            return poses
-        drift = pose_errors(self.settings, np.zeros(len(self.poses), bool))
-        errors = [pose_errors(self.settings, self.is_training), drift[[view.frame for view in self.rotation_views]]]
-        return displaced(poses, np.concatenate(errors))
+            return self.poses
+        drift = pose_errors(self.settings, np.zeros(self.settings.frames, bool))
+        errors = [pose_errors(self.settings, self.is_training), drift[self.frames[self.settings.frames :]]]
+        return displaced(self.poses, np.concatenate(errors))
 
     def given_depth(self, z_depth: Float[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "H W"]:
         """The depth of image ``number`` that methods are given, from the true one: training frames' has errors."""
-        if not self.settings.depth_noise or number >= len(self.poses) or self.layout.is_test(number):
+        if not self.settings.depth_noise or number >= self.settings.frames or self.layout.is_test(number):
             return z_depth
         return estimated_depth(z_depth, self.settings, number)
 
     def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
-        """Render image ``number``: the sequence's frames come first, then the rotation views."""
-        frames, settings, sensor = len(self.poses), self.settings, self.sensor
+        """Render image ``number``."""
+        frame, settings, sensor = self.frames[number], self.settings, self.sensor
         during: list[Float[np.ndarray, "4 4"]] = []
-        if number < frames:
-            frame, pose, gain = number, self.poses[number], self.gains[number]
-            if settings.shutter:
-                least = sensor.samples.shape[1]
-                during = poses_during(self.poses, number, settings.shutter, sensor.focal_length, least)
-        else:
-            view = self.rotation_views[number - frames]
-            frame, pose, gain = view.frame, view.camera_to_world, self.rotation_gains[number - frames]
+        if settings.shutter and number < settings.frames:
+            least = sensor.samples.shape[1]
+            sequence = self.poses[: settings.frames]
+            during = poses_during(sequence, number, settings.shutter, sensor.focal_length, least)
         world = world_at(self.world, self.motion, settings, frame)
-        exposure = expose(world, sensor, pose, self.indirect[number], during)
+        exposure = expose(world, sensor, self.poses[number], self.indirect[number], during)
         if settings.washes:
             radiance, cover = wet_lens(
                 sensor.image(exposure.radiance), sensor.image(exposure.cover), settings, frame / settings.frame_rate
@@ -112,7 +111,7 @@ class PreparedPhantom:
         if settings.softness:
             exposure = replace(exposure, radiance=sensor.softened(exposure.radiance, settings.softness))
         noise = stream(settings.seed, Purpose.SENSOR, number)
-        return exposure, develop(exposure.radiance, gain, settings, noise, sensor)
+        return exposure, develop(exposure.radiance, self.gains[number], settings, noise, sensor)
 
     def wall(
         self, exposure: Exposure, pose: Float[np.ndarray, "4 4"], pixels: Int[np.ndarray, "N"]
@@ -125,7 +124,7 @@ class PreparedPhantom:
         return np.asarray(local.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
 
     def seen(self, points: Float[np.ndarray, "N 3"], cameras: list[Float[np.ndarray, "4 4"]]) -> Bool[np.ndarray, "N"]:
-        """Which points of the wall are seen from at least one of these poses."""
+        """Return which points of the wall are seen from at least one of these poses."""
         return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.tracer)
 
 
@@ -161,39 +160,35 @@ def prepare(settings: PhantomSettings, report: Progress) -> PreparedPhantom:
     lamps = CameraLight.all_of(settings)
     world = World(surface, mucosa, tracer, lamps, settings.light_preset.vignetting)
     motion = wall_motion(anatomy, surface, settings)
-    poses = camera_path(anatomy.centre_line, settings, tracer, motion)
-    views = turn_away(poses, settings, layout.is_test) if layout.has_rotation else []
-    everywhere = [*poses, *(view.camera_to_world for view in views)]
-    indirect: list[IndirectLight | None] = [None] * len(everywhere)
+    sequence = camera_path(anatomy.centre_line, settings, tracer, motion)
+    views = turn_away(sequence, settings, layout.is_test) if layout.has_rotation else []
+    poses = np.stack([*sequence, *(view.camera_to_world for view in views)])
+    frames = [*range(settings.frames), *(view.frame for view in views)]
+    indirect: list[IndirectLight | None] = [None] * len(poses)
     if settings.interreflection > 0.0:
         generator = stream(settings.seed, Purpose.INTERREFLECTION)
         albedo = vertex_albedo(surface, mucosa)
-        indirect[:] = indirect_lights(surface, albedo, tracer, lamps, everywhere, settings.interreflection, generator)
+        indirect[:] = indirect_lights(surface, albedo, tracer, lamps, list(poses), settings.interreflection, generator)
     report("colon", 3, 4)
     lens, mask = layout.lens(settings.width or 0, settings.height or 0)
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
     weights = meter_weights(thin.mask, settings)
+    is_metered = settings.rotation_exposure == "metered"
     ideal = []
-    for frame, (pose, light) in enumerate(zip(poses, indirect[: len(poses)], strict=True)):
+    for number, frame in enumerate(frames if is_metered else frames[: settings.frames]):
         now = world_at(world, motion, settings, frame)
-        if motion is not None:
-            _check_clear(now, pose, frame)
-        ideal.append(exposure_for(meter(now, thin, pose, light), settings, weights))
+        if motion is not None and number < settings.frames:
+            _check_clear(now, poses[number], frame)
+        ideal.append(exposure_for(meter(now, thin, poses[number], indirect[number]), settings, weights))
         if settings.moves:
-            report("exposure", frame + 1, len(poses))
-    balances = white_balances(settings)
-    gains = exposures(ideal, settings)[:, None] * balances
-    turned = [view.frame for view in views]
-    rotation_gains = gains[turned]
-    if settings.rotation_exposure == "metered":
-        settled = []
-        for view, light in zip(views, indirect[len(poses) :], strict=True):
-            now = world_at(world, motion, settings, view.frame)
-            settled.append(exposure_for(meter(now, thin, view.camera_to_world, light), settings, weights))
-        rotation_gains = exposures(ideal, settings, settled)[:, None] * balances[turned]
+            report("exposure", min(number + 1, settings.frames), settings.frames)
+    during, settled = ideal[: settings.frames], ideal[settings.frames :]
+    levels = exposures(during, settings)
+    rotated = exposures(during, settings, settled) if is_metered else levels[frames[settings.frames :]]
+    gains = np.concatenate([levels, rotated])[:, None] * white_balances(settings)[frames]
     report("colon", 4, 4)
-    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains, rotation_gains, motion)
+    return PreparedPhantom(settings, layout, world, sensor, views, poses, frames, indirect, gains, motion)
 
 
 def _check_clear(world: World, pose: Float[np.ndarray, "4 4"], frame: int) -> None:
@@ -229,10 +224,8 @@ def generate(
 
 
 def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
-    layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
-    rotated = np.array([view.camera_to_world for view in phantom.rotation_views])
+    layout, lens, frames, total = phantom.layout, phantom.sensor.lens, phantom.settings.frames, len(phantom.poses)
     training = phantom.is_training
-    total = frames + len(rotated)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
@@ -243,12 +236,10 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
         image = phantom.sensor.image
         part: Part = "video" if number < frames else "rotation"
         index = number if part == "video" else number - frames
-        pose = phantom.poses[index] if part == "video" else rotated[index]
         z_depth = phantom.given_depth(image(exposure.z_depth), number)
-        taken = PhantomFrame(part, index, image(color), z_depth)
-        layout.write_frame(folder, taken)
-        if phantom.motion is not None:
-            fits.append(_to_rest(phantom, exposure, pose))
+        layout.write_frame(folder, PhantomFrame(part, index, image(color), z_depth))
+        if phantom.motion is not None and part == "video":
+            fits.append(_to_rest(phantom, exposure, phantom.poses[number]))
         if phantom.settings.covers and part == "video":
             write_image(folder / "truth" / "not_wall" / f"{index:04d}.png", image(exposure.cover))
         if part == "video":
@@ -258,17 +249,17 @@ def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
             if layout.has_points:
                 drawn.append(_draw_points(phantom, index, exposure, color))
         else:
-            seen = image(_seen_mask(phantom, exposure, pose))
-            write_image(layout.seen_mask(folder, part, index), seen)
+            mask = image(_seen_mask(phantom, exposure, phantom.poses[number]))
+            write_image(layout.seen_mask(folder, part, index), mask)
         report("frames", number + 1, total)
-    given = phantom.given_poses
-    layout.write_sequence(folder, "video", given[:frames], lens)
-    if len(rotated):
-        layout.write_sequence(folder, "rotation", given[frames:], lens)
+    poses = phantom.given_poses
+    layout.write_sequence(folder, "video", poses[:frames], lens)
+    if phantom.rotation_views:
+        layout.write_sequence(folder, "rotation", poses[frames:], lens)
     if layout.has_points:
         positions, colors = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         points = WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
-        layout.write_points(folder, points, given[:frames], lens)
+        layout.write_points(folder, points, poses[:frames], lens)
     report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
     if phantom.motion is not None:
@@ -317,17 +308,16 @@ def _write_truth(
     folder.mkdir(parents=True, exist_ok=True)
     albedo = vertex_albedo(surface, phantom.world.mucosa)
     _write_mesh(folder / "mesh.ply", surface, albedo)
-    vertices = surface.vertices.astype(np.float64)
-    seen = phantom.seen(vertices, phantom.training_poses)
+    vertex_seen = phantom.seen(surface.vertices.astype(np.float64), phantom.training_poses)
     faces = {"face_seen": trained_on, "face_seen_by_any_frame": observed}
-    write_arrays(folder / "mesh_seen.npz", {"vertex_seen": seen, **faces})
+    write_arrays(folder / "mesh_seen.npz", {"vertex_seen": vertex_seen, **faces})
     texture = {"texture": phantom.world.mucosa.albedo.astype(np.float16), "vertex_albedo": albedo}
     grid = {"row_arc_mm": surface.arc, "columns": np.array(surface.columns)}
     write_arrays(folder / "albedo.npz", texture | grid)
-    np.save(folder / "camera_to_world.npy", phantom.poses)
-    _write_gains(folder / "gain.csv", phantom.gains)
+    np.save(folder / "camera_to_world.npy", phantom.poses[: settings.frames])
+    _write_gains(folder / "gain.csv", phantom.gains[: settings.frames])
     if phantom.rotation_views:
-        _write_gains(folder / "rotation_gain.csv", phantom.rotation_gains)
+        _write_gains(folder / "rotation_gain.csv", phantom.gains[settings.frames :])
     lamps = [lamp.describe() for lamp in phantom.world.lamps]
     light: dict[str, Any] = {
         "law": "pixel = noise + shoulder(gain * cos(theta)^vignetting * (albedo * (E n.l + E_indirect) + gloss E))"
@@ -367,7 +357,7 @@ def _to_rest(
 def _write_motion(
     phantom: PreparedPhantom, motion: WallMotion, folder: Path, fits: Sequence[tuple[Float[np.ndarray, "4 4"], float]]
 ) -> None:
-    relative, residuals = zip(*fits[: len(phantom.poses)], strict=True)
+    relative, residuals = zip(*fits, strict=True)
     np.save(folder / "camera_to_wall.npy", np.stack(relative))
     times = frame_times(phantom.settings)
     displacement = {"radial": motion.radial, "wave_mm": motion.wave, "shift_mm": motion.shift}
@@ -415,10 +405,8 @@ def pose_errors(settings: PhantomSettings, training: Bool[np.ndarray, "T"]) -> F
 
 def displaced(poses: Float[np.ndarray, "N 4 4"], errors: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 4 4"]:
     """Poses moved by errors: translated in world axes, and turned about their own centres."""
-    given = poses.copy()
-    given[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(errors[:, 3:]).as_matrix()
-    given[:, :3, 3] += errors[:, :3]
-    return given
+    rotations = poses[:, :3, :3] @ Rotation.from_rotvec(errors[:, 3:]).as_matrix()
+    return rigid(rotations, poses[:, :3, 3] + errors[:, :3])
 
 
 def estimated_depth(
@@ -426,12 +414,12 @@ def estimated_depth(
 ) -> Float[np.ndarray, "H W"]:
     """The z-depth of a frame as it is given, mm: it bleeds over edges, and its relative noise is smooth; 0 stays 0."""
     height, width = z_depth.shape
-    known = z_depth > 0.0
+    is_wall = z_depth > 0.0
     sigma = max(_BLEEDING * width, 0.3)
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma)
+    weight = cv2.GaussianBlur(is_wall.astype(np.float32), (0, 0), sigma)
     blurred = cv2.GaussianBlur(z_depth, (0, 0), sigma) / np.maximum(weight, 1e-6)
     noise = stream(settings.seed, Purpose.DEPTH_NOISE, frame).standard_normal((height, width))
     blobs = _BLOBS * width
     # A Gaussian kernel in two dimensions leaves 1 / (2 sqrt(pi) sigma) of the deviation of white noise.
     noise = scipy.ndimage.gaussian_filter(noise, blobs, mode="wrap") * (2.0 * np.sqrt(np.pi) * blobs)
-    return np.where(known, blurred * np.exp(settings.depth_noise * noise), 0.0).astype(np.float32)
+    return np.where(is_wall, blurred * np.exp(settings.depth_noise * noise), 0.0).astype(np.float32)

@@ -72,7 +72,7 @@ class PREndoLayout(EndoGSLAMLayout):
         _write_gaussians(cloud, means, points.colors)
 
     def seen_mask(self, folder, part, index):
-        """In the scene's folder, beside the images."""
+        """Path in the scene's folder, beside the images."""
         return super().seen_mask(folder / _DATA / _SCENE, part, index)
 
 

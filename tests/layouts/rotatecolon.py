@@ -62,7 +62,7 @@ class RotateColonLayout(Layout):
         write_ply(folder / POINTS, point_properties(points.positions, points.colors))
 
     def seen_mask(self, folder, part, index):
-        """In ``truth/``: the dataset has no seen masks."""
+        """Path in ``truth/``, since the dataset has no seen masks."""
         return folder / "truth" / "seen" / f"{index:04d}_seen.png"
 
 
