@@ -7,13 +7,11 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.api.training import import_splats
 from coliags_plugin.comparison import compare
-from coliags_plugin.comparison.compare import carry_out, make_request
-from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.compare import carry_out
 from coliags_plugin.config.options import SPLAT_FORMATS, CompareOptions
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine import pose_refinement
 from coliags_plugin.engine.camera_path import CameraPath, Keyframe
-from coliags_plugin.engine.tasks import ExecutionOptions
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.viewer.live import Viewer
 from coliags_plugin.geometry.meshes.files import read_mesh
@@ -178,12 +176,10 @@ def test_a_scene_is_reconstructed(wall, tmp_path):
 
 
 def test_methods_are_compared(wall, tmp_path):
-    options = CompareOptions((wall,), tmp_path / "compared", steps=2, settings=options_of("3dgs"))
+    options = CompareOptions((wall,), tmp_path / "compared", steps=2, settings=options_of("3dgs"), device="cuda")
     with pytest.MonkeyPatch.context() as patch, PretendedCuda():
         patch.setattr(compare, "make_executor", lambda options: InlineExecutor())
-        comparison = carry_out(
-            make_request("3dgs", options), ComparisonFolder(options.output), ExecutionOptions(device="cuda")
-        )
+        comparison = carry_out("3dgs", options)
     assert not comparison.failures
     (result,) = (tmp_path / "compared" / "results").rglob("*.json")
     assert "a pretended device" in result.read_text(encoding="utf-8")

@@ -34,14 +34,9 @@ def compare(methods: str | Variant | Sequence[str | Variant], options: CompareOp
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
     from coliags_plugin.api.training import warn_of_suspect_data
-    from coliags_plugin.comparison.compare import carry_out, make_request
-    from coliags_plugin.comparison.folder import ComparisonFolder
-    from coliags_plugin.engine.tasks import ExecutionOptions
+    from coliags_plugin.comparison.compare import carry_out
 
-    names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
-    execution = ExecutionOptions(**{name: getattr(options, name) for name in names})
-    folder = ComparisonFolder(options.output)
-    return carry_out(make_request(methods, options), folder, execution, warn_of_suspect_data)
+    return carry_out(methods, options, warn_of_suspect_data)
 
 
 @takes(AblateOptions)

@@ -30,24 +30,23 @@ class ComparisonCommand(options.CompareOptions):
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""
         from coliags_plugin.api.comparing import compare
-        from coliags_plugin.comparison.compare import dry_run, make_request
-        from coliags_plugin.comparison.folder import ComparisonFolder
+        from coliags_plugin.comparison.compare import dry_run
 
         if self.dry_run:
-            planned = dry_run(make_request(methods, self), ComparisonFolder(self.output))
+            planned = dry_run(methods, self)
             print_summary(str(planned), {"cells": planned.rows}, as_json=self.json)
             return
-        done = compare(methods, self)
-        table = done.table()
+        comparison = compare(methods, self)
+        table = comparison.table()
         facts = {
-            "cells": len(done.cells),
-            "done": len(done.results),
-            "failed": [vars(failure) for failure in done.failures],
+            "cells": len(comparison.cells),
+            "done": len(comparison.results),
+            "failed": [vars(failure) for failure in comparison.failures],
             "methods": table.rows,
         }
-        report = [coliags("report", done.folder)] if done.results else []
-        print_summary(str(table), facts, written=[done.folder], then=report, as_json=self.json)
-        if done.failures:
+        report = [coliags("report", comparison.folder)] if comparison.results else []
+        print_summary(str(table), facts, written=[comparison.folder], then=report, as_json=self.json)
+        if comparison.failures:
             sys.exit(1)
 
 

@@ -36,6 +36,9 @@ from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 log = logging.getLogger(__name__)
 
+#: Names of methods, paths of method configs, and variants; or one of these.
+Methods = str | Variant | Sequence[str | Variant]
+
 
 class CellJob(Job):
     """Cells of one result key: the first is run, the others are equal to it."""
@@ -184,12 +187,9 @@ class FinishedComparison:
 
 
 def carry_out(
-    request: Request,
-    comparison: ComparisonFolder,
-    options: ExecutionOptions,
-    check_data: Callable[[Scene], None] | None = None,
+    methods: Methods, options: CompareOptions, check_data: Callable[[Scene], object] | None = None
 ) -> FinishedComparison:
-    """Train and evaluate methods on scenes, as far as that is not done in a folder, which is new or extended.
+    """Train and evaluate methods on scenes, as far as that is not done in the output folder, which is new or extended.
 
     Every scene with a cell that is missing is given to ``check_data`` before the first run.
 
@@ -197,7 +197,10 @@ def carry_out(
         InputError: Something is not valid or not there; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
-    executor = make_executor(options)
+    request, comparison = make_request(methods, options), ComparisonFolder(options.output)
+    names = ("jobs", "threads", "device", "executor", "ray_address", "retries")
+    execution = ExecutionOptions(**{name: getattr(options, name) for name in names})
+    executor = make_executor(execution)
     cells = _plan_cells(request, comparison)
     with comparison.held():
         missing = {cell.scene.name: cell for cell in cells if comparison.done(cell) is None}
@@ -214,7 +217,7 @@ def carry_out(
                 with suppress(InputError):  # of which the cell fails
                     check_data(data_manager(cell.config.datamanager, cell.scene.path).load(cell.scene.path))
         comparison.record(request, cells)
-        run_cells(cells, comparison, executor, options)
+        run_cells(cells, comparison, executor, execution)
         results = [(cell.title, result) for cell in cells if (result := comparison.done(cell)) is not None]
     for title, result in results:
         for name, record in result.sets.items():
@@ -223,9 +226,10 @@ def carry_out(
     return FinishedComparison(comparison.path, cells, [result for _, result in results], comparison.failures)
 
 
-def dry_run(request: Request, comparison: ComparisonFolder) -> DisplayTable:
+def dry_run(methods: Methods, options: CompareOptions) -> DisplayTable:
     """List what :func:`carry_out` would do with each cell; writes nothing."""
-    cells = _plan_cells(request, comparison)
+    comparison = ComparisonFolder(options.output)
+    cells = _plan_cells(make_request(methods, options), comparison)
     comparison.read_results()
     return _states(cells, comparison)
 
@@ -263,7 +267,7 @@ def _plan_cells(request: Request, comparison: ComparisonFolder) -> list[Comparis
     return make_cells(request, comparison.recorded_fingerprint)
 
 
-def make_request(methods: str | Variant | Sequence[str | Variant], options: CompareOptions) -> Request:
+def make_request(methods: Methods, options: CompareOptions) -> Request:
     """Make a request, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
     methods = [methods] if isinstance(methods, (str, Variant)) else methods
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
@@ -278,18 +282,13 @@ def make_request(methods: str | Variant | Sequence[str | Variant], options: Comp
     check_number("steps", options.steps)
     for split in options.splits:
         check_name("split", split, get_args(Split))
-    _check_decision([variant.name for variant in variants], options.protocol, options.reference, options.primary)
-    return Request(variants, find_scenes([str(scene) for scene in options.scenes], options.data), options)
-
-
-def _check_decision(methods: Sequence[str], protocol: str, reference: str | None, primary: Sequence[str]) -> None:
-    """Refuse a reference without primary metrics, and the reverse, and names that are not there."""
-    if (reference is None) == bool(primary):
-        given, lacking = ("`primary`", "`reference`") if reference is None else ("`reference`", "`primary`")
-        raise InputError(f"{given} without {lacking}", "both: what is decided before the first run")
-    if reference is not None:
-        check_name("method", reference, methods)
-    kind = registry.protocols.get(protocol)
-    metrics = [*kind.metrics, *kind.optional_metrics]
-    for name in primary:
+    if (options.reference is None) == bool(options.primary):
+        option, lacking = ("primary", "reference") if options.reference is None else ("reference", "primary")
+        raise InputError(f"`{option}` without `{lacking}`", "both: what is decided before the first run")
+    if options.reference is not None:
+        check_name("method", options.reference, [variant.name for variant in variants])
+    protocol = registry.protocols.get(options.protocol)
+    metrics = [*protocol.metrics, *protocol.optional_metrics]
+    for name in options.primary:
         check_name("metric", name, [*metrics, *(metric + SEEN_SUFFIX for metric in metrics)])
+    return Request(variants, find_scenes([str(scene) for scene in options.scenes], options.data), options)

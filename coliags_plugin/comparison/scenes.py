@@ -14,7 +14,7 @@ from typing import Any
 from coliags_plugin.comparison.named_files import Benchmark, load_benchmark, shipped
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.registry import phantom_layouts
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, check_name, did_you_mean
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.jobs import Progress, locked
 from coliags_plugin.core.json_files import json_text, parse_json
@@ -65,15 +65,31 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
         if benchmark is not None:
             benchmarks.add(benchmark.name)
             sources += _scenes_of(benchmark, scene, data or SCENES / benchmark.name)
+        elif (folder := user_path(name)).is_dir():
+            sources.append(SceneSource(folder.resolve().name, folder.resolve()))
         else:
-            sources.append(_folder(name))
+            raise InputError(
+                f"no scene '{name}'",
+                f"the folder of a scene, or a benchmark: {', '.join(shipped())}",
+                did_you_mean(name, shipped()) or "`coliags list benchmarks` describes them",
+            )
     if data is not None and len(benchmarks) != 1:
         many = ", ".join(sorted(benchmarks)) or "none"
         raise InputError(f"`data={data}` with these benchmarks: {many}", "one benchmark, whose scenes are there")
     twice = [name for name, count in Counter(source.name for source in sources).items() if count > 1]
     if twice:
         raise InputError(f"more than one scene is named {', '.join(twice)}", "scenes of different names")
-    _check_there(sources)
+    missing = [source for source in sources if not source.is_there and source.phantom is None]
+    if missing:
+        folders = ", ".join(dict.fromkeys(str(source.path.parent) for source in missing))
+        raise InputError(
+            f"{len(missing)} of {len(sources)} scenes are not there: {', '.join(source.name for source in missing)}",
+            f"a folder for each in {folders}",
+            "Get the dataset (docs/data.md), or name its folder with `data`",
+        )
+    for source in sources:
+        if source.is_there and source.phantom is not None:
+            _check_same_phantom(source)
     return sources
 
 
@@ -100,53 +116,17 @@ def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
 
 
 def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[SceneSource]:
-    scenes = benchmark.settings.scenes
-    if only is not None and only not in scenes:
-        known = ", ".join(scenes)
-        raise InputError(
-            f"benchmark '{benchmark.name}' has no scene '{only}'", f"one of {known}", did_you_mean(only, scenes)
-        )
-    return [
-        SceneSource(
-            name,
-            _first_there([(data / user_path(folder)).resolve() for folder in entry.folders(name)]),
-            benchmark.overrides(name),
-            entry.format or benchmark.settings.format,
-            entry.phantom,
-        )
-        for name, entry in scenes.items()
-        if only in (None, name)
-    ]
-
-
-def _first_there(paths: Sequence[Path]) -> Path:
-    return next((path for path in paths if path.is_dir()), paths[0])
-
-
-def _folder(name: str) -> SceneSource:
-    path = user_path(name)
-    if not path.is_dir():
-        files = shipped()
-        raise InputError(
-            f"no scene '{name}'",
-            f"the folder of a scene, or a benchmark: {', '.join(files)}",
-            did_you_mean(name, files) or "`coliags list benchmarks` describes them",
-        )
-    return SceneSource(path.resolve().name, path.resolve())
-
-
-def _check_there(sources: Sequence[SceneSource]) -> None:
-    missing = [source for source in sources if not source.is_there and source.phantom is None]
-    if missing:
-        folders = ", ".join(dict.fromkeys(str(source.path.parent) for source in missing))
-        raise InputError(
-            f"{len(missing)} of {len(sources)} scenes are not there: {', '.join(source.name for source in missing)}",
-            f"a folder for each in {folders}",
-            "Get the dataset (docs/data.md), or name its folder with `data`",
-        )
-    for source in sources:
-        if source.is_there and source.phantom is not None:
-            _check_same_phantom(source)
+    """Scenes of a benchmark, or one of them, each in the first of its folders that is there."""
+    scenes, sources = benchmark.settings.scenes, []
+    if only is not None:
+        check_name(f"scene of benchmark '{benchmark.name}'", only, scenes)
+    for name in scenes if only is None else [only]:
+        entry = scenes[name]
+        folders = [(data / user_path(folder)).resolve() for folder in entry.folders(name)]
+        folder = next((path for path in folders if path.is_dir()), folders[0])
+        data_format = entry.format or benchmark.settings.format
+        sources.append(SceneSource(name, folder, benchmark.overrides(name), data_format, entry.phantom))
+    return sources
 
 
 def _check_same_phantom(source: SceneSource) -> None:

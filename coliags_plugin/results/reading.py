@@ -6,16 +6,18 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.settings import invalid_reported
-from coliags_plugin.reporting.numbers import duration
+from coliags_plugin.reporting.numbers import Direction, duration
 from coliags_plugin.results.hashing import metrics_sha256
-from coliags_plugin.results.record import FORMAT, SEEN_SUFFIX, VERSION, Result
+from coliags_plugin.results.record import FORMAT, SEEN_SUFFIX, VERSION, CostRecord, Result
 
 #: Name of the results file in the folder of an evaluation.
 RESULT_FILE = "result.json"
@@ -110,7 +112,7 @@ VALUE_COLUMNS = (
 def means_summary(result: Result) -> dict[str, Any]:
     """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
     main = result.sets[result.main_set]
-    protocols_own = [name for name in result.metrics if not _over_seen_pixels(name, result)]
+    seen = {f"{name}{SEEN_SUFFIX}" for name in result.metrics}
     reasons: dict[str, str] = {}
     for part in reversed(result.sets.values()):
         reasons |= part.reasons
@@ -121,7 +123,7 @@ def means_summary(result: Result) -> dict[str, Any]:
         "step": result.steps,
         "untrained_views": result.provenance.get("untrained_views", {}),
         **{name: result.provenance[name] for name in ("held_out_used", "learned") if name in result.provenance},
-        **{name: main.mean(name) for name in protocols_own},
+        **{name: main.mean(name) for name in result.metrics if name not in seen},
         "reasons": reasons,
         "directions": {name: metric.direction for name, metric in result.metrics.items()},
         "units": {name: metric.unit for name, metric in result.metrics.items()},
@@ -133,34 +135,46 @@ def means_summary(result: Result) -> dict[str, Any]:
     }
 
 
-def _over_seen_pixels(name: str, result: Result) -> bool:
-    return name.endswith(SEEN_SUFFIX) and name.removesuffix(SEEN_SUFFIX) in result.metrics
+@dataclass(frozen=True)
+class Cost:
+    """A cost of a run: how it is read from the record, and printed."""
+
+    key: str
+    title: str
+    value: Callable[[CostRecord], float | None]
+    text: Callable[[float], str]
+    unit: str = ""
+    direction: Direction | None = "lower"  # whether higher or lower is better; None where neither is
+    work: Literal["training", "rendering"] | None = None  # whose device it depends on
+    missing: str = "not measured"
+
+
+_NO_GAUSSIANS = "not counted, or a radiance field, which has none"
+#: Costs but the times to a PSNR.
+COSTS = (
+    Cost("train_seconds", "Training", attrgetter("train_seconds"), duration, work="training"),
+    Cost("processor_seconds", "Processor time", attrgetter("processor_seconds"), duration, work="training"),
+    Cost("fps", "Rendering", attrgetter("render_fps"), "{:.3g}".format, "views/s", "higher", "rendering"),
+    Cost("memory", "Peak memory", attrgetter("peak_memory_mib"), "{:,.0f}".format, "MiB", work="training"),
+    Cost("gaussians", "Gaussians", attrgetter("gaussians"), "{:,.0f}".format, "", None, missing=_NO_GAUSSIANS),
+    Cost("checkpoint", "Checkpoint", attrgetter("checkpoint_mib"), "{:,.1f}".format, "MiB"),
+)
 
 
 def facts(result: Result) -> dict[str, str]:
     """Facts of a run and its costs, in words; nothing about what was not measured."""
     cost = result.cost
-    threads = "" if cost.threads is None else f", {cost.threads} threads"
+    costs = {each.title.lower(): (each, each.value(cost)) for each in COSTS}
     reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
-    mib = None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
     texts = {
         "key": result.key,
         "seed": str(result.seed),
         "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
-        "trained on": f"{cost.device}{threads}",
-        "training": _said(cost.train_seconds, duration),
+        "trained on": cost.device + ("" if cost.threads is None else f", {cost.threads} threads"),
+        **{name: f"{each.text(value)} {each.unit}" for name, (each, value) in costs.items() if value is not None},
         "psnr reached": ", ".join(f"{mark} dB after {duration(seconds)}" for mark, seconds in reached.items()),
-        "processor time": _said(cost.processor_seconds, duration),
-        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB".format),
-        "rendering": _said(cost.render_fps, "{:.2f} views a second".format),
-        "gaussians": _said(cost.gaussians, "{:.0f} in a view".format),
-        "checkpoint": _said(mib, "{:.1f} MiB".format),
     }
-    return {name: text for name, text in texts.items() if text}
-
-
-def _said(value: float | None, text: Callable[[float], str]) -> str:
-    return "" if value is None else text(value)
+    return {name: text.rstrip() for name, text in texts.items() if text}
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -123,8 +123,8 @@ class SetRecord(_Part):
 
     def mean(self, metric: str) -> float | None:
         """Mean over the frames that have a metric; None where none has."""
-        known = [value for value in self.values.get(metric, ()) if value is not None]
-        return sum(known) / len(known) if known else None
+        values = [value for value in self.values.get(metric, ()) if value is not None]
+        return sum(values) / len(values) if values else None
 
 
 class CostRecord(_Part):
@@ -145,6 +145,11 @@ class CostRecord(_Part):
     gaussians: float | None = None  # mean number drawn in a test view; None for radiance fields
     checkpoint_bytes: int | None = None  # size of the last checkpoint
     seconds_to_psnr: dict[str, float | None] = {}  # training time until the logged PSNR, smoothed, reached a mark, dB
+
+    @property
+    def checkpoint_mib(self) -> float | None:
+        """Size of the last checkpoint, MiB."""
+        return None if self.checkpoint_bytes is None else self.checkpoint_bytes / 2**20
 
 
 class Result(_Part):
@@ -214,30 +219,23 @@ class Result(_Part):
             for name, metric in self.metrics.items()
             if any(part.mean(name) is not None for part in self.sets.values())
         ]
-        reasons = {name: reason for part in self.sets.values() for name, reason in part.reasons.items()}
-        without = {each: [name for name in reasons if reasons[name] == each] for each in reasons.values()}
-        warnings = {name: part.transparency_warning for name, part in self.sets.items()}
-        sets = [Column(name, f"{name} ({len(part.frames)} frames)") for name, part in self.sets.items()]
-        return DisplayTable(
-            self.title,
-            [Column("metric"), Column("unit"), *sets],
-            rows,
-            [
-                *(f"{self._not_shown(names)}: {reason}" for reason, names in without.items()),
-                *(f"warning, {name}: {text}" for name, text in warnings.items() if text),
-            ],
-        )
-
-    def _not_shown(self, names: list[str]) -> str:
-        """Names of metrics that lack values, saying so if no set has any."""
-        empty = all(part.mean(name) is None for name in names for part in self.sets.values())
-        return f"not shown: {', '.join(names)}" if empty else ", ".join(names)
+        reasons = {name: reason for record in self.sets.values() for name, reason in record.reasons.items()}
+        notes = []
+        for reason in dict.fromkeys(reasons.values()):
+            names = [name for name, other in reasons.items() if other == reason]
+            is_empty = not {row["metric"] for row in rows} & {*names}
+            notes.append(f"{'not shown: ' if is_empty else ''}{', '.join(names)}: {reason}")
+        warnings = {name: record.transparency_warning for name, record in self.sets.items()}
+        notes += [f"warning, {name}: {text}" for name, text in warnings.items() if text]
+        sets = [Column(name, f"{name} ({len(record.frames)} frames)") for name, record in self.sets.items()]
+        return DisplayTable(self.title, [Column("metric"), Column("unit"), *sets], rows, notes)
 
     def __repr__(self) -> str:
         """The title with the means of the main test set."""
-        own = {name: metric.unit for name, metric in self.metrics.items() if not name.endswith(SEEN_SUFFIX)}
-        known = [f"{name} {value_text(mean)} {own[name]}" for name in own if (mean := self.mean(name)) is not None]
-        return f"{self.title}: {', '.join(text.strip() for text in known) or 'no values'}"
+        units = {name: metric.unit for name, metric in self.metrics.items() if not name.endswith(SEEN_SUFFIX)}
+        means = {name: mean for name in units if (mean := self.mean(name)) is not None}
+        texts = (f"{name} {value_text(mean)} {units[name]}".strip() for name, mean in means.items())
+        return f"{self.title}: {', '.join(texts) or 'no values'}"
 
     def __str__(self) -> str:
         """The table."""

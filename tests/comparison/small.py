@@ -13,11 +13,10 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.comparison import compare
-from coliags_plugin.comparison.compare import carry_out, make_request
-from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.compare import carry_out
 from coliags_plugin.comparison.worker import CellTask
 from coliags_plugin.config.options import CompareOptions
-from coliags_plugin.engine.tasks import ExecutionOptions, TaskOutcome
+from coliags_plugin.engine.tasks import TaskOutcome
 from tests.task_list import TaskList
 
 #: Overrides that make the anchor methods small, whose steps then take some milliseconds.
@@ -41,11 +40,10 @@ def compare_inline(
     methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=(), check_data=None
 ):
     """A comparison in this process."""
-    options = CompareOptions(scenes, Path(output), seeds=seeds, splits=splits, steps=steps, settings=tuple(overrides))
+    runs = {"seeds": seeds, "splits": splits, "steps": steps, "settings": tuple(overrides), "device": "cpu"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "make_executor", lambda options: executor or InlineExecutor())
-        request, folder = make_request(methods, options), ComparisonFolder(options.output)
-        return carry_out(request, folder, ExecutionOptions(device="cpu"), check_data)
+        return carry_out(methods, CompareOptions(scenes, Path(output), **runs), check_data)
 
 
 def hashes(folder: Path) -> dict[str, str]:

@@ -12,7 +12,7 @@ import pytest
 
 from coliags_plugin.comparison import folder as comparison_folder
 from coliags_plugin.comparison import plan
-from coliags_plugin.comparison.compare import dry_run, make_request
+from coliags_plugin.comparison.compare import dry_run
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.named_files import Variant
 from coliags_plugin.config.options import CompareOptions
@@ -71,12 +71,10 @@ def test_a_comparison_leaves_runs_results_and_a_plan(compared):
 
 
 def test_a_dry_run_says_what_has_changed_since_a_cell_was_done(wall, folder, monkeypatch):
-    comparison = ComparisonFolder(folder)
-
     def states(overrides=TINY, scene=wall):
-        request = make_request("coliags", CompareOptions((scene,), folder, steps=3, settings=tuple(overrides)))
         monkeypatch.setattr(ComparisonFolder, "check_extends", lambda *_: None)
-        return [(row["state"], row["changed"]) for row in dry_run(request, comparison).rows]
+        planned = dry_run("coliags", CompareOptions((scene,), folder, steps=3, settings=tuple(overrides)))
+        return [(row["state"], row["changed"]) for row in planned.rows]
 
     assert states() == [("done", None)]
     assert states((*TINY, "field.features=4")) == [("new", "method")]

@@ -180,7 +180,7 @@ def test_folders_and_scenes_of_a_file(tmp_path, written):
     ("names", "data", "told"),
     [
         (["nowhere"], None, "no scene 'nowhere'.*a benchmark: c3vd, c3vd-endogslam"),
-        (["c3vd/cecum"], None, "benchmark 'c3vd' has no scene 'cecum'.*Did you mean"),
+        (["c3vd/cecum"], None, "no scene of benchmark 'c3vd' 'cecum'.*Did you mean"),
         (["{tmp}/wall", "{tmp}/other/wall"], None, "more than one scene is named wall"),
         (["{tmp}/wall"], "x", "`data=x` with these benchmarks: none"),
         (["c3vd", "rotatecolon"], "x", "`data=x` with these benchmarks: c3vd, rotatecolon"),

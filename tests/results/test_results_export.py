@@ -104,7 +104,7 @@ def test_csv_keeps_every_digit_and_leaves_missing_values_empty(tmp_path):
 def test_show_prints_means_and_costs(runs, capsys):
     assert run("results", "show", runs / "one/eval/paper/result.json") == 0
     printed = capsys.readouterr().out
-    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "1 min 12 s", "1234 in a view"):
+    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "1 min 12 s", "1,234"):
         assert part in printed
     assert "processor time" not in printed, "it was not measured"
     assert run("results", "show", runs) == 0

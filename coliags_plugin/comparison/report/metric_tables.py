@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
-from typing import Literal
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from coliags_plugin.results.comparisons import (
     smallest_p,
     spread,
 )
+from coliags_plugin.results.reading import COSTS, Cost
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, CostRecord
 
 #: Labels the rows.
@@ -230,40 +230,15 @@ def _titles(columns: Sequence[Column]) -> str:
 # Costs
 
 
-@dataclass(frozen=True)
-class _Cost:
-    """A cost: its column, how it is read and printed, and the work whose device it depends on."""
-
-    column: Column
-    value: Callable[[CostRecord], float | None]
-    text: Callable[[float], str]
-    work: Literal["training", "rendering"] | None = None
-    missing: str = "not measured"
-
-
-def _mark(mark: str) -> _Cost:
-    column = Column(f"seconds_to_{mark}", f"To {mark} dB", "", "lower")
-    return _Cost(column, lambda cost: cost.seconds_to_psnr.get(mark), duration, "training", "not reached")
-
-
-def _mib(cost: CostRecord) -> float | None:
-    return None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
-
-
-_NO_GAUSSIANS = "not counted, or a radiance field, which has none"
-#: Costs before and behind the PSNR marks.
-_TIMES = [
-    _Cost(Column(key, title, "", "lower"), attrgetter(key), duration, "training")
-    for key, title in (("train_seconds", "Training"), ("processor_seconds", "Processor time"))
-]
-_OTHERS = [
-    _Cost(Column("fps", "Rendering", "views/s", "higher"), attrgetter("render_fps"), "{:.3g}".format, "rendering"),
-    _Cost(Column("memory", "Peak memory", "MiB", "lower"), attrgetter("peak_memory_mib"), "{:,.0f}".format, "training"),
-    _Cost(Column("gaussians", "Gaussians"), attrgetter("gaussians"), "{:,.0f}".format, missing=_NO_GAUSSIANS),
-    _Cost(Column("checkpoint", "Checkpoint", "MiB", "lower"), _mib, "{:,.1f}".format),
-]
 #: Largest number of PSNR marks.
 _MARKS_SHOWN = 3
+
+
+def _mark(mark: str) -> Cost:
+    def value(cost: CostRecord) -> float | None:
+        return cost.seconds_to_psnr.get(mark)
+
+    return Cost(f"seconds_to_{mark}", f"To {mark} dB", value, duration, work="training", missing="not reached")
 
 
 def cost_table(study: Study) -> Table:
@@ -277,15 +252,16 @@ def cost_table(study: Study) -> Table:
     }
     mixed = [work for work, names in devices.items() if len(names) > 1]
     marks = [_mark(name) for name in sorted({name for cost in costs for name in cost.seconds_to_psnr}, key=float)]
-    columns, cells = [Column("steps", "Steps")], {"steps": [_steps(study, method) for method in study.methods]}
-    for cost in (*_TIMES, *marks, *_OTHERS):
-        columns.append(replace(cost.column, direction=None) if cost.work in mixed else cost.column)
-        cells[cost.column.key] = _cost_cells(study, shared, replace(cost, column=columns[-1]))
+    shown = [replace(cost, direction=None) if cost.work in mixed else cost for cost in (*COSTS[:2], *marks, *COSTS[2:])]
+    cells = {"steps": [_steps(study, method) for method in study.methods]}
+    cells |= {cost.key: _cost_cells(study, shared, cost) for cost in shown}
     # The highest marks that all methods reached, then the lowest that some did.
-    reached = {mark.column.key: [bool(cell.text) for cell in cells[mark.column.key]] for mark in marks}
+    reached = {mark.key: [bool(cell.text) for cell in cells[mark.key]] for mark in marks}
     by_all = [key for key in reversed(reached) if all(reached[key])]
     by_some = [key for key in reached if any(reached[key]) and key not in by_all]
     hidden = reached.keys() - {*[*by_all, *by_some][:_MARKS_SHOWN]}
+    columns = [Column("steps", "Steps")]
+    columns += [Column(cost.key, cost.title, cost.unit, cost.direction, cost.key not in hidden) for cost in shown]
     if "training" in mixed:
         columns.append(Column("device", "Device", words=True))
         used = ([training_device(run.result.cost) for run in runs] for runs in study.by_method.values())
@@ -305,7 +281,7 @@ def cost_table(study: Study) -> Table:
     notes.append("Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean")
     plans = dict.fromkeys((run.method, run.result.provenance.get("training", {}).get("plan")) for run in study.runs)
     return replace(
-        _table(study, [replace(column, shown=column.key not in hidden) for column in columns], cells, "Costs"),
+        _table(study, columns, cells, "Costs"),
         notes=notes + [f"{method}: {plan}" for method, plan in plans if plan],
         count=f"means over {counted(len(shared), 'scene')}" if len(shared) > 1 else "",
         name="costs",
@@ -317,7 +293,7 @@ def _steps(study: Study, method: str) -> TableCell:
     return TableCell(f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}", steps[-1])
 
 
-def _cost_cells(study: Study, shared: Sequence[str], cost: _Cost) -> list[TableCell]:
+def _cost_cells(study: Study, shared: Sequence[str], cost: Cost) -> list[TableCell]:
     """Mean over scenes of the means over seeds; missing unless it is known of every run."""
     means, notes = list[float | None](), list[str]()
     for runs in study.by_method.values():
@@ -327,9 +303,9 @@ def _cost_cells(study: Study, shared: Sequence[str], cost: _Cost) -> list[TableC
         is_known = bool(shared) and count == len(shared)
         means.append(float(scene_means.mean()) if is_known else None)
         where = f"; known of {count} of {len(shared)} scenes" if count else ""
-        missing = f"{cost.column.title}: {cost.missing}{where}" if shared else "no scene that all methods have"
+        missing = f"{cost.title}: {cost.missing}{where}" if shared else "no scene that all methods have"
         notes.append("" if is_known else missing)
-    cells = ranked_cells(means, "", cost.column.direction, text=cost.text)
+    cells = ranked_cells(means, "", cost.direction, text=cost.text)
     return [replace(cell, note=note) for cell, note in zip(cells, notes, strict=True)]
 
 
