@@ -205,7 +205,7 @@ class ComparisonFolder:
 
 
 def _decision(request: Request) -> Decision | None:
-    """What a request decides before the first run, if anything."""
+    """Decision that a request makes before the first run; None without one."""
     reference, primary = request.options.reference, tuple(dict.fromkeys(request.options.primary))
     today = datetime.now(timezone.utc).date().isoformat()
     return None if reference is None else Decision(reference=reference, primary=primary, date=today)

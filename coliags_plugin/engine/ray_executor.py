@@ -63,7 +63,7 @@ class RayExecutor(Executor):
 
     @property
     def slots(self) -> int:  # type: ignore[override]
-        """As many as the cluster has room for now, or fewer where that was asked for."""
+        """Number of tasks that the cluster has room for now; fewer where that was asked for."""
         rooms = [int(self._resource("CPU") // self.threads)]
         rooms += [int(self._resource("GPU"))] if self._gpus else []
         return max(1, min(rooms if self._slots is None else [*rooms, self._slots]))
@@ -81,21 +81,21 @@ class RayExecutor(Executor):
                 path.unlink(missing_ok=True)
 
     def start(self, task: Task) -> None:
-        """See :class:`Executor`."""
+        """Give a task to the cluster."""
         self._tasks[self._work.remote(task)] = task
 
     def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
-        """See :class:`Executor`."""
+        """Wait for a task that ends; returns it with its outcome."""
         ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=seconds)
         return [(self._tasks.pop(reference), self._outcome(reference)) for reference in ready]
 
     def stop(self) -> None:
-        """See :class:`Executor`."""
+        """Cancel all tasks, whose workers save their state; by force those that need too long."""
         for reference in self._tasks:
             self._ray.cancel(reference)
         if self._tasks:
-            _, left = self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=STOPPING + 10.0)
-            for reference in left:
+            _, unfinished = self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=STOPPING + 10.0)
+            for reference in unfinished:
                 self._ray.cancel(reference, force=True)
         self._tasks.clear()
 
@@ -103,7 +103,7 @@ class RayExecutor(Executor):
         return float(self._ray.cluster_resources().get(name, 0.0))
 
     def _ask(self, node: Mapping[str, Any], file: Path, inputs: Sequence[Path]) -> tuple[str, ...]:
-        """What a node lacks, what was expected, and what to do; empty where it lacks nothing, or is gone meanwhile."""
+        """Fault of a node: what was seen, expected, and to do; empty where it has none, or is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there, errors = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False), self._ray.exceptions
@@ -151,7 +151,7 @@ def _connected(address: str) -> Any:
 
 
 def _fault_of_node(version: str, file: Path, inputs: Sequence[Path]) -> tuple[str, ...]:
-    """On a node: whether it has this version, can write beside a file that the driver wrote, and sees the inputs."""
+    """Fault of the node that this runs on: another version, a folder that it cannot write, or inputs that it lacks."""
     if version != __version__:
         return f"has coliags_plugin {__version__}", f"{version}, as here", "Install it there"
     place = "on storage that all machines share, under the same path"
@@ -159,14 +159,14 @@ def _fault_of_node(version: str, file: Path, inputs: Sequence[Path]) -> tuple[st
         renamed = file.rename(file.with_name(f"{file.name}-seen"))
         renamed.rename(file)
     except OSError as error:
-        seen = f"does not see {file.parent}, or cannot write there: {error.strerror or error}"
-        return seen, f"an `output` {place}", "Choose a folder on a network file system"
+        fault = f"does not see {file.parent}, or cannot write there: {error.strerror or error}"
+        return fault, f"an `output` {place}", "Choose a folder on a network file system"
     missing = ", ".join(str(path) for path in inputs if not path.exists())
     return (f"does not see {missing}", f"inputs {place}", "Copy them there") if missing else ()
 
 
 def _work(task: Task) -> dict[str, Any]:
-    """On a node: run a worker process to its end, or until the task is cancelled."""
+    """Run a worker process on a node, to its end or until the task is cancelled."""
     worker = LocalWorker(task)
     try:
         while not worker.ended:

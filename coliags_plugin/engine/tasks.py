@@ -246,12 +246,12 @@ class LocalExecutor(Executor):
         self._workers: dict[int, LocalWorker] = {}  # by slot
 
     def start(self, task: Task) -> None:
-        """See :class:`Executor`."""
+        """Start a task in the first free slot."""
         slot = min(set(range(self.slots)) - self._workers.keys())
         self._workers[slot] = LocalWorker(task, self._gpus[slot % len(self._gpus)] if self._gpus else None)
 
     def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
-        """See :class:`Executor`."""
+        """Wait for processes that end; returns their tasks with the outcomes."""
         until = time.monotonic() + seconds
         while not (ended := [slot for slot, worker in self._workers.items() if worker.ended]):
             if time.monotonic() >= until:
@@ -260,7 +260,7 @@ class LocalExecutor(Executor):
         return [(worker.task, worker.outcome()) for worker in map(self._workers.pop, ended)]
 
     def stop(self) -> None:
-        """See :class:`Executor`."""
+        """Have all processes save their state and end; kill those that need too long."""
         until = time.monotonic() + STOPPING
         try:
             for worker in self._workers.values():

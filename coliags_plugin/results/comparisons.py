@@ -59,8 +59,8 @@ def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
 
 def common_scenes(methods: Sequence[Mapping[str, Collection[object]]]) -> list[str]:
     """Scenes for which every method has a value, in the order of the first method."""
-    known = [{scene for scene, seeds in values.items() if seeds} for values in methods]
-    return [scene for scene in methods[0] if all(scene in scenes for scenes in known)] if methods else []
+    covered = [{scene for scene, seeds in values.items() if seeds} for values in methods]
+    return [scene for scene in methods[0] if all(scene in scenes for scenes in covered)] if methods else []
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class PairedTests:
 
 @dataclass(frozen=True)
 class RivalComparison:
-    """By how much a reference leads over a rival."""
+    """Lead of a reference over a rival."""
 
     rival: str
     scenes: tuple[str, ...]  # scenes that both have

@@ -47,7 +47,7 @@ class ErrorProfiles:
         self._frames += 1
 
     def records(self) -> dict[str, ProfileRecord]:
-        """Both profiles; empty where no frame had true depth."""
+        """Profiles over distance and angle; empty where no frame had true depth."""
         return {"distance": self._distance.record(), "angle": self._angle.record()} if self._frames else {}
 
 

@@ -48,11 +48,11 @@ def compare_inline(
 
 def hashes(folder: Path) -> dict[str, str]:
     """``metrics_sha256`` of every results file, by its place."""
-    found = {}
+    by_place = {}
     for path in sorted((folder / "results").rglob("*.json")):
         (value,) = re.findall(r'"metrics_sha256": "(\w+)"', path.read_text(encoding="utf-8"))
-        found[path.relative_to(folder).as_posix()] = value
-    return found
+        by_place[path.relative_to(folder).as_posix()] = value
+    return by_place
 
 
 def trainings(folder: Path) -> dict[str, list[int]]:

@@ -36,8 +36,8 @@ def bare(tmp_path_factory):
 def compared(wall, tmp_path_factory):
     """A comparison that is done; copied by tests that change it."""
     folder = tmp_path_factory.mktemp("compared") / "comparison"
-    done = compare_inline(["coliags", "scaffold-gs"], [wall], folder)
-    assert not done.failures
+    comparison = compare_inline(["coliags", "scaffold-gs"], [wall], folder)
+    assert not comparison.failures
     return folder
 
 
@@ -50,8 +50,8 @@ def folder(compared, tmp_path):
 def again(wall, folder, methods=("coliags", "scaffold-gs"), **options):
     """Compare in the same folder; the comparison, and the titles of what was run."""
     executor = InlineExecutor()
-    done = compare_inline(list(methods), [wall], folder, executor, **options)
-    return done, [task.title for task in executor.tasks]
+    comparison = compare_inline(list(methods), [wall], folder, executor, **options)
+    return comparison, [task.title for task in executor.tasks]
 
 
 # What is done
@@ -94,9 +94,9 @@ def test_what_is_done_is_not_run_again(wall, folder, monkeypatch, lost, count):
     for path in (folder / name for name in lost):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     monkeypatch.setattr(Trainer, "train", None)
-    done, ran = again(wall, folder)
-    assert not done.failures and len(ran) == count and hashes(folder) == before
-    assert [result.method for result in done.results] == ["coliags", "scaffold-gs"]
+    comparison, ran = again(wall, folder)
+    assert not comparison.failures and len(ran) == count and hashes(folder) == before
+    assert [result.method for result in comparison.results] == ["coliags", "scaffold-gs"]
 
 
 def test_views_that_show_nothing_are_told(wall, folder, caplog):
@@ -134,8 +134,8 @@ def test_a_comparison_is_extended(wall, folder):
 def test_a_method_that_has_changed_is_another_run(wall, folder, tmp_path, caplog):
     mine = tmp_path / "mine.yaml"
     mine.write_text("base: scaffold-gs\n")
-    done, ran = again(wall, folder, [str(mine)])
-    assert ran == [] and done.results[0].provenance["same_as"] == "scaffold-gs"
+    comparison, ran = again(wall, folder, [str(mine)])
+    assert ran == [] and comparison.results[0].provenance["same_as"] == "scaffold-gs"
     mine.write_text("base: scaffold-gs\nlosses: {l1: {weight: 0.7}}\n")
     _, ran = again(wall, folder, [str(mine)])
     assert ran == ["wall mine seed 0"] and "not those of the former plan" in caplog.text
@@ -145,10 +145,10 @@ def test_a_method_that_has_changed_is_another_run(wall, folder, tmp_path, caplog
 
 def test_methods_that_are_the_same_are_run_once(wall, tmp_path):
     names = ["coliags", Variant("whole", "ablations/depth-imve-imia"), "ablations/embedding-10-5"]
-    done, ran = again(wall, tmp_path / "new", names)
+    comparison, ran = again(wall, tmp_path / "new", names)
     assert ran == ["wall coliags seed 0"]
-    assert [result.method for result in done.results] == ["coliags", "whole", "ablations/embedding-10-5"]
-    assert len({result.metrics_sha256 for result in done.results}) == 1
+    assert [result.method for result in comparison.results] == ["coliags", "whole", "ablations/embedding-10-5"]
+    assert len({result.metrics_sha256 for result in comparison.results}) == 1
     assert (tmp_path / "new/results/wall/ablations-embedding-10-5").is_dir()
 
 
@@ -168,25 +168,25 @@ def test_a_run_goes_on_from_its_newest_whole_checkpoint(wall, tmp_path, monkeypa
         return steps(self)
 
     monkeypatch.setattr(Trainer, "take_step", struck)
-    done = compare_inline(["coliags"], [wall], part, executor, steps=6, overrides=overrides)
-    assert not done.failures and len(executor.tasks) == 2 and hashes(part) == hashes(whole)
+    comparison = compare_inline(["coliags"], [wall], part, executor, steps=6, overrides=overrides)
+    assert not comparison.failures and len(executor.tasks) == 2 and hashes(part) == hashes(whole)
     assert len(list(part.glob("runs/wall/coliags/s0-*/checkpoints/damaged-step-000004-*"))) == damaged
 
 
 def test_every_cell_that_begins_and_ends_is_told(bare, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         compare_inline(["coliags", "scaffold-gs"], [bare], tmp_path / "new")
-    told = [
+    messages = [
         record.message
         for record in caplog.records
         if record.name.endswith((".task_queue", ".compare")) and "cells:" not in record.message
     ]
-    assert told[:1] + told[2:] == [
+    assert messages[:1] + messages[2:] == [
         "bare coliags seed 0: started",
         "bare scaffold-gs seed 0: started",
         "[2/2] bare scaffold-gs seed 0: done",
     ]
-    assert told[1].startswith("[1/2] bare coliags seed 0: failed: ")
+    assert messages[1].startswith("[1/2] bare coliags seed 0: failed: ")
 
 
 @pytest.mark.thorough
@@ -203,7 +203,7 @@ WILD = ("optimizers.opacity_mlp.lr=1e39", "optimizers.opacity_mlp.final_lr=1e39"
 
 
 @pytest.mark.parametrize(
-    ("methods", "options", "failed", "reason", "done"),
+    ("methods", "options", "failed", "reason", "results"),
     [
         (
             ["coliags", "scaffold-gs"],
@@ -216,26 +216,26 @@ WILD = ("optimizers.opacity_mlp.lr=1e39", "optimizers.opacity_mlp.final_lr=1e39"
         (["coliags"], {"splits": ["all-train"]}, ("wall-all-train", "coliags"), "has no test frames", []),
     ],
 )
-def test_what_cannot_be_done_fails_alone(wall, bare, tmp_path, methods, options, failed, reason, done):
-    found = compare_inline(methods, [wall] if options else [wall, bare], tmp_path / "new", **options)
-    (failure,) = found.failures
+def test_what_cannot_be_done_fails_alone(wall, bare, tmp_path, methods, options, failed, reason, results):
+    finished = compare_inline(methods, [wall] if options else [wall, bare], tmp_path / "new", **options)
+    (failure,) = finished.failures
     assert (failure.scene, failure.method) == failed and reason in failure.reason
-    assert [f"{result.scene.name} {result.method}" for result in found.results] == done
+    assert [f"{result.scene.name} {result.method}" for result in finished.results] == results
     (file,) = (tmp_path / "new" / "failures").rglob("*.json")
     assert json.loads(file.read_text())["reason"] == failure.reason
     if "splits" in options:
         assert not [*(tmp_path / "new").rglob("metrics.jsonl")], "it fails before training"
     elif not options:
-        assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(found.table()))
+        assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(finished.table()))
 
 
 def test_a_failure_is_forgotten_when_the_cell_is_done(wall, tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "take_step", lambda self: 1 / 0)
-    done = compare_inline(["coliags"], [wall], tmp_path / "new")
-    assert done.failures[0].reason == "ZeroDivisionError: division by zero"
+    comparison = compare_inline(["coliags"], [wall], tmp_path / "new")
+    assert comparison.failures[0].reason == "ZeroDivisionError: division by zero"
     monkeypatch.undo()
-    done = compare_inline(["coliags"], [wall], tmp_path / "new")
-    assert not done.failures and not list((tmp_path / "new" / "failures").rglob("*.json"))
+    comparison = compare_inline(["coliags"], [wall], tmp_path / "new")
+    assert not comparison.failures and not list((tmp_path / "new" / "failures").rglob("*.json"))
 
 
 @pytest.mark.thorough
@@ -246,10 +246,10 @@ def test_a_full_disk_in_the_middle(wall, tmp_path, monkeypatch):
         return evaluate(trained, protocol)
 
     monkeypatch.setattr("coliags_plugin.engine.evaluator.evaluate", full)
-    done = compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
-    assert [failure.method for failure in done.failures] == ["coliags"]
-    assert done.failures[0].reason.startswith("no space left for")
-    assert [result.method for result in done.results] == ["scaffold-gs"]
+    comparison = compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
+    assert [failure.method for failure in comparison.failures] == ["coliags"]
+    assert comparison.failures[0].reason.startswith("no space left for")
+    assert [result.method for result in comparison.results] == ["scaffold-gs"]
 
 
 class Dying(InlineExecutor):
@@ -266,11 +266,11 @@ class Dying(InlineExecutor):
 
 @pytest.mark.parametrize(("times", "fails"), [(2, False), (3, True)])
 def test_workers_that_die_are_tried_again_so_often(wall, tmp_path, times, fails):
-    done = compare_inline(["coliags"], [wall], tmp_path / "new", Dying(times))
-    assert bool(done.failures) == fails
+    comparison = compare_inline(["coliags"], [wall], tmp_path / "new", Dying(times))
+    assert bool(comparison.failures) == fails
     if fails:
-        assert done.failures[0].reason == "the process was ended by SIGKILL, 3 times"
-        assert done.failures[0].attempts == 3
+        assert comparison.failures[0].reason == "the process was ended by SIGKILL, 3 times"
+        assert comparison.failures[0].attempts == 3
 
 
 @pytest.mark.thorough
@@ -283,8 +283,8 @@ def test_a_stop_names_what_is_done(wall, tmp_path):
 
     with pytest.raises(InterruptedRunError, match="stopped with 1 of 2 cells done; the same command goes on"):
         compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new", Interrupted())
-    done, ran = again(wall, tmp_path / "new")
-    assert ran == ["wall scaffold-gs seed 0"] and not done.failures
+    comparison, ran = again(wall, tmp_path / "new")
+    assert ran == ["wall scaffold-gs seed 0"] and not comparison.failures
 
 
 # Damaged and foreign folders
@@ -304,7 +304,7 @@ def test_a_damaged_result_is_written_again_and_a_newer_one_refused(wall, folder,
 
 
 @pytest.mark.parametrize(
-    ("content", "options", "told"),
+    ("content", "options", "message"),
     [
         ('{"format": "coliags-comparison", "version": 99}', {}, "plan.json is from a newer version"),
         ("{", {}, "plan.json is not JSON"),
@@ -318,10 +318,10 @@ def test_a_damaged_result_is_written_again_and_a_newer_one_refused(wall, folder,
         ),
     ],
 )
-def test_plans_that_cannot_be_read_and_runs_of_another_kind(wall, folder, content, options, told):
+def test_plans_that_cannot_be_read_and_runs_of_another_kind(wall, folder, content, options, message):
     if content is not None:
         (folder / "plan.json").write_text(content)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         again(wall, folder, **options)
 
 
@@ -329,12 +329,12 @@ def test_a_folder_of_something_else(wall, tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("")
     (tmp_path / "file").write_text("")
-    for path, told in [
+    for path, message in [
         (tmp_path / "thesis", "not the folder of a comparison: it holds chapter.txt"),
         (tmp_path / "file", "is a file"),
         (tmp_path / "file" / "x", "cannot write to"),
     ]:
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             again(wall, path)
 
 

@@ -43,8 +43,8 @@ def process_of(folder, method):
 
 def run_of(folder, method):
     """The run folder of a method, once there is one with so many steps."""
-    found = [path for path in folder.glob(f"runs/wall/{method}/s0-*") if RunFolder(path).logged_step > 20]
-    return found[0] if found else None
+    folders = [path for path in folder.glob(f"runs/wall/{method}/s0-*") if RunFolder(path).logged_step > 20]
+    return folders[0] if folders else None
 
 
 def alive(process):
@@ -62,9 +62,9 @@ def test_a_comparison_that_is_asked_to_stop_saves_its_runs(wall, undisturbed, tm
     first = driver(wall, folder)
     until("step", lambda: run_of(folder, "coliags") and run_of(folder, "scaffold-gs-depth"))
     os.kill(first.pid, number)
-    _, told = first.communicate()
+    _, messages = first.communicate()
     assert first.returncode == 130
-    assert "stopped with 0 of 2 cells done; the same command goes on where it stopped" in told
+    assert "stopped with 0 of 2 cells done; the same command goes on where it stopped" in messages
     runs = sorted(folder.glob("runs/wall/*/s0-*"))
     saved = {run.relative_to(folder / "runs").as_posix(): RunFolder(run).step for run in runs}
     assert list(saved.values()) == [RunFolder(run).logged_step for run in runs], "the last step that was taken is saved"
@@ -83,8 +83,8 @@ def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
     until("retry", lambda: process_of(folder, "coliags") not in (None, struck))
     workers = [worker for method in METHODS if (worker := process_of(folder, method))]
     first.kill()
-    _, told = first.communicate()
-    assert "SIGKILL" in told and "trying again" in told
+    _, messages = first.communicate()
+    assert "SIGKILL" in messages and "trying again" in messages
     until("end of the workers", lambda: not any(map(alive, workers)))
 
     options = {"steps": STEPS, "settings": parse_assignments(OFTEN), "jobs": 2, "threads": 1, "device": "cpu"}

@@ -68,7 +68,7 @@ def test_options_become_changes_of_the_data_manager(written):
 
 
 @pytest.mark.parametrize(
-    ("load", "text", "told"),
+    ("load", "text", "message"),
     [
         (load_benchmark, "", "mine.yaml:1: scenes: is missing"),
         (load_benchmark, "scenes: {}", "mine.yaml:2: scenes"),
@@ -90,8 +90,8 @@ def test_options_become_changes_of_the_data_manager(written):
         (load_ablation, "base: coliags\nvariants: {a: [[[b]]]}", "mine.yaml:3: variants.a.set"),
     ],
 )
-def test_faults_are_named_by_line_and_key(written, load, text, told):
-    with pytest.raises(InputError, match=told):
+def test_faults_are_named_by_line_and_key(written, load, text, message):
+    with pytest.raises(InputError, match=message):
         load(written(f"description: x\n{text}"))
 
 
@@ -124,8 +124,8 @@ def test_variants_have_what_their_names_say():
         parts, (geometry, appearance) = {*variant.name.split("-")}, heads(variant)
         sees_distance = appearance.name == "plain" and appearance.settings.distance
         has_depth = "depth" in load_method(variant.method, variant.overrides).config.losses
-        found = (geometry.name == "imve", appearance.name == "imia", sees_distance, has_depth)
-        assert found == tuple(part in parts for part in ("imve", "imia", "distance", "depth"))
+        used = (geometry.name == "imve", appearance.name == "imia", sees_distance, has_depth)
+        assert used == tuple(part in parts for part in ("imve", "imia", "distance", "depth"))
     for variant in load_ablation("rivals"):
         config = load_method(variant.method, variant.overrides).config
         supervised = "depth" in config.losses
@@ -177,7 +177,7 @@ def test_folders_and_scenes_of_a_file(tmp_path, written):
 
 
 @pytest.mark.parametrize(
-    ("names", "data", "told"),
+    ("names", "data", "message"),
     [
         (["nowhere"], None, "no scene 'nowhere'.*a benchmark: c3vd, c3vd-endogslam"),
         (["c3vd/cecum"], None, "no scene of benchmark 'c3vd' 'cecum'.*Did you mean"),
@@ -186,15 +186,15 @@ def test_folders_and_scenes_of_a_file(tmp_path, written):
         (["c3vd", "rotatecolon"], "x", "`data=x` with these benchmarks: c3vd, rotatecolon"),
     ],
 )
-def test_scenes_that_cannot_be_meant(tmp_path, names, data, told):
+def test_scenes_that_cannot_be_meant(tmp_path, names, data, message):
     for folder in ("wall", "other/wall"):
         (tmp_path / folder).mkdir(parents=True)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         find_scenes([name.format(tmp=tmp_path) for name in names], None if data is None else Path(data))
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({}, None),
         ({"wave": 2.0}, r"wave 2\.0 instead of 0\.0"),
@@ -206,12 +206,12 @@ def test_scenes_that_cannot_be_meant(tmp_path, names, data, told):
         (None, "is not a phantom"),
     ],
 )
-def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written, changes, told):
+def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written, changes, message):
     name = written("description: x\nscenes: {one: {phantom: {seed: 3, frames: 9}}}")
     (scene,) = find_scenes([name], tmp_path / "made")
     (tmp_path / "made" / "one").mkdir(parents=True)
     if changes is not None:
         settings = {"settings": {**scene.phantom_record, **changes}}
         (tmp_path / "made" / "one" / "phantom.json").write_text(json.dumps(settings))
-    with nullcontext() if told is None else pytest.raises(InputError, match=told):
+    with nullcontext() if message is None else pytest.raises(InputError, match=message):
         assert find_scenes([name], tmp_path / "made")[0].is_there

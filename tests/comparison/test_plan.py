@@ -35,13 +35,13 @@ def keys(wall, **options):
 
 
 def test_one_cell_for_each_method_split_and_seed_the_seeds_together(wall):
-    made = cells(wall, ["coliags", "3dgs"], seeds=2, splits=["every-8th", "block"])
-    assert [(cell.seed, cell.scene_label, cell.variant.name) for cell in made] == [
+    planned = cells(wall, ["coliags", "3dgs"], seeds=2, splits=["every-8th", "block"])
+    assert [(cell.seed, cell.scene_label, cell.variant.name) for cell in planned] == [
         (seed, label, method) for seed in (0, 1) for label in ("wall", "wall-block") for method in ("coliags", "3dgs")
     ]
-    assert {cell.config.datamanager.settings.split for cell in made if cell.scene_label == "wall"} == {"every-8th"}
-    assert len({cell.keys.result for cell in made}) == len(made)
-    assert {cell.config.schedule.steps for cell in made} == {5}
+    assert {cell.config.datamanager.settings.split for cell in planned if cell.scene_label == "wall"} == {"every-8th"}
+    assert len({cell.keys.result for cell in planned}) == len(planned)
+    assert {cell.config.schedule.steps for cell in planned} == {5}
     (cell,) = cells(wall, overrides=["datamanager.split=block"])
     assert cell.scene_label == "wall-block"
 
@@ -81,15 +81,15 @@ def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
 def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
     phantom = PhantomSettings(layout=layout, frames=9)
     request = requested(tmp_path)
-    request = replace(request, scenes=[SceneSource("made", tmp_path / "made", phantom=phantom)])
+    request = replace(request, scenes=[SceneSource("planned", tmp_path / "planned", phantom=phantom)])
     (unknown,) = make_cells(request)
     assert unknown.keys is None and unknown.config.schedule.steps == 5
-    (known,) = make_cells(request, lambda scene: "abc")
-    assert known.keys is not None and known.keys.fingerprint == "abc"
+    (recorded,) = make_cells(request, lambda scene: "abc")
+    assert recorded.keys is not None and recorded.keys.fingerprint == "abc"
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"methods": []}, "no method"),
         ({"methods": ["colias"]}, "no method 'colias'.*Did you mean 'coliags'"),
@@ -105,8 +105,8 @@ def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, 
         ({"overrides": ["field.featurs=8"]}, "`field.featurs=8`.*Did you mean 'features'"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(wall, options, told):
-    with pytest.raises(InputError, match=told):
+def test_what_cannot_be_compared_is_refused(wall, options, message):
+    with pytest.raises(InputError, match=message):
         cells(wall, **options)
 
 

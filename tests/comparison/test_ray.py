@@ -39,26 +39,26 @@ METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance"
 
 def test_ray_that_is_not_installed_is_told_how_to_get(wall, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    told = refused(capsys, "compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
-    assert 'pip install "coliags_plugin[sweep]"' in told and not (tmp_path / "x").exists()
+    message = refused(capsys, "compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
+    assert 'pip install "coliags_plugin[sweep]"' in message and not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
 def test_a_cluster_that_cannot_be_reached(wall, tmp_path, capsys, address):
     pytest.importorskip("ray")
     words = ("compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
-    told = refused(capsys, *words, "--ray-address", address)
-    assert f"no Ray cluster at {address}" in told and "ray start --head" in told
+    message = refused(capsys, *words, "--ray-address", address)
+    assert f"no Ray cluster at {address}" in message and "ray start --head" in message
 
 
 def patiently(start):
-    """What a function starts; on a busy machine a node may miss the 30 seconds that Ray gives it."""
+    """Result of a start tried four times: on a busy machine a node may miss the 30 seconds that Ray gives it."""
     for _ in range(4):
         try:
             return start()
         except Exception as error:
-            found = error
-    raise found
+            last_error = error
+    raise last_error
 
 
 @pytest.fixture
@@ -69,12 +69,12 @@ def cluster():
     from ray.cluster_utils import Cluster
 
     head = {"num_cpus": 0, "include_dashboard": False}
-    made = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
-    nodes = [patiently(lambda: made.add_node(num_cpus=1)) for _ in range(2)]
-    made.wait_for_nodes(timeout=120)
-    yield made, nodes
+    ray_cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
+    nodes = [patiently(lambda: ray_cluster.add_node(num_cpus=1)) for _ in range(2)]
+    ray_cluster.wait_for_nodes(timeout=120)
+    yield ray_cluster, nodes
     ray.shutdown()
-    made.shutdown()
+    ray_cluster.shutdown()
 
 
 @pytest.fixture
@@ -136,13 +136,13 @@ def check(folder, undisturbed):
 
 @pytest.mark.slow
 def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, tmp_path):
-    made, nodes = cluster
+    ray_cluster, nodes = cluster
     folder = tmp_path / "killed"
-    first = driver(wall, folder, made.address)
+    first = driver(wall, folder, ray_cluster.address)
     os.kill(until("run", lambda: under_way(folder)), signal.SIGKILL)
     until("retry of the worker", lambda: told_by(folder).count("trying again") == 1)
     lost = node_of(until("second run", lambda: under_way(folder)), nodes)
-    made.remove_node(lost, allow_graceful=False)
+    ray_cluster.remove_node(lost, allow_graceful=False)
     nodes.remove(lost)
     until("retry on the other node", lambda: told_by(folder).count("trying again") == 2)
     assert "SIGKILL" in told_by(folder) and "the node died" in told_by(folder)
@@ -150,26 +150,26 @@ def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, t
     first.kill()
     first.wait()
 
-    assert driver(wall, folder, made.address).wait() == 0, told_by(folder)
+    assert driver(wall, folder, ray_cluster.address).wait() == 0, told_by(folder)
     check(folder, undisturbed)
     before = trainings(folder)
     assert sum(map(len, before.values())) >= len(METHODS) + 2, "what was struck went on"
-    assert driver(wall, folder, made.address).wait() == 0
+    assert driver(wall, folder, ray_cluster.address).wait() == 0
     assert trainings(folder) == before, "what is done is not run again"
 
 
 @pytest.mark.slow
 def test_a_sweep_that_nobody_disturbs_and_one_that_is_asked_to_stop(cluster, wall, undisturbed, tmp_path):
-    made, _ = cluster
+    ray_cluster, _ = cluster
     folder = tmp_path / "stopped"
-    first = driver(wall, folder, made.address)
+    first = driver(wall, folder, ray_cluster.address)
     until("run", lambda: under_way(folder))
     os.kill(first.pid, signal.SIGINT)
     assert first.wait() == 130 and "the same command goes on" in told_by(folder)
     settings = parse_assignments(OFTEN)
-    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": made.address}
-    done = cp.compare(METHODS, wall, folder, steps=STEPS, settings=settings, **options)
-    assert not done.failures
+    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": ray_cluster.address}
+    comparison = cp.compare(METHODS, wall, folder, steps=STEPS, settings=settings, **options)
+    assert not comparison.failures
     check(folder, undisturbed)
 
 
@@ -179,27 +179,27 @@ def test_tries_are_counted_when_memory_runs_out(monkeypatch, request, wall, tmp_
     monkeypatch.setenv("RAY_memory_usage_threshold", "0.001")  # less than is in use
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
     monkeypatch.setattr(RayExecutor, "check", lambda *_: None)  # whose tasks would end likewise
-    made, _ = request.getfixturevalue("cluster")
+    ray_cluster, _ = request.getfixturevalue("cluster")
     settings = parse_assignments(TINY)
-    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": made.address, "retries": 1}
-    done = cp.compare("coliags", wall, tmp_path / "full", steps=100_000, settings=settings, **options)
-    (failure,) = done.failures
+    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": ray_cluster.address, "retries": 1}
+    comparison = cp.compare("coliags", wall, tmp_path / "full", steps=100_000, settings=settings, **options)
+    (failure,) = comparison.failures
     assert (failure.reason, failure.attempts) == ("the node's memory ran out, 2 times", 2)
 
 
 @pytest.mark.slow
 def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch):
-    made, _ = cluster
-    executor = RayExecutor(made.address, None, 1, "cpu")
+    ray_cluster, _ = cluster
+    executor = RayExecutor(ray_cluster.address, None, 1, "cpu")
     assert executor.slots == 2
     executor.check(tmp_path, [wall])
     assert not list(tmp_path.glob(".storage-*"))
     with pytest.raises(InputError, match=r"node .* does not see .*/gone\. Expected inputs on storage"):
         executor.check(tmp_path, [wall, tmp_path / "gone"])
-    seen = RayExecutor._ask
+    ask = RayExecutor._ask
 
     def elsewhere(self, node, file, scenes):
-        return seen(self, node, Path("/proc/1/nowhere") / file.name, scenes)
+        return ask(self, node, Path("/proc/1/nowhere") / file.name, scenes)
 
     monkeypatch.setattr(RayExecutor, "_ask", elsewhere)
     with pytest.raises(InputError, match=r"node .* does not see .*No such file.*storage that all machines share"):
@@ -208,20 +208,20 @@ def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_every_run_gets_a_gpu_of_its_own(cluster, wall, tmp_path, monkeypatch):
-    made, _ = cluster
+    ray_cluster, _ = cluster
     with pytest.raises(InputError, match="the cluster has no GPU"):
-        RayExecutor(made.address, None, 1, "cuda")
-    patiently(lambda: made.add_node(num_cpus=3, num_gpus=2))
-    made.wait_for_nodes(timeout=120)
-    assert RayExecutor(made.address, None, 1, "cpu").slots == 5
+        RayExecutor(ray_cluster.address, None, 1, "cuda")
+    patiently(lambda: ray_cluster.add_node(num_cpus=3, num_gpus=2))
+    ray_cluster.wait_for_nodes(timeout=120)
+    assert RayExecutor(ray_cluster.address, None, 1, "cpu").slots == 5
 
-    def seen(task):
+    def device_seen(task):
         time.sleep(2.0)
         return {"ending": "done", "reason": os.environ.get("CUDA_VISIBLE_DEVICES", "")}
 
-    monkeypatch.setattr(ray_executor, "_work", seen)
+    monkeypatch.setattr(ray_executor, "_work", device_seen)
     for device, gpus in (("auto", {"0", "1"}), ("cpu", {""})):
-        executor = RayExecutor(made.address, None, 1, device)
+        executor = RayExecutor(ray_cluster.address, None, 1, device)
         for _ in range(2):
             executor.start(None)
         ended = []

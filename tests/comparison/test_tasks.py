@@ -1,4 +1,4 @@
-"""What workers are told and tell: tasks, their environment, and how a process ended."""
+"""Tasks of worker processes: JSON, environment, outcomes, and the executor of this machine."""
 
 from __future__ import annotations
 

@@ -29,11 +29,11 @@ def one_seed(values):
 
 def test_spread_by_hand():
     values = {"a": {0: 1.0, 1: 3.0}, "b": {0: 5.0}, "c": {0: 7.0, 1: 7.0, 2: 13.0}}
-    found = spread(values, ["a", "b", "c"])
-    assert (found.mean, found.scenes) == (pytest.approx(16 / 3), 3)
-    assert found.over_scenes == pytest.approx(np.std([2, 5, 9], ddof=1))
-    assert found.over_seeds == pytest.approx(np.sqrt((2 + 12) / 2))
-    assert (found.median, found.ruled_by_few) == (5.0, False)
+    result = spread(values, ["a", "b", "c"])
+    assert (result.mean, result.scenes) == (pytest.approx(16 / 3), 3)
+    assert result.over_scenes == pytest.approx(np.std([2, 5, 9], ddof=1))
+    assert result.over_seeds == pytest.approx(np.sqrt((2 + 12) / 2))
+    assert (result.median, result.ruled_by_few) == (5.0, False)
     far = spread({"a": {0: 1.0}, "b": {0: 2.0}, "c": {0: 9.1}}, ["a", "b", "c"])
     assert (far.median, far.ruled_by_few) == (2.0, True)
     alone = spread(values, ["b"])

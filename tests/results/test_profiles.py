@@ -24,18 +24,18 @@ def view(camera, depth, rgb_error=0.1, depth_error=2.0, mask=None, depth_valid=N
     """A frame of this true depth and its rendering with these errors."""
     image = torch.full((camera.height, camera.width, 3), 100, dtype=torch.uint8)
     frame = Frame.of("f", 0, image, camera, depth, mask)
-    known = torch.isfinite(depth) if depth_valid is None else depth_valid
+    is_known = torch.isfinite(depth) if depth_valid is None else depth_valid
     compared = Comparison(
-        frame.rgb + rgb_error, frame.rgb, frame.valid, depth + depth_error, depth, known & frame.valid
+        frame.rgb + rgb_error, frame.rgb, frame.valid, depth + depth_error, depth, is_known & frame.valid
     )
     return compared, frame
 
 
 def profiles(*views, unit="mm"):
-    found = ErrorProfiles(unit)
+    records = ErrorProfiles(unit)
     for compared, frame in views:
-        found.add(compared, frame)
-    return found.records()
+        records.add(compared, frame)
+    return records.records()
 
 
 def pixel(column, row, camera):
@@ -57,16 +57,16 @@ def test_pixels_and_errors_are_in_the_bins_where_trigonometry_puts_them():
     depth = torch.rand(24, 32, generator=torch.Generator().manual_seed(0)) * 90 + 1
     rgb_error, depth_error = rays[..., 1] / 1000, rays[..., 0]
     compared = view(camera, depth, torch.from_numpy(rgb_error)[..., None], torch.from_numpy(depth_error))
-    found = profiles(compared)
-    assert (found["distance"].unit, found["angle"].unit) == ("mm", "degrees")
+    records = profiles(compared)
+    assert (records["distance"].unit, records["angle"].unit) == ("mm", "degrees")
     assert profiles(compared, unit="units")["distance"].unit == "units"
     bins = {"distance": (rays[..., 0] * depth.numpy(), DISTANCE_EDGES), "angle": (rays[..., 1], ANGLE_EDGES)}
     for name, (where, edges) in bins.items():
-        assert found[name].edges == edges and sum(found[name].pixels) == 24 * 32
+        assert records[name].edges == edges and sum(records[name].pixels) == 24 * 32
         for index, (low, high) in enumerate(pairwise(edges)):
             inside = (where >= low) & (where < high)
-            assert found[name].pixels[index] == inside.sum()
-            for errors, means in ((rgb_error, found[name].rgb_mse), (depth_error, found[name].depth_mse)):
+            assert records[name].pixels[index] == inside.sum()
+            for errors, means in ((rgb_error, records[name].rgb_mse), (depth_error, records[name].depth_mse)):
                 mean = pytest.approx((errors[inside] ** 2).mean(), rel=1e-4) if inside.any() else None
                 assert means[index] == mean
 
@@ -75,26 +75,26 @@ def test_the_mean_is_over_the_pixels_of_all_frames_and_channels():
     camera, wide = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose()), Camera(1e3, 1e3, 1.0, 0.5, 2, 1, pose(1.0))
     first = view(camera, torch.tensor([[12.0]]), rgb_error=torch.tensor([0.3, 0.0, 0.0]), depth_error=3.0)
     second = view(wide, torch.tensor([[12.0, 13.0]]), rgb_error=0.0, depth_error=0.0)
-    found = profiles(first, second)["distance"]
-    assert found.pixels[2] == 3
-    assert found.depth_mse[2] == 3.0
-    assert found.rgb_mse[2] == pytest.approx(0.09 / 3 / 3, rel=1e-5)
+    records = profiles(first, second)["distance"]
+    assert records.pixels[2] == 3
+    assert records.depth_mse[2] == 3.0
+    assert records.rgb_mse[2] == pytest.approx(0.09 / 3 / 3, rel=1e-5)
 
 
 def test_only_pixels_of_known_depth_that_are_compared_count():
     camera = Camera(1e3, 1e3, 2.0, 0.5, 4, 1, pose())
     depth = torch.tensor([[12.0, torch.nan, 12.0, 400.0]])
-    made = view(camera, depth, mask=torch.tensor([[True, True, False, True]]))
-    assert sum(profiles(made)["distance"].pixels) == 1, "one is masked, one unknown, and one beyond the last edge"
+    compared = view(camera, depth, mask=torch.tensor([[True, True, False, True]]))
+    assert sum(profiles(compared)["distance"].pixels) == 1, "one is masked, one unknown, and one beyond the last edge"
     everywhere = view(camera, depth, depth_valid=torch.ones(1, 4, dtype=torch.bool))
     assert sum(profiles(everywhere)["distance"].pixels) == 2, "a protocol that compares unknown depth has no distance"
 
 
 def test_a_depth_that_is_not_finite_leaves_its_bin_without_a_value():
     camera = Camera(1e3, 1e3, 1.0, 0.5, 2, 1, pose())
-    found = profiles(view(camera, torch.tensor([[12.0, 12.0]]), depth_error=torch.tensor([[torch.inf, 1.0]])))
-    assert found["distance"].pixels[2] == 2 and found["distance"].depth_mse[2] is None
-    assert found["distance"].rgb_mse[2] is not None
+    records = profiles(view(camera, torch.tensor([[12.0, 12.0]]), depth_error=torch.tensor([[torch.inf, 1.0]])))
+    assert records["distance"].pixels[2] == 2 and records["distance"].depth_mse[2] is None
+    assert records["distance"].rgb_mse[2] is not None
 
 
 def test_without_true_depth_there_is_no_profile():

@@ -17,7 +17,7 @@ ROTATION = made_set(("r",), (0.1 + 0.2,), (1e-300,))
 
 
 def other_run(**changes):
-    """Of another method, under another protocol, with two test sets."""
+    """Result of another method, under another protocol, with two test sets."""
     facts = {"key": "f" * 16, "method": "ablations/none", "protocol": ProtocolRecord(name="mine", version=3)}
     return made_result({"test": made_set(), "rotation": ROTATION}, **{**facts, **changes})
 
@@ -81,11 +81,11 @@ def test_an_unreadable_file_is_named(runs):
 
 
 def test_there_is_one_row_per_value():
-    found = list(value_rows(other_run()))
-    assert len(found) == 3 * 2 + 3 * 1 == len({row[7:10] for row in found})
+    rows = list(value_rows(other_run()))
+    assert len(rows) == 3 * 2 + 3 * 1 == len({row[7:10] for row in rows})
     run = ("f" * 16, "ablations/none", "wall", "every-8th", 0, "mine", 3)
-    assert found[0] == (*run, "test", "0000", "psnr", 30.0, "dB")
-    assert found[-1] == (*run, "rotation", "r", "depth_mse", 1e-300, "mm^2")
+    assert rows[0] == (*run, "test", "0000", "psnr", 30.0, "dB")
+    assert rows[-1] == (*run, "rotation", "r", "depth_mse", 1e-300, "mm^2")
 
 
 def test_csv_keeps_every_digit_and_leaves_missing_values_empty(tmp_path):

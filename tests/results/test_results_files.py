@@ -31,9 +31,9 @@ def file(tmp_path):
 
 
 def refusal(path) -> str:
-    with pytest.raises(InputError) as found:
+    with pytest.raises(InputError) as read:
         read_result(path)
-    return str(found.value)
+    return str(read.value)
 
 
 def change(path, edit):
@@ -51,9 +51,9 @@ def change(path, edit):
 def test_what_is_read_is_what_was_written(result, tmp_path):
     path = tmp_path / "result.json"
     write_result(path, result)
-    found = read_result(path)
-    assert found == result
-    assert [*found.sets] == [*result.sets] and [*found.metrics] == [*result.metrics]
+    read = read_result(path)
+    assert read == result
+    assert [*read.sets] == [*result.sets] and [*read.metrics] == [*result.metrics]
 
 
 # Hash of the values
@@ -99,10 +99,10 @@ def test_the_hash_is_of_the_documented_text_whatever_the_order_of_names():
 
 
 def arrays_hash(*arrays) -> str:
-    found = ArraysHash()
+    read = ArraysHash()
     for frame, part, values in arrays:
-        found.add(frame, part, values)
-    return found.hexdigest()
+        read.add(frame, part, values)
+    return read.hexdigest()
 
 
 def test_images_have_a_hash_of_names_shapes_and_numbers():
@@ -201,12 +201,12 @@ def test_what_cannot_be_written_is_refused():
 
 
 def test_means_are_over_the_frames_that_have_a_value():
-    own, other = made_set(), made_set(psnr=(20.0, 20.0))
-    summary = means_summary(made_result({"rotation": other, "test": own}))
+    main_set, other = made_set(), made_set(psnr=(20.0, 20.0))
+    summary = means_summary(made_result({"rotation": other, "test": main_set}))
     assert summary["psnr"] == 30.75 and summary["depth_mse"] == 0.25 and summary["lpips"] is None
     assert summary["reasons"] == {"lpips": "no weights"}
     assert "psnr_seen" not in summary and summary["sets"]["test"]["psnr_seen"] is None
-    assert means_summary(made_result({"rotation": other, "up": own}))["psnr"] == 20.0, (
+    assert means_summary(made_result({"rotation": other, "up": main_set}))["psnr"] == 20.0, (
         "the first, without one of that name"
     )
 

@@ -68,8 +68,8 @@ class Page(HTMLParser):
 
     def images(self, alt):
         """Decoded images whose alternative text matches."""
-        found = [attrs["src"] for attrs in self.all("img") if re.search(alt, attrs["alt"])]
-        raw = [base64.b64decode(source.split(",", 1)[1], validate=True) for source in found]
+        matches = [attrs["src"] for attrs in self.all("img") if re.search(alt, attrs["alt"])]
+        raw = [base64.b64decode(source.split(",", 1)[1], validate=True) for source in matches]
         return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] for data in raw]
 
     def charts(self):
@@ -133,8 +133,8 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
     depth = (0.1, 0.5, 0.1, 0.1, 0.1)
     result = result_of("coliags", values={"psnr": psnr, "depth_mse": depth})
     page = report(tmp_path, [write_run(tmp_path / "run", result)], frames=2)
-    found = re.findall(r"frame (\d{4}) (\d of \d)(?: · (worst [\w ]+ of coliags))?", page.words)
-    assert found == [
+    matches = re.findall(r"frame (\d{4}) (\d of \d)(?: · (worst [\w ]+ of coliags))?", page.words)
+    assert matches == [
         ("0004", "1 of 5", ""),
         ("0012", "2 of 5", "worst Depth MSE of coliags"),
         ("0028", "4 of 5", "worst PSNR of coliags"),
@@ -307,12 +307,12 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
     assert summaries.count("scene-1") >= 3  # views, curves, tables
     shutil.rmtree(folder / f"runs/scene-1/coliags/s0-{results[0].key[:8]}")
     shutil.rmtree(folder / f"runs/scene-2/coliags/s0-{results[1].key[:8]}")
-    left = [
+    shown_methods = [
         attributes["data-method"]
         for attributes in report(tmp_path, [folder]).all("figure")
         if "data-method" in attributes
     ]
-    assert set(left) == {"truth", "3dgs"}
+    assert set(shown_methods) == {"truth", "3dgs"}
 
 
 # Formats

@@ -154,8 +154,8 @@ RULED = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
     ],
 )
 def test_means_of_metrics(study_of, results, table, metric, cells):
-    found = entries(tables(of(study_of, results))[table], metric)
-    assert {method: (c.text, c.spread, c.rank, c.note) for method, c in found.items()} == cells
+    cells_shown = entries(tables(of(study_of, results))[table], metric)
+    assert {method: (c.text, c.spread, c.rank, c.note) for method, c in cells_shown.items()} == cells
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_means_of_metrics(study_of, results, table, metric, cells):
             ],
         ),
         (
-            [result_of(m, f"s{i}", depth=depth) for m, own in RULED.items() for i, depth in enumerate(own)],
+            [result_of(m, f"s{i}", depth=depth) for m, depths in RULED.items() for i, depth in enumerate(depths)],
             [
                 "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags "
                 "(0.0100)",
@@ -186,8 +186,8 @@ def test_means_of_metrics(study_of, results, table, metric, cells):
     ],
 )
 def test_notes_below_the_means(study_of, results, notes):
-    found = tables(of(study_of, results))["summary-test"].notes
-    assert all(any(note.startswith(said) for note in found) for said in notes), found
+    lines = tables(of(study_of, results))["summary-test"].notes
+    assert all(any(line.startswith(note) for line in lines) for note in notes), lines
 
 
 def test_the_summary_of_many_scenes_is_the_mean_over_those_that_all_have(study_of):
@@ -222,7 +222,7 @@ def test_reference(study_of):
 
 
 @pytest.mark.parametrize(
-    ("scenes", "rivals", "said"),
+    ("scenes", "rivals", "text"),
     [
         (5, 2, "No test is run: 5 scenes cannot tell methods apart. The unit is the scene, not the frame, and of "
                "5 differences the two-sided Wilcoxon test cannot give less than p = .0625; tests are run from 6 scenes "
@@ -233,10 +233,10 @@ def test_reference(study_of):
         (8, 6, "no p below .00781, or .0469 after Holm's adjustment for 6 rivals: every"),
     ],
 )  # fmt: skip
-def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
+def test_what_the_statistics_can_say(study_of, scenes, rivals, text):
     methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
     page = report_page(decided(study_of(made_scenes(methods, scenes)), "psnr"), ReportOptions())
-    assert said in paragraphs(page)
+    assert text in paragraphs(page)
     table = tables(page)["summary-test"]
     stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
     assert stars == ({"*"} if (scenes, rivals) in ((6, 1), (8, 6)) else {""})
@@ -299,7 +299,7 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
 
 
 @pytest.mark.parametrize(
-    ("results", "said"),
+    ("results", "texts"),
     [
         (
             [OURS, result_of("3dgs", steps=80, software={"code": "c2", "git": "def5678"}, data={"calibration": "x"})],
@@ -360,8 +360,8 @@ HELD_OUT = {"depth": ["0004", "0012"], "points": None}
         ([transparent(0.01)], []),
     ],
 )
-def test_cautions(study_of, results, said):
-    assert of(study_of, results).cautions == said
+def test_cautions(study_of, results, texts):
+    assert of(study_of, results).cautions == texts
 
 
 def test_cells_without_a_result(tmp_path, study_of):

@@ -113,7 +113,7 @@ def test_columns_are_chosen_for_all_tables(opened):
 
 
 def at(browser):
-    """Where the slider is, and how much of the left picture is seen, both in percent."""
+    """Position of the slider, which is the visible share of the left picture, percent."""
     value = float(browser.run("document.querySelector('.compare input').value"))
     clip = browser.run("getComputedStyle(document.querySelector('.stage .left')).clipPath")
     assert clip == f"inset(0px calc({100 - value:g}%) 0px 0px)" or clip == f"inset(0px {100 - value:g}% 0px 0px)"
@@ -190,7 +190,7 @@ def test_the_worst_views_come_first_on_demand(opened):
 
 
 def curves(browser):
-    """How many charts against steps, and against seconds, are seen."""
+    """Numbers of visible charts against steps, and against seconds."""
     visible = "document.querySelectorAll('figure.{}').values().filter(each => each.checkVisibility()).toArray().length"
     return [browser.run(visible.format(kind)) for kind in ("by-step", "by-seconds")]
 
@@ -233,10 +233,10 @@ def test_a_dark_page_is_dark(browser, page):
 
 
 def test_a_console_error_would_be_seen(browser, tmp_path):
-    """Of the driver itself: a page that fails in three ways."""
+    """A page that fails in three ways, which the driver reports."""
     broken = tmp_path / "broken.html"
     broken.write_text("<img src='missing.png'><script>console.error('one'); undefinedFunction();</script>")
     browser.open(broken, DESKTOP)
-    found = " ".join(browser.errors())
-    assert "one" in found and "undefinedFunction" in found and "ERR_FILE_NOT_FOUND" in found
+    errors = " ".join(browser.errors())
+    assert "one" in errors and "undefinedFunction" in errors and "ERR_FILE_NOT_FOUND" in errors
     assert len(browser.requests()) == 2

@@ -112,8 +112,8 @@ def test_the_family_is_all_that_was_planned_shown_or_not(compared):
         expected = multipletests([*raw, *[1.0] * (4 - len(raw))], method="holm")[1]  # the others may have any p
         assert [holm_of(study)[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
         page = report_page(study, ReportOptions())
-        said = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
-        assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in said
+        text = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
+        assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in text
 
 
 def test_a_decision_holds_where_all_plans_have_it(tmp_path):
@@ -239,9 +239,9 @@ def test_splits_are_parts_of_their_own(study_of):
     ],
 )
 def test_runs_of_one_method_are_told_apart_where_they_are_not_seeds(study_of, results, labels):
-    found = [run.method for run in study_of(results).runs]
-    assert [label[: len(expected)] for label, expected in zip(found, labels, strict=True)] == labels
-    assert len({*found}) == (2 if "config" in labels[0] else len({*labels})) and found[0] == found[1]
+    shown = [run.method for run in study_of(results).runs]
+    assert [label[: len(expected)] for label, expected in zip(shown, labels, strict=True)] == labels
+    assert len({*shown}) == (2 if "config" in labels[0] else len({*labels})) and shown[0] == shown[1]
 
 
 def test_runs_are_told_apart_by_their_stamps(tmp_path):
