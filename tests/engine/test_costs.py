@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from coliags_plugin.engine import costs
 from coliags_plugin.engine.costs import PSNR_MARKS, CostMeter, RenderMeter, TrainingCost, seconds_to_psnr
 from coliags_plugin.engine.devices import device_name
-from tests.engine.test_trainer import final_state, log_rows, make_trainer, train
+from tests.engine.test_trainer import final_state, interfere, kill, log_rows, make_trainer, train
 
 CPU = torch.device("cpu")
 
@@ -59,16 +59,12 @@ def test_only_what_runs_is_counted(clocks):
     with meter.running():
         clocks.go_on(2, 2)
     assert (meter.cost().seconds, meter.cost().processor_seconds) == (6.0, 8.0)
-
-
-def test_earlier_parts_of_the_run_are_added(clocks):
-    earlier = TrainingCost(device="old", threads=1, seconds=10.0, processor_seconds=20.0, peak_memory_mib=1e9)
-    meter = CostMeter(CPU, earlier)
-    with meter.running():
+    assert meter.cost().device == device_name(CPU) and meter.cost().threads == torch.get_num_threads()
+    resumed = CostMeter(CPU, TrainingCost(device="old", seconds=10.0, processor_seconds=20.0, peak_memory_mib=1e9))
+    with resumed.running():
         clocks.go_on(3, 5)
-    measured = meter.cost()
-    assert (measured.seconds, measured.processor_seconds, measured.peak_memory_mib) == (13.0, 25.0, 1e9)
-    assert measured.device == device_name(CPU) and measured.threads == torch.get_num_threads()
+    total = resumed.cost()
+    assert (total.seconds, total.processor_seconds, total.peak_memory_mib) == (13.0, 25.0, 1e9)
 
 
 def test_processor_time_counts_work_and_not_waiting():
@@ -107,7 +103,8 @@ def test_the_cost_of_a_resumed_run_goes_on_from_its_checkpoint(tmp_path, clocks)
     """Stopped at 4 of 8 steps; two more steps were taken and lost."""
     first = make_trainer(tmp_path / "run", steps=8, overrides=["schedule.checkpoint_every=4"])
     first.start()
-    _tick(first, clocks, until=6)
+    interfere(first, lambda step: clocks.go_on(1, 2))
+    kill(first, 6)
     with pytest.raises(RuntimeError, match="killed"):
         first.train()
     assert first.seconds == 6.0
@@ -116,24 +113,11 @@ def test_the_cost_of_a_resumed_run_goes_on_from_its_checkpoint(tmp_path, clocks)
     second.resume()
     assert second.seconds == 4.0, "lost steps are not counted"
     clocks.go_on(1000, 1000)
-    _tick(second, clocks)
+    interfere(second, lambda step: clocks.go_on(1, 2))
     second.train()
     measured = final_state(second).cost
     assert (measured.seconds, measured.processor_seconds) == (8.0, 16.0)
     assert [row["seconds"] for row in log_rows(second)] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
-
-
-def _tick(trainer, clocks, until=None):
-    """Each step takes one second, and two of the processor; killed after a step."""
-    take = trainer.take_step
-
-    def step():
-        if trainer.step == until:
-            raise RuntimeError("killed")
-        clocks.go_on(1, 2)
-        return take()
-
-    trainer.take_step = step
 
 
 def test_steps_taken_outside_the_loop_have_no_cost(tmp_path):

@@ -6,27 +6,21 @@ import json
 
 import pytest
 
-from coliags_plugin.cli import main
+from tests.commands import run
 
 STEPS = 1000
 
 
-def run(*argv):
-    with pytest.raises(SystemExit) as stopped:
-        main([str(arg) for arg in argv])
-    assert stopped.value.code == 0
-
-
 def metrics(folder, method, data):
-    run("train", method, "--data", data, "--output", folder / method, "--steps", STEPS)
-    run("eval", folder / method)
+    assert run("train", method, "--data", data, "--output", folder / method, "--steps", STEPS) == 0
+    assert run("eval", folder / method) == 0
     return json.loads((folder / method / "eval/paper/metrics.json").read_text())
 
 
 @pytest.mark.slow
 def test_coliags_beats_scaffold_gs_where_the_lamp_moves(tmp_path):
     """Equal steps, seed and data, both with depth loss: measured +7.4 dB, depth / 1.3, inner depth / 1.9, +9.1 dB."""
-    run("phantom", "-o", tmp_path / "strong", "--light", "strong", "--seed", 0, "--size", "169x135")
+    assert not run("phantom", "-o", tmp_path / "strong", "--light", "strong", "--seed", 0, "--size", "169x135")
     ours = metrics(tmp_path, "coliags", tmp_path / "strong")
     rival = metrics(tmp_path, "scaffold-gs-depth", tmp_path / "strong")
     assert ours["psnr"] >= rival["psnr"] + 6.0

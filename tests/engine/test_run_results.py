@@ -21,7 +21,7 @@ from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.results.hashing import code_key, result_key
 from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, read_result
-from tests.engine.test_trainer import make_trainer
+from tests.engine.test_trainer import kill, make_trainer
 from tests.scenes import SMALL, wall_scene
 
 CPU = torch.device("cpu")
@@ -51,7 +51,7 @@ def loaded(scene, tmp_path_factory):
         trainer = make_trainer(path, scene=scene, **{"steps": STEPS, **options})
         trainer.start()
         if stop is not None:
-            _stop(trainer, stop)
+            kill(trainer, stop)
             with pytest.raises(RuntimeError):
                 trainer.train()
         else:
@@ -64,17 +64,6 @@ def loaded(scene, tmp_path_factory):
 
     yield make
     patch.undo()
-
-
-def _stop(trainer, step):
-    take = trainer.take_step
-
-    def stopping():
-        if trainer.step == step:
-            raise RuntimeError("killed")
-        return take()
-
-    trainer.take_step = stopping
 
 
 @pytest.fixture(scope="module")

@@ -103,6 +103,32 @@ def assert_same(first, second):
         assert torch.equal(tensor, second.tensors[name]), name
 
 
+def interfere(trainer, act):
+    """Let each step call a function of its number before it is taken."""
+    take = trainer.take_step
+
+    def step():
+        act(trainer.step + 1)
+        return take()
+
+    trainer.take_step = step
+
+
+def interrupt(trainer, last, number=signal.SIGINT, times=1):
+    """Send a real signal, or several, while a step is in hand."""
+    interfere(trainer, lambda step: [os.kill(os.getpid(), number) for _ in range(times if step == last else 0)])
+
+
+def kill(trainer, last):
+    """Let the process fail, as if killed, after a step."""
+
+    def act(step):
+        if step > last:
+            raise RuntimeError("killed")
+
+    interfere(trainer, act)
+
+
 def log_rows(trainer):
     return [json.loads(line) for line in trainer.run.log_file.read_text().splitlines()]
 
@@ -142,7 +168,7 @@ def test_an_interrupted_run_resumes_to_the_bit(tmp_path, request, method, steps,
     options = {"method": method, "steps": steps, "overrides": overrides}
     whole, broken = train(tmp_path / "whole", **options), make_trainer(tmp_path / "cut", **options)
     broken.start()
-    _stop_after(broken, cut, number)
+    interrupt(broken, cut, number)
     with pytest.raises(InterruptedRunError, match=f"stopped after step {cut}"):
         broken.train()
     resumed = make_trainer(tmp_path / "cut", **options)
@@ -166,23 +192,10 @@ def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
     assert [row["step"] for row in log_rows(longer)] == [1, 2, 3, 4, 5, 6]
 
 
-def _stop_after(trainer, steps, number=signal.SIGINT):
-    """A real signal while a step is in hand."""
-    take = trainer.take_step
-
-    def step():
-        row = take()
-        if row["step"] == steps:
-            os.kill(os.getpid(), number)
-        return row
-
-    trainer.take_step = step
-
-
 def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path):
     trainer = make_trainer(tmp_path / "run", steps=4)
     trainer.start()
-    _stop_after(trainer, 2, signal.SIGHUP)
+    interrupt(trainer, 2, signal.SIGHUP)
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         trainer.train()
@@ -195,14 +208,7 @@ def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path):
 def test_a_second_interrupt_does_not_wait(tmp_path):
     trainer = make_trainer(tmp_path / "run")
     trainer.start()
-    take = trainer.take_step
-
-    def step():
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-        return take()
-
-    trainer.take_step = step
+    interrupt(trainer, 1, times=2)
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
