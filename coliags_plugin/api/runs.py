@@ -110,7 +110,7 @@ class Run:
         from coliags_plugin.engine.trained import load_trained
 
         loaded, device = self._loaded, choose_device(self.device)
-        if loaded is None or (loaded.lamp is None and loaded.step != self.step):
+        if loaded is None or (not loaded.relit and loaded.step != self.step):
             self._loaded = loaded = load_trained(self.path, device, self.data)
         return loaded
 

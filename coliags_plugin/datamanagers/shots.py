@@ -236,7 +236,7 @@ class StoredPixels(PixelSource):
 
     @override
     def read(self, name: str) -> Tensor | None:
-        stored = self._stored("depth" if name == "depth_at_least" else name)
+        stored = self.stored("depth" if name == "depth_at_least" else name)
         if stored is None:
             return None
         values, schema = self._decoded(name, stored), PIXEL_MAPS[name]
@@ -255,7 +255,7 @@ class StoredPixels(PixelSource):
     def preload(self) -> None:
         """Fill the cache."""
         for name in _READERS:
-            self._stored(name)
+            self.stored(name)
 
     def _decoded(self, name: str, stored: Shaped[np.ndarray, "H W ..."]) -> Shaped[np.ndarray, "H W ..."] | None:
         form = self.shot.depth_format
@@ -266,7 +266,7 @@ class StoredPixels(PixelSource):
             return None if bound is None else bound * np.float32(self.scale)
         return stored.astype(np.float32) / np.float32(255.0) if name == "depth_confidence" else stored
 
-    def _stored(self, name: str) -> Shaped[np.ndarray, "H W ..."] | None:
+    def stored(self, name: str) -> Shaped[np.ndarray, "H W ..."] | None:
         """A map at the working size, in the stored data type."""
         if not self.keep:
             return _READERS[name](self)
@@ -294,7 +294,7 @@ def _depth(pixels: StoredPixels) -> Shaped[np.ndarray, "H W"] | None:
     shot = pixels.shot
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), pixels._stored("mask")
+    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), pixels.stored("mask")
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 

@@ -324,7 +324,8 @@ class MappedLens(CalibratedLens):
     def _at(self, angles: Array) -> Array:
         return self._bent(_directions(angles))
 
-    def _keeps_orientation(self, clock: Array, angle: Array) -> Array:
+    def keeps_orientation(self, clock: Array, angle: Array) -> Array:
+        """Mask of directions at which the map from angles to the image does not mirror."""
         with np.errstate(all="ignore"):
             jacobian = self._jacobian(_vector(clock, angle))
             return np.asarray(np.linalg.det(jacobian) > 0.0)
@@ -413,13 +414,13 @@ def _limits(lens: MappedLens) -> Array:
     """
     away: Array = np.linspace(0.0, _WIDEST, _AWAY + 1)[1:]
     grid = np.repeat(_CLOCK, _AWAY), np.tile(away, _AROUND)
-    sound = lens._keeps_orientation(*grid).reshape(_AROUND, _AWAY)
+    sound = lens.keeps_orientation(*grid).reshape(_AROUND, _AWAY)
     first_bad = np.where(sound.all(axis=1), _AWAY, np.argmin(sound, axis=1))
     high = away[np.minimum(first_bad, _AWAY - 1)]
     low = np.where(first_bad > 0, away[np.maximum(first_bad, 1) - 1], 0.0)
     for _ in range(40):
         middle = 0.5 * (low + high)
-        sound_there = lens._keeps_orientation(_CLOCK, middle)
+        sound_there = lens.keeps_orientation(_CLOCK, middle)
         low, high = np.where(sound_there, middle, low), np.where(sound_there, high, middle)
     return np.where(first_bad == _AWAY, _WIDEST, low)
 

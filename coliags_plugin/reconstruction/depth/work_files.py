@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
 from coliags_plugin.core.jobs import locked
 
@@ -22,10 +22,6 @@ log = logging.getLogger(__name__)
 Arrays = Mapping[str, np.ndarray]
 #: What describes the estimation, in the folder of its work files.
 _REQUEST = "request.json"
-
-#: Held while a file is read: CPython 3.11 counts the depth of the syntax trees that NumPy reads headers by for all
-#: threads together, and raises SystemError where two are at it.
-_READING = Lock()
 
 
 @dataclass(frozen=True)
@@ -44,8 +40,7 @@ class WorkFolder:
 
     def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
         """The results of a frame of a pass."""
-        with _READING, np.load(self._file(stage, index)) as stored:
-            return {name: stored[name] for name in stored.files}
+        return read_arrays(self._file(stage, index), "a work file of this estimation", optional=None)
 
     def is_done(self, stage: str) -> bool:
         """True if all frames of a pass have been kept."""
