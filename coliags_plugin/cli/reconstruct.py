@@ -43,7 +43,7 @@ class ReconstructCommand(options.ReconstructOptions):
     every: options.OptionalInt = None
     """Use the sharpest of every n frames; default: all."""
     frames_per_second: Annotated[float | None, tyro.conf.arg(metavar="F", help_behavior_hint="")] = None
-    """In place of --every: use about so many frames a second, the sharpest of every n by the video's rate, or of every
+    """Use about so many frames a second, in place of --every: the sharpest of every n by the video's rate, or of every
     1/F s of a variable one."""
     size: options.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
@@ -60,7 +60,7 @@ class ReconstructCommand(options.ReconstructOptions):
         from coliags_plugin.pipeline.contents import read_contents
         from coliags_plugin.pipeline.stages import PAGE_FILE
 
-        given: dict[str, Any] = {
+        options: dict[str, Any] = {
             "sfm.camera.model": self.camera,
             "sfm.camera.params": None
             if self.params is None
@@ -71,11 +71,11 @@ class ReconstructCommand(options.ReconstructOptions):
             "method": self.method,
             "steps": self.steps,
         }
-        settings = {key: value for key, value in given.items() if value is not None}
+        settings = {key: value for key, value in options.items() if value is not None}
         record = reconstruct(replace(self, settings=(*assignments(settings), *self.settings)))
         contents = read_contents(self.output, record, scene=self.video)
-        done = [submap for submap in contents.submaps if "report" in submap.stages and not submap.failure]
-        largest = max(done, key=lambda submap: len(submap.names))
+        finished = [submap for submap in contents.submaps if "report" in submap.stages and not submap.failure]
+        largest = max(finished, key=lambda submap: len(submap.names))
         print_summary(
             "\n".join(_lines(contents)),
             {"stages": {name: asdict(stage) for name, stage in record.stages.items()}},
@@ -148,8 +148,8 @@ def _lines(contents: Contents) -> Iterator[str]:
     yield from (f"{folder / path}: {content}" for stage in stages.values() for path, content in stage.files.items())
     for segment in contents.segments if len(contents.segments) > 1 else ():
         span, poses = segment.span, segment.stages.get("poses")
-        told = "not begun" if poses is None else poses.summary.partition("\n")[0]
-        yield f"{span.name}, frames {span.first} to {span.last}: {told}"
+        outcome = "not begun" if poses is None else poses.summary.partition("\n")[0]
+        yield f"{span.name}, frames {span.first} to {span.last}: {outcome}"
     for skipped in contents.video.skipped:
         yield f"frames {skipped.first} to {skipped.last} left out: {skipped.why}"
     for join in contents.joins:

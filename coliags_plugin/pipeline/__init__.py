@@ -1,1 +1,1 @@
-"""From a video to mesh, coverage and report, in resumable stages."""
+"""Reconstruction of a video: mesh, coverage and report, in resumable stages."""

@@ -1,4 +1,4 @@
-"""What lies in the folder of a reconstruction: video, segments, sub-maps, why frames have no pose, problems."""
+"""Contents of the folder of a reconstruction: video, segments, sub-maps, why frames have no pose, problems."""
 
 from __future__ import annotations
 
@@ -138,7 +138,9 @@ class Contents:
     @cached_property
     def submaps(self) -> list[SubmapContents]:
         """Sub-maps of all segments, by their first frames."""
-        return sorted((one for segment in self.segments for one in segment.submaps), key=lambda submap: submap.first)
+        return sorted(
+            (submap for segment in self.segments for submap in segment.submaps), key=lambda submap: submap.first
+        )
 
     @property
     def posed(self) -> set[int]:
@@ -152,7 +154,7 @@ class Contents:
 
     @property
     def has_frames(self) -> bool:
-        """Whether the frames are known one by one: not of a scene with poses without a list of them."""
+        """True if the frames are known one by one: not of a scene with poses without a list of them."""
         return self.video.size is not None or bool(self.used)
 
     def seconds(self, frames: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "N"]:
@@ -188,7 +190,9 @@ def read_contents(out: Path, record: Record | None = None, scene: Path | None = 
         segments = (Segment(0, max(0, count - 1), ""),)
         video = Video(source=(scene or out).resolve().name, frames=max(1, count), segments=segments)
     contents = [_read_segment(out / span.name, span, record.within(span.name), video, posed) for span in video.segments]
-    problems += [": ".join(filter(None, (one.span.name, one.problem))) for one in contents if one.problem]
+    problems += [
+        ": ".join(filter(None, (segment.span.name, segment.problem))) for segment in contents if segment.problem
+    ]
     survey = _attempt(partial(_read_survey, out, video), out, problems)
     joins = figures_as(stages, "joins", _Joins, out).joins if "joins" in stages else []
     return Contents(out, video, stages, contents, joins, survey, problems)
@@ -235,7 +239,7 @@ def _read_segment(
         images, used = folder / "frames" / IMAGES, {}
         if frames := _attempt(partial(FramesRecord.read, folder / "frames"), folder, problems):
             lost = {frame.frame: frame.why for frame in frames.dropped}
-            used = {one.frame: f"{one.name}.png" for one in frames.kept if span.first <= one.frame <= span.last}
+            used = {frame.frame: f"{frame.name}.png" for frame in frames.kept if span.first <= frame.frame <= span.last}
     by_submap: dict[int, dict[str, StageRecord]] = {}
     for name, stage in stages.items():
         place, _, step = name.rpartition("/")
@@ -265,7 +269,7 @@ def _read_segment(
 
 def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video) -> list[int]:
     """Numbers in the video of an atlas's frames: by their names, in ``numbers`` or of the form ``frame_000123``."""
-    found = []
+    in_video = []
     for file in atlas.frames:
         if Path(file).name != file:
             raise ValueError(f"the name '{file}'")
@@ -274,8 +278,8 @@ def _frame_numbers(atlas: AtlasRecord, numbers: Mapping[str, int], video: Video)
         number = numbers.get(name, int(match.group(1)) if match else -1)
         if not video.first <= number < video.stop:
             raise ValueError(f"{file} is none of the frames {video.first} to {video.stop - 1}")
-        found.append(number)
-    return found
+        in_video.append(number)
+    return in_video
 
 
 def common_frames(contents: Contents) -> dict[ModelKey, tuple[ModelKey, Float[np.ndarray, "4 4"]]]:

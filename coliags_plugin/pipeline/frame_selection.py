@@ -60,7 +60,7 @@ def sharpest_frames(
 
 
 def blurred_frames(chosen: Sequence[int], sharpness: Sequence[float], settings: FrameSettings) -> set[int]:
-    """Those of the chosen frames, ascending, that are much less sharp than the ones around them."""
+    """Frames among the chosen ones, ascending, that are much less sharp than those around them."""
     values = np.asarray(sharpness)
     return {
         index
@@ -118,7 +118,7 @@ def combing(image: UInt8[np.ndarray, "H W 3"]) -> float:
 
 
 def looks_interlaced(images: Iterable[UInt8[np.ndarray, "H W 3"]]) -> bool:
-    """Whether frames of a video show two moments each, by the first of them that differ from the one before."""
+    """True if frames of a video show two moments each, by the first of them that differ from the one before."""
     combs, last = list[float](), None
     for image in islice(images, _LOOKED_AT):
         if last is not None and not is_repeated(last, image):
@@ -172,11 +172,11 @@ def corner_motion(
         return float("inf"), 0.0
     moved, tracked = _followed(before, after, corners)
     back, again = _followed(after, before, moved)
-    kept = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
-    if kept.sum() < _FEWEST:
-        return float("inf"), float(kept.sum()) / _CORNERS
-    lengths = np.linalg.norm(moved - corners, axis=2)[kept, 0]
-    return float(np.median(lengths)) / max(before.shape), float(kept.sum()) / _CORNERS
+    survived = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
+    if survived.sum() < _FEWEST:
+        return float("inf"), float(survived.sum()) / _CORNERS
+    lengths = np.linalg.norm(moved - corners, axis=2)[survived, 0]
+    return float(np.median(lengths)) / max(before.shape), float(survived.sum()) / _CORNERS
 
 
 def _followed(

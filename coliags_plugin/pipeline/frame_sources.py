@@ -43,7 +43,7 @@ class Span:
     deinterlace: bool | None = False
 
     def count(self, of: int) -> int:
-        """How many there are in a video of so many frames; at least 1, so that progress has an end."""
+        """Number of frames in a video of ``of`` frames; at least 1, so that progress has an end."""
         return max(1, (of if self.last is None else min(of, self.last + 1)) - self.first)
 
     def shown(self, image: UInt8[np.ndarray, "H W 3"], is_interlaced: bool) -> UInt8[np.ndarray, "H W 3"]:
@@ -113,9 +113,9 @@ class FrameSource:
     def known_rate(self) -> float:
         """Frames a second; InputError where the source does not tell."""
         if self.rate is None:
-            seen = f"{self.path} does not tell how many frames a second it has"
+            lacks = f"{self.path} does not tell how many frames a second it has"
             numbers = "`every=N`, `frames.first=100`, `frames.last=400`"
-            raise InputError(seen, "a video whose header does", f"Give numbers of frames: {numbers}")
+            raise InputError(lacks, "a video whose header does", f"Give numbers of frames: {numbers}")
         return self.rate
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
@@ -212,10 +212,10 @@ def watched(
 ) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
     """Names and images of a source; each is reported when the next one is asked for."""
     expected = source.expected
-    for done, frame in enumerate(source, start=1):
+    for count, frame in enumerate(source, start=1):
         yield frame
         if progress is not None:
-            progress(what, done, max(done, expected))
+            progress(what, count, max(count, expected))
 
 
 @contextmanager
@@ -276,5 +276,5 @@ def opened_recording(path: Path, settings: SfmSettings) -> tuple[Path, SfmSettin
         lens = lens.resized(round(lens.width * aspect), lens.height)
     model, params = camera_of_lens(lens, str(calibration.path), width, height)
     log.info("%s: camera of %s, for frames of %d x %d", source, calibration.path, width, height)
-    known = camera.model_copy(update={"model": model, "params": params})
-    return source, settings.model_copy(update={"camera": known})
+    calibrated = camera.model_copy(update={"model": model, "params": params})
+    return source, settings.model_copy(update={"camera": calibrated})

@@ -97,21 +97,21 @@ def write_frames(
     chosen, dropped = sharpest_frames(sharpnesses, settings, survey.times)
     blurred = blurred_frames(chosen, sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
-        kept, last, left = list[tuple[int, str]](), None, set(chosen)
+        used_frames, last, wanted_indices = list[tuple[int, str]](), None, set(chosen)
         for index, (name, image) in enumerate(watched(source, "write frames", progress)):
-            if index not in left:
+            if index not in wanted_indices:
                 continue
             gray = reduced(image)
             if last is not None and corner_motion(last, gray, used)[0] < settings.least_motion:
                 dropped[index] = RESTING
                 continue
             last = gray
-            kept.append((index, name))
+            used_frames.append((index, name))
             write_image(scratch / IMAGES / f"{name}.png", source.with_alpha(name, image))
-        blurred &= {index for index, _ in kept}
+        blurred &= {index for index, _ in used_frames}
         reasons = [f"{len(blurred)} blurred, of use for poses alone"] if blurred else []
         why = ", ".join([*reasons, *(f"{n} {reason}" for reason, n in sorted(Counter(dropped.values()).items()))])
-        if (count := len(kept) - len(blurred)) < FEWEST:
+        if (count := len(used_frames) - len(blurred)) < FEWEST:
             raise InputError(
                 f"{count} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
                 f"at least {FEWEST}",
@@ -123,7 +123,7 @@ def write_frames(
         record = FramesRecord(
             kept=[
                 KeptFrame(frame=first + index, name=name, blurred=index in blurred, sharpness=sharpnesses[index])
-                for index, name in kept
+                for index, name in used_frames
             ],
             dropped=[
                 DroppedFrame(frame=first + index, why=why, sharpness=sharpnesses[index])
@@ -140,7 +140,7 @@ def write_frames(
         write_json(scratch / RECORD, record.model_dump(mode="json"))
     outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
     fields = ", deinterlaced" if source.span.deinterlace else ""
-    return f"{len(kept)} of {total} frames, {width} x {height} px{fields}{f'; {why}' if why else ''}{outside}"
+    return f"{len(used_frames)} of {total} frames, {width} x {height} px{fields}{f'; {why}' if why else ''}{outside}"
 
 
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:

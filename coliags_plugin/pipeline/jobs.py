@@ -109,12 +109,12 @@ class StageJobs:
 
     def _begin_submaps(self, shared: StageJob) -> list[StageJob]:
         """Jobs of the sub-maps of a segment that has poses, and of the segments that have waited for them."""
-        contexts, left = shared.context.submaps(), shared.size / _SHARED_WORK - shared.size
+        contexts, size = shared.context.submaps(), shared.size / _SHARED_WORK - shared.size
         frames = [context.submap.frames or 1 for context in contexts if context.submap]
         jobs = list[StageJob]()
         for context, count in zip(contexts, frames, strict=True):
             check_options(stages_of(context), self.record, self._overwrite)
-            jobs.append(StageJob(self, context, round(left * count / sum(frames))))
+            jobs.append(StageJob(self, context, round(size * count / sum(frames))))
         return [*(job for job in jobs if not job.is_done), *self._begin_segments(shared.context.posed)]
 
     def end(self, job: StageJob, error: ReportedError | None = None) -> list[StageJob]:
@@ -162,7 +162,7 @@ class StageJob(Job):
 
     @property
     def is_done(self) -> bool:
-        """Whether all stages are done."""
+        """True if all stages are done."""
         return all(self._jobs.record.is_done(stage.name) for stage in self.stages)
 
     def run_here(self) -> list[StageJob]:
@@ -193,7 +193,7 @@ class StageJob(Job):
         return " ".join([self.task.title, *(name.rpartition("/")[2] for name in begun)])
 
     def _states(self) -> dict[str, StageRecord]:
-        """Its stages, as far as they are recorded; else failed ones without a word."""
+        """Records of its stages; of those that are not begun, failed ones without a word."""
         record = self._jobs.record
         record.refresh()
         return {stage.name: record.stages.get(stage.name, StageRecord(state="failed")) for stage in self.stages}
@@ -253,7 +253,9 @@ class StageTask(Task):
             self.folder, self.source, settings, self.mask, self.data_format, device, segment=self.segment
         )
         if self.submap is not None:
-            context = next(one for one in context.submaps() if one.submap and one.submap.number == self.submap)
+            context = next(
+                inside for inside in context.submaps() if inside.submap and inside.submap.number == self.submap
+            )
         with locked(worker_lock(context.root, worker_name(context)), context.root, LOCK_SECONDS):
             run_stages(stages_of(context), Record.of(context.root, context.places))
 

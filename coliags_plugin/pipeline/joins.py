@@ -32,7 +32,7 @@ ModelKey = tuple[str, str]
 
 
 class SegmentJoin(BaseModel):
-    """What came out where the models of two segments were compared."""
+    """Result of comparing models of two segments."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
@@ -60,7 +60,7 @@ class SegmentJoin(BaseModel):
 
 
 def _is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether a matrix turns, scales and moves, and mirrors nothing."""
+    """True if a matrix turns, scales and moves, and mirrors nothing."""
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     if not (1e-9 < scale < 1e9 and np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0))):
@@ -97,12 +97,12 @@ def find_joins(out: Path, segments: Sequence[Segment]) -> list[SegmentJoin]:
     """Joins of every two neighbouring segments in the folder of a reconstruction."""
     scenes = [out / segment.name / "poses" for segment in segments]
     posed = [read_posed(scene) if scene.is_dir() else [] for scene in scenes]
-    found = list[SegmentJoin]()
+    places = list[SegmentJoin]()
     for (first, before), (second, after) in pairwise(zip(segments, posed, strict=True)):
         names, gap = (first.name, second.name), second.first - first.last - 1
         why = f"{gap} frames between them show nothing that can be followed"
-        found += joins(names, before, after) if gap < 0 else [_apart(names, why)]
-    return found
+        places += joins(names, before, after) if gap < 0 else [_apart(names, why)]
+    return places
 
 
 def joins(segments: tuple[str, str], first: list[PosedFrames], second: list[PosedFrames]) -> list[SegmentJoin]:

@@ -151,7 +151,7 @@ def held_out_text(submaps: Sequence[SubmapContents]) -> str:
 
 
 def remarks(contents: Contents) -> list[str]:
-    """What limits the result, and what to do: failures, suspect poses, warnings; the findings of checks are counted."""
+    """Limits of the result, and what to do: failures, suspect poses, warnings; the findings of checks are counted."""
     failures, warnings = list[str](), list[str]()
     for name, stage in contents.stages.items():
         if stage.state == "failed":
@@ -267,7 +267,9 @@ def _views(contents: Contents) -> list[Section]:
     from coliags_plugin.comparison.report.study import Study
     from coliags_plugin.comparison.report.views import view_section
 
-    by_psnr = sorted((one for one in contents.submaps if "psnr" in one.figures), key=lambda one: one.figures["psnr"])
+    by_psnr = sorted(
+        (submap for submap in contents.submaps if "psnr" in submap.figures), key=lambda submap: submap.figures["psnr"]
+    )
     shown = [submap.key for submap in (*by_psnr[: _SUBMAPS // 2], *by_psnr[-_SUBMAPS // 2 :])]
     runs = []
     for submap in contents.submaps:
@@ -283,8 +285,8 @@ def _views(contents: Contents) -> list[Section]:
         why = str(error).replace(f"{contents.folder}/", "").replace(str(contents.folder), contents.folder.name)
         return [Section("Held-out views", [Paragraph(why, hint=False)])]
     if section and len(by_psnr) > _SUBMAPS:
-        told = Paragraph(f"Of {len(by_psnr)} sub-maps, the {_SUBMAPS // 2} with the lowest and with the highest PSNR.")
-        return [replace(section[0], blocks=[told, *section[0].blocks])]
+        hint = Paragraph(f"Of {len(by_psnr)} sub-maps, the {_SUBMAPS // 2} with the lowest and with the highest PSNR.")
+        return [replace(section[0], blocks=[hint, *section[0].blocks])]
     return section
 
 

@@ -1,4 +1,4 @@
-"""From a video, a folder of images or a posed scene to mesh and report, in stages that a repeated call goes on with.
+"""Reconstruction of a video, a folder of images or a posed scene, in stages that a repeated call goes on with.
 
 A long video is cut into segments, which are reconstructed each by itself and joined.
 """
@@ -63,8 +63,8 @@ def reconstruct(
     """
     refuse_overlap(out, source)
     if mask is not None and not mask.is_file():
-        seen = f"{mask} is a folder" if mask.is_dir() else f"no file {mask}"
-        raise InputError(seen, "an image, black where pixels are ignored", "Check `mask`")
+        problem = f"{mask} is a folder" if mask.is_dir() else f"no file {mask}"
+        raise InputError(problem, "an image, black where pixels are ignored", "Check `mask`")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
     if data_format is None:
         source, sfm = opened_recording(source, settings.sfm)
@@ -104,8 +104,8 @@ def reconstruct(
         failure = next(error for context, error in jobs.failures if context.folder == context.out)
         if len(segments) == 1:
             raise failure
-        seen = f"none of {len(segments)} segments of {source} could be reconstructed: {str(failure).rstrip('.')}"
-        raise InputError(seen, do=f"{out / PAGE_FILE} shows why")
+        problem = f"none of {len(segments)} segments of {source} could be reconstructed: {str(failure).rstrip('.')}"
+        raise InputError(problem, do=f"{out / PAGE_FILE} shows why")
     return record
 
 
@@ -147,9 +147,9 @@ def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | 
         "frames": settings.frames != FrameSettings(),
         "sfm": settings.sfm != SfmSettings(),
     }
-    if given := ", ".join(name for name, is_given in unused.items() if is_given):
+    if names := ", ".join(name for name, is_given in unused.items() if is_given):
         raise InputError(
-            f"{source} has poses, and settings of {given} are given",
+            f"{source} has poses, and settings of {names} are given",
             "these for a video or a folder of images alone",
             "Leave them out, or give the folder of the scene's images, for their poses to be estimated",
         )

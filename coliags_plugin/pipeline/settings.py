@@ -18,7 +18,7 @@ Pixels = Annotated[int, Field(gt=0)]
 
 
 class FrameSettings(Settings):
-    """Which frames of a video are used."""
+    """Choice of the frames of a video that are used."""
 
     first: int = Field(default=0, ge=0, description="Number of the first frame in the video, counted from 0.")
     last: int | None = Field(default=None, ge=0, description="Number of the last frame; None: of the video.")
@@ -55,10 +55,10 @@ class FrameSettings(Settings):
 
 
 class ReconstructionSettings(Settings):
-    """What is done with a video, stage by stage."""
+    """Settings of all stages."""
 
     frames: FrameSettings = FrameSettings()
-    """Which frames are used."""
+    """Frames that are used."""
     sfm: SfmSettings = SfmSettings()
     """Structure from motion, with the camera."""
     diameter: float | None = Field(
@@ -91,5 +91,5 @@ class ReconstructionSettings(Settings):
     mesh: MeshSettings = MeshSettings()
     """Fusion of the rendered depth into a mesh."""
     coverage: CoverageSettings = CoverageSettings()
-    """What counts as seen."""
+    """Coverage: limits within which wall counts as seen."""
     seed: int = Field(default=0, ge=0, description="Seed of training.")

@@ -54,7 +54,7 @@ SHARED = ("survey", "frames", "poses", "joins")
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What a stage has made, and how far it is."""
+    """Result of a stage, and its state."""
 
     summary: str = ""  # what came out, or why it failed, in one line
     files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to its folder, and what each is
@@ -140,7 +140,7 @@ class Record:
         return [name for name in self.stages if name.startswith(prefix) and name.rpartition("/")[2] not in SHARED]
 
     def is_done(self, name: str) -> bool:
-        """Whether a stage is done."""
+        """True if a stage is done."""
         return name in self.stages and self.stages[name].state == "done"
 
     def put(self, name: str, stage: StageRecord) -> None:
@@ -207,7 +207,7 @@ def _read(file: Path) -> dict[str, StageRecord]:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a file is there before the record is: a lock, or what a kill has left of writing the record."""
+    """True if a file is there before the record is: a lock, or what a kill has left of writing the record."""
     return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")
 
 

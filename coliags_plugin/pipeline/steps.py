@@ -101,8 +101,8 @@ class StageContext:
     def submaps(self) -> list[StageContext]:
         """Contexts of the models that are reconstructed, the largest first, as far as poses are there."""
         is_atlas = self.data_format in (None, "colmap") and self.posed.is_dir()
-        found = find_submaps(self.posed, self.settings.least_submap) if is_atlas else [Submap()]
-        return [replace(self, submap=submap) for submap in found]
+        models = find_submaps(self.posed, self.settings.least_submap) if is_atlas else [Submap()]
+        return [replace(self, submap=submap) for submap in models]
 
     @property
     def out(self) -> Path:
@@ -255,8 +255,8 @@ def make_frames(context: StageContext) -> StageRecord:
     span = Span(settings.first, settings.last, settings.deinterlace)
     source, survey = frame_source(context.source, span), Survey.read(context.root).part(span.first, span.last)
     summary = write_frames(source, survey, context.frames, settings, context.mask, context.progress)
-    made = {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}
-    return StageRecord(summary, made)
+    files = {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}
+    return StageRecord(summary, files)
 
 
 def make_poses(context: StageContext) -> StageRecord:
@@ -295,8 +295,8 @@ def make_poses(context: StageContext) -> StageRecord:
         if units[0] == "unknown"
         else f"unit mm, by a diameter of {settings.diameter:g} mm; median depth {depth:.3g} mm"
     )
-    made = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
-    return StageRecord(f"{atlas.summary()}; {unit}", made, warnings)
+    files = {"poses": "scene in COLMAP's layout: images, poses, points", f"poses/{RIBBON_FILE}": "frames with a pose"}
+    return StageRecord(f"{atlas.summary()}; {unit}", files, warnings)
 
 
 def check_data(context: StageContext) -> StageRecord:
@@ -311,9 +311,9 @@ def check_data(context: StageContext) -> StageRecord:
     )
     write_html(check_page(check), context.folder / "check.html")
     write_json(context.folder / "check.json", check.as_json())
-    made = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
+    files = {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
     warnings = [str(finding) for finding in check.findings]
-    return StageRecord(verdict(check), made, warnings, {"frames": len(scene.video)})
+    return StageRecord(verdict(check), files, warnings, {"frames": len(scene.video)})
 
 
 def estimate_depth(context: StageContext) -> StageRecord:
@@ -324,14 +324,14 @@ def estimate_depth(context: StageContext) -> StageRecord:
     estimated = estimate_scene(
         context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
     )
-    made = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
-    return StageRecord(estimated.summary, made, estimated.warnings)
+    files = {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"}
+    return StageRecord(estimated.summary, files, estimated.warnings)
 
 
 def method_for(context: StageContext) -> str:
     """Name of the method to train: the one given, or else by what is known of the depth."""
-    given = context.settings.method
-    return given or ("coliags-in-vivo" if context.estimates_depth or context.has_estimates else "coliags")
+    chosen = context.settings.method
+    return chosen or ("coliags-in-vivo" if context.estimates_depth or context.has_estimates else "coliags")
 
 
 def steps_for(context: StageContext) -> int:
@@ -389,10 +389,10 @@ def evaluate(context: StageContext) -> StageRecord:
     figures = {name: result.sets[result.main_set].mean(name) for name in ("psnr", "ssim", "psnr_pose_refined")}
     figures = {name: value for name, value in figures.items() if value is not None}
     shown = ", ".join(f"{name.upper()} {figures[name]:.4g}" for name in ("psnr", "ssim") if name in figures)
-    made = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
+    files = {str(folder.relative_to(context.folder)): "metrics and rendered frames"}
     figures |= {"held_out": sum(len(frames) for frames in trained.scene.test_sets.values())}
     warnings = [f"held-out frames: {part.transparency_warning}" for part in result.sets.values() if part.blank]
-    return StageRecord(f"held-out frames: {shown}", made, warnings, figures=figures | _training_psnr(trained))
+    return StageRecord(f"held-out frames: {shown}", files, warnings, figures=figures | _training_psnr(trained))
 
 
 def _training_psnr(trained: TrainedRun) -> dict[str, float]:
@@ -414,12 +414,12 @@ def mesh(context: StageContext) -> StageRecord:
     from coliags_plugin.surface.meshing.fusion import mesh_run
 
     trained = load_trained(context.run, context.device, context.scene)
-    made = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
-    area = made.mesh.areas.sum()
+    fused = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
+    area = fused.mesh.areas.sum()
     shown = area_text(area, trained.scene.is_metric)
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
-    figures = {"triangles": len(made.mesh), "area": float(area), "unit": trained.scene.length_unit}
-    return StageRecord(f"{len(made.mesh):,} triangles, {shown}", files, figures=figures)
+    figures = {"triangles": len(fused.mesh), "area": float(area), "unit": trained.scene.length_unit}
+    return StageRecord(f"{len(fused.mesh):,} triangles, {shown}", files, figures=figures)
 
 
 def coverage(context: StageContext) -> StageRecord:
@@ -429,15 +429,15 @@ def coverage(context: StageContext) -> StageRecord:
 
     wall, folder = read_mesh(context.run / "mesh" / "mesh.ply"), context.run / "coverage"
     try:
-        made = measure_scene(context.open_posed(), wall, folder, context.settings.coverage, overwrite=True)
+        measured = measure_scene(context.open_posed(), wall, folder, context.settings.coverage, overwrite=True)
     except NotWritableError:
         raise
     except InputError as error:
         return StageRecord(f"left out: {error}", warnings=[f"no coverage: {error}"])
     what = "what was seen and missed, for research use only"
-    values = made.values
+    values = measured.values
     return StageRecord(
-        "; ".join(f"{fact.name}: {fact.text}" for fact in made.facts),
+        "; ".join(f"{fact.name}: {fact.text}" for fact in measured.facts),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
         figures={name: values[name] for name in ("seen", "seen_area") if values[name] is not None},
     )

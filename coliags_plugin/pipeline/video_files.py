@@ -122,19 +122,19 @@ class VideoFile:
             ) from None
         with container:
             if not (videos := _videos(container)):
-                held = ", ".join(each.type for each in container.streams) or "none"
-                raise InputError(f"{self.path} has no video among its streams ({held})", "a video", "Check the path")
-            known = [each for each in videos if each.codec_context is not None]
-            if not known:
+                kinds = ", ".join(each.type for each in container.streams) or "none"
+                raise InputError(f"{self.path} has no video among its streams ({kinds})", "a video", "Check the path")
+            decodable = [each for each in videos if each.codec_context is not None]
+            if not decodable:
                 raise InputError(f"FFmpeg does not know the codec of {self.path}", "another one", AS_IMAGES)
-            yield container, max(known, key=lambda stream: stream.width * stream.height)
+            yield container, max(decodable, key=lambda stream: stream.width * stream.height)
 
     @cached_property
     def aspect(self) -> Fraction:
         """Width of a pixel as stored over its height; 1 where the file does not say, in earnest."""
         with self.opened() as (_, stream):
-            found = stream.sample_aspect_ratio or Fraction(1)
-            return found if 1 / _STRETCHED <= found <= _STRETCHED else Fraction(1)
+            ratio = stream.sample_aspect_ratio or Fraction(1)
+            return ratio if 1 / _STRETCHED <= ratio <= _STRETCHED else Fraction(1)
 
     @property
     def index(self) -> VideoIndex | None:
@@ -181,36 +181,36 @@ class VideoFile:
         before ``stop`` that it lacks. ``shown`` is applied to images and flags as they are stored, before pixels become
         square and images are turned as the file says.
         """
-        done, concealed = 0, 0
+        count, concealed = 0, 0
         for number, frame in self._numbered(first):
             image, behind = self._picture(frame, shown), min(number, stop)
-            if behind > first + done:
-                log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + done, number - 1)
-            while behind > first + done:
+            if behind > first + count:
+                log.warning("%s: frames %d to %d cannot be decoded: black here", self.path, first + count, number - 1)
+            while behind > first + count:
                 yield np.zeros(image.shape, np.uint8), False
-                done += 1
+                count += 1
             if number < stop:
                 concealed += frame.is_corrupt
                 yield image, frame.interlaced_frame
-                done += 1
+                count += 1
             if number + 1 >= stop:
                 break
         if concealed:
             log.warning("%s: damaged frames, %d, are shown as far as they can be decoded", self.path, concealed)
-        if is_filled and done < stop - first:
-            shape = image.shape if done else next(self.frames(0, 1, False, shown))[0].shape
-            yield from ((np.zeros(shape, np.uint8), False) for _ in range(first + done, stop))
-        elif done == 0 and first > 0:
+        if is_filled and count < stop - first:
+            shape = image.shape if count else next(self.frames(0, 1, False, shown))[0].shape
+            yield from ((np.zeros(shape, np.uint8), False) for _ in range(first + count, stop))
+        elif count == 0 and first > 0:
             raise InputError(f"{self.path} has no frame {first}", f"one of about {self.expected} frames")
-        elif done == 0:
+        elif count == 0:
             raise InputError(f"no frame of {self.path} can be decoded", "a video whose codec FFmpeg has", AS_IMAGES)
         if (index := self.index) is None:
             return
-        if done < _COMPLETE * (stated := min(stop, index.stated) - first):
-            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, done, stated)
-        elif first == 0 and done < min(stop, _COMPLETE * index.room):
+        if count < _COMPLETE * (stated := min(stop, index.stated) - first):
+            log.warning("%s: %d frames, though its header says %d: is it complete?", self.path, count, stated)
+        elif first == 0 and count < min(stop, _COMPLETE * index.room):
             what = "%s: %d frames, though there is time for %d: some are missing in between"
-            log.warning(what, self.path, done, index.room)
+            log.warning(what, self.path, count, index.room)
 
     def _picture(
         self, frame: VideoFrame, shown: Callable[[np.ndarray, bool], np.ndarray]
@@ -221,8 +221,8 @@ class VideoFile:
         try:
             image: Any = frame.to_ndarray(format="rgb24", interpolation="BICUBIC", threads=1)
         except av.FFmpegError as error:
-            seen = f"FFmpeg does not convert {frame.format.name} with the colour matrix {frame.colorspace}"
-            raise InputError(f"{self.path}: {seen}: {error.strerror}", "BT.601 or BT.709", AS_IMAGES) from None
+            problem = f"FFmpeg does not convert {frame.format.name} with the colour matrix {frame.colorspace}"
+            raise InputError(f"{self.path}: {problem}: {error.strerror}", "BT.601 or BT.709", AS_IMAGES) from None
         image = shown(image, frame.interlaced_frame)
         height, width = image.shape[:2]
         if (square := round(width * self.aspect)) != width:
@@ -259,10 +259,10 @@ class VideoFile:
             return first, iter(())
         if index is None or (key := index.key_before(first)) is None:
             return 0, self.decoded()
-        found, time = self.decoded(key), int(index.times[first])
-        for frame in found:
+        frames, time = self.decoded(key), int(index.times[first])
+        for frame in frames:
             if frame is None or frame.pts == time:
-                return first, chain([frame], found)
+                return first, chain([frame], frames)
             if frame.pts is None or frame.pts > time:
                 break
         return 0, self.decoded()

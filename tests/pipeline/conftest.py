@@ -35,7 +35,7 @@ class Killed(BaseException):
 
 
 @pytest.fixture
-def done(monkeypatch):
+def calls(monkeypatch):
     """Names of the stages that were run, behind the folder of the sub-map; all but the first, quick one are faked."""
     names: list[str] = []
 

@@ -113,11 +113,11 @@ def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
     shutil.copytree(poses / "images", images)
     write_image(images / "lost.png", np.zeros((32, 40, 3), np.uint8))
     write_frames(folder, [{"frame": first + index, "name": name, "blurred": False} for index, name in enumerate(names)])
-    for own in ("", "submap-1/"):
-        file = folder / own / SCENE_FILE
+    for place in ("", "submap-1/"):
+        file = folder / place / SCENE_FILE
         file.parent.mkdir(parents=True)
-        file.write_text(f"<title>{folder.name} {own}</title>" + "x" * 2000)
-        write_json(folder / own / "depth" / "transforms.json", {"frames": []})
+        file.write_text(f"<title>{folder.name} {place}</title>" + "x" * 2000)
+        write_json(folder / place / "depth" / "transforms.json", {"frames": []})
     for kind in ("recorded", "depth", "flattened light"):
         write_png(folder / FOLDER / "003" / f"{kind}.png", np.full((4, 4, 3), len(kind), np.uint8))
     evaluation = folder / "run" / "eval" / "paper"
@@ -128,15 +128,15 @@ def write_segment(folder: Path, first: int = 0) -> dict[str, StageRecord]:
     return three_submaps()
 
 
-def write_frames(folder: Path, kept) -> None:
-    write_json(folder / "frames" / "frames.json", {"kept": kept, "dropped": []})
+def write_frames(folder: Path, frames) -> None:
+    write_json(folder / "frames" / "frames.json", {"kept": frames, "dropped": []})
 
 
 def change_video(out: Path, joins=None, **changes) -> None:
     """Other joins, or figures of the survey, in the record of a long video."""
     record = Record.of(out)
-    found = {**record.stages["survey"].figures, **changes}
-    record.stages["survey"] = done(**found)
+    figures = {**record.stages["survey"].figures, **changes}
+    record.stages["survey"] = done(**figures)
     record.stages["joins"] = done(joins=record.stages["joins"].figures["joins"] if joins is None else joins)
     record.write()
 
@@ -146,12 +146,12 @@ def write_long(out: Path, **changes) -> Path:
     stages = {"survey": done(**video()), "joins": done(joins=JOINS)}
     for name, (first, _) in SPANS.items():
         if name != "segment-002":
-            own = write_segment(out / name, first)
+            stages_of = write_segment(out / name, first)
             (out / name / "index.html").write_text("the page of a segment")
         else:
             (out / name).mkdir()
-            own = {"frames": done(), "poses": failed(FAILURE)}
-        for key, stage in own.items():
+            stages_of = {"frames": done(), "poses": failed(FAILURE)}
+        for key, stage in stages_of.items():
             stages[f"{name}/{key}"] = replace(
                 stage, files={f"{name}/{path}": what for path, what in stage.files.items()}
             )

@@ -21,36 +21,36 @@ from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, s
 def test_every_sub_map_is_exported_with_its_trajectory(out, tmp_path):
     manifest = export_atlas(out, tmp_path / "export")
     assert json.loads((tmp_path / "export" / "manifest.json").read_text()) == manifest
-    assert {one["name"]: one["frames"] for one in manifest["submaps"]} == {
-        name: [*own] for name, own in SUBMAPS.items()
+    assert {entry["name"]: entry["frames"] for entry in manifest["submaps"]} == {
+        name: [*folder] for name, folder in SUBMAPS.items()
     }
     assert (manifest["source"], manifest["rate"], manifest["timestamps"]) == (["withdrawal.mp4"], RATE, "s")
-    for one in manifest["submaps"]:
-        segment, number = one["name"].split("/")
-        own = tmp_path / "export" / one["folder"]
-        assert one["folder"] == f"{segment}-{number}"
-        path, model = tum.read(own / "trajectory.txt"), colmap.read(out / segment / "poses" / "sparse" / number)
-        np.testing.assert_array_equal(path.timestamps, np.array(one["frames"]) / RATE)
+    for entry in manifest["submaps"]:
+        segment, number = entry["name"].split("/")
+        folder = tmp_path / "export" / entry["folder"]
+        assert entry["folder"] == f"{segment}-{number}"
+        path, model = tum.read(folder / "trajectory.txt"), colmap.read(out / segment / "poses" / "sparse" / number)
+        np.testing.assert_array_equal(path.timestamps, np.array(entry["frames"]) / RATE)
         np.testing.assert_allclose(path.camera_to_world, model.camera_to_world, atol=1e-9)
-        scene = open_scene(own / "colmap", "colmap", ["initial_points=none"])
-        assert len(scene.video) == len(one["frames"]) == len(list((own / "colmap" / "images").iterdir()))
-        assert one["nerfstudio"] == (number != "2") == (own / "nerfstudio" / "transforms.json").is_file()
+        scene = open_scene(folder / "colmap", "colmap", ["initial_points=none"])
+        assert len(scene.video) == len(entry["frames"]) == len(list((folder / "colmap" / "images").iterdir()))
+        assert entry["nerfstudio"] == (number != "2") == (folder / "nerfstudio" / "transforms.json").is_file()
 
 
 def test_joined_sub_maps_have_the_transform_to_the_first_one(out, tmp_path):
     manifest = export_atlas(out, tmp_path / "export")
-    by_name = {one["name"]: one for one in manifest["submaps"]}
-    joined = {name for name, one in by_name.items() if one["joined_to"] != name}
+    by_name = {entry["name"]: entry for entry in manifest["submaps"]}
+    joined = {name for name, entry in by_name.items() if entry["joined_to"] != name}
     assert joined == {"segment-001/0"}
     assert by_name["segment-001/0"]["joined_to"] == "segment-000/2"
     np.testing.assert_allclose(by_name["segment-001/0"]["to_joined"], similarity(1))
     np.testing.assert_array_equal(by_name["segment-000/2"]["to_joined"], np.eye(4))
-    assert [one["reason"] for one in manifest["joins"]] == [one["reason"] for one in JOINS]
+    assert [entry["reason"] for entry in manifest["joins"]] == [entry["reason"] for entry in JOINS]
 
 
 def test_a_short_video_is_exported_likewise(short, tmp_path):
     manifest = export_atlas(short, tmp_path / "export")
-    assert [(one["name"], one["folder"], one["nerfstudio"]) for one in manifest["submaps"]] == [
+    assert [(entry["name"], entry["folder"], entry["nerfstudio"]) for entry in manifest["submaps"]] == [
         (f"sub-map {number}", f"submap-{number}", number != 2) for number in range(3)
     ]
     assert manifest["joins"] == [] and manifest["size"] == [40, 32]
@@ -67,9 +67,9 @@ def test_timestamps_are_those_of_frames_where_the_rate_varies(out, tmp_path):
     times = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.3, 100))
     replace(Survey.read(out), times=times).write(out)
     manifest = export_atlas(out, tmp_path / "export")
-    for one in manifest["submaps"]:
-        path = tum.read(tmp_path / "export" / one["folder"] / "trajectory.txt")
-        np.testing.assert_array_equal(path.timestamps, times[one["frames"]])
+    for entry in manifest["submaps"]:
+        path = tum.read(tmp_path / "export" / entry["folder"] / "trajectory.txt")
+        np.testing.assert_array_equal(path.timestamps, times[entry["frames"]])
 
 
 @pytest.mark.parametrize(("link", "other_disk"), [(False, False), (True, False), (True, True)])
@@ -81,9 +81,9 @@ def test_linked_images_take_no_space_on_the_same_disk(out, tmp_path, monkeypatch
         monkeypatch.setattr("os.link", refused)
     export_atlas(out, tmp_path / "export", link=link)
     for file, is_linked in (("images/003.png", link and not other_disk), ("sparse/0/images.bin", False)):
-        one, other = out / "segment-000/poses" / file, tmp_path / "export/segment-000-0/colmap" / file
-        assert one.read_bytes() == other.read_bytes()
-        assert one.samefile(other) is is_linked
+        entry, other = out / "segment-000/poses" / file, tmp_path / "export/segment-000-0/colmap" / file
+        assert entry.read_bytes() == other.read_bytes()
+        assert entry.samefile(other) is is_linked
 
 
 def test_what_cannot_be_exported_is_refused(out, tmp_path):
@@ -111,9 +111,9 @@ def test_the_command_names_the_sub_maps(out, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["poses", "export", str(out), "--output", str(tmp_path / "export")])
     assert stopped.value.code == 0
-    told = capsys.readouterr().out
-    assert "segment-001/0: 14 frames, unit unknown, joined to segment-000/2" in told
-    assert "segment-000/2: 5 frames, unit unknown, no dense depth" in told
+    printed = capsys.readouterr().out
+    assert "segment-001/0: 14 frames, unit unknown, joined to segment-000/2" in printed
+    assert "segment-000/2: 5 frames, unit unknown, no dense depth" in printed
     with pytest.raises(SystemExit) as stopped:
         main(["poses", "export", str(tmp_path), "--output", str(tmp_path / "other")])
     assert stopped.value.code == 2

@@ -69,18 +69,18 @@ def test_the_sharpest_of_every_few_or_of_every_stretch_of_time_is_used(settings,
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60), st.integers(1, 30))
 def test_every_frame_is_kept_or_dropped_and_one_of_every_few_is_kept(values, every):
-    kept, dropped = sharpest_frames(values, FrameSettings(every=every))
-    assert sorted([*kept, *dropped]) == list(range(len(values)))
-    assert kept == sorted(kept) and len(kept) <= -(-len(values) // every)
+    used, dropped = sharpest_frames(values, FrameSettings(every=every))
+    assert sorted([*used, *dropped]) == list(range(len(values)))
+    assert used == sorted(used) and len(used) <= -(-len(values) // every)
 
 
 def test_empty_frames_are_dropped_and_those_less_sharp_than_their_neighbours_are_blurred():
     values = [0.5] * 20
     values[4], values[5], values[9] = 0.1, 0.2, 0.0
-    kept, dropped = sharpest_frames(values, FrameSettings())
-    assert dropped == {9: EMPTY} and kept == [index for index in range(20) if index != 9]
-    assert blurred_frames(kept, values, FrameSettings()) == {4, 5}
-    assert not blurred_frames(kept, values, FrameSettings(least_sharpness=0.0))
+    used, dropped = sharpest_frames(values, FrameSettings())
+    assert dropped == {9: EMPTY} and used == [index for index in range(20) if index != 9]
+    assert blurred_frames(used, values, FrameSettings()) == {4, 5}
+    assert not blurred_frames(used, values, FrameSettings(least_sharpness=0.0))
     smooth_wall = blurred_frames(range(120), [1.0] * 60 + [0.2] * 60, FrameSettings())
     assert len(smooth_wall) < 12 and smooth_wall <= set(range(60, 70))
 
@@ -203,7 +203,7 @@ def test_one_field_is_interpolated_along_columns(image):
 
 @pytest.mark.thorough
 def test_one_field_is_nearer_to_the_frame_of_its_moment_and_is_followed_as_that_is():
-    """On a camera that shakes: where its motion is even, combs move along with it and are followed, to wrong places."""
+    """Camera that shakes: where its motion is even, combs move along with it and are followed, to wrong places."""
     places = np.clip(80 + np.cumsum(np.random.default_rng(0).integers(-8, 9, 120)), 0, 159)
     fields = film(places)
     true, interlaced = fields[::2], woven(fields)
@@ -261,8 +261,8 @@ def test_it_is_read_so_where_it_looks_so_and_all_else_is_as_it_is(tmp_path, kind
 
 
 @pytest.mark.thorough
-def test_a_long_video_is_found_interlaced_once(tmp_path, done, workers):
-    """Of which the last segment would not look interlaced by itself."""
+def test_a_long_video_is_found_interlaced_once(tmp_path, calls, workers):
+    """The last segment would not look interlaced by itself."""
     file = tmp_path / "long.mp4"
     write_video([*INTERLACED, *FIELDS[:120]], file, 25.0)
     executor = workers()
@@ -293,12 +293,12 @@ def test_frames_are_written_without_loss_and_what_is_dropped_is_recorded(tmp_pat
     frames = [*FILM[:5], blurred(FILM[5]), *FILM[6:10], FILM[9], FILM[9], np.zeros_like(FILM[0]), *FILM[10:]]
     out = tmp_path / "frames"
     summary = write(frame_source(write_images(tmp_path / "film", frames)), out)
-    kept, dropped = written(out)
+    used, dropped = written(out)
     assert dropped == {10: RESTING, 11: RESTING, 12: EMPTY}
-    assert kept == [index for index in range(len(frames)) if index not in dropped]
+    assert used == [index for index in range(len(frames)) if index not in dropped]
     assert read_blurred(out) == {"5"} and read_lens_mask(out) is None
-    assert sorted(path.name for path in (out / "images").iterdir()) == sorted(f"{index}.png" for index in kept)
-    for index in kept:
+    assert sorted(path.name for path in (out / "images").iterdir()) == sorted(f"{index}.png" for index in used)
+    for index in used:
         np.testing.assert_array_equal(read_rgb(out / "images" / f"{index}.png"), frames[index])
     assert summary.startswith(f"20 of 23 frames, {WIDTH} x {HEIGHT} px; 1 blurred, of use for poses alone, 1 black")
 

@@ -35,11 +35,11 @@ def parts(executor):
 
 
 @pytest.fixture
-def posed(done, monkeypatch):
+def posed(calls, monkeypatch):
     """Poses in three models, two of which are reconstructed."""
 
     def poses(context):
-        done.append("make_poses")
+        calls.append("make_poses")
         write_atlas(context.posed)
         return StageRecord("posed")
 
@@ -47,24 +47,24 @@ def posed(done, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, workers, done):
+def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, workers, calls):
     cp.reconstruct(video, tmp_path / "alone")
-    alone = list(done)
-    done.clear()
+    alone = list(calls)
+    calls.clear()
     executor = workers()
     record = cp.reconstruct(video, tmp_path / "out", jobs=2)
-    assert parts(executor) == [None, 0, 1] and done == alone
+    assert parts(executor) == [None, 0, 1] and calls == alone
     assert told(tmp_path / "out") == told(tmp_path / "alone") and list(record.stages) == list(told(tmp_path / "alone"))
     assert (tmp_path / "out" / PAGE_FILE).is_file()
     executor = workers()
     cp.reconstruct(video, tmp_path / "out", jobs=2)
     assert parts(executor) == [], "what is done is not done again"
     cp.reconstruct(video, tmp_path / "out")
-    assert done == alone
+    assert calls == alone
 
 
 @pytest.mark.thorough
-def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(done, atlas, tmp_path, workers, caplog):
+def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(calls, atlas, tmp_path, workers, caplog):
     died = TaskOutcome("died", "the process was ended by SIGKILL")
     executor = workers(died)
     cp.reconstruct(atlas, tmp_path / "out", jobs=1)
@@ -94,7 +94,7 @@ def test_the_stage_that_a_worker_is_at_is_told(tmp_path):
 
 @pytest.mark.thorough
 def test_workers_are_processes_and_one_that_is_killed_is_replaced(atlas, tmp_path):
-    """On the real stages, of which the check of the data is done and depth cannot be: its one point says nothing."""
+    """Real stages: the check of the data is done, and depth cannot be, as its one point says nothing."""
     code = "from coliags_plugin.cli import main; main()"
     argv = ["reconstruct", str(atlas), "--output", str(tmp_path / "out"), "--jobs", "2"]
     with (tmp_path / "told.txt").open("w") as messages:

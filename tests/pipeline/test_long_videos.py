@@ -61,8 +61,8 @@ def test_a_video_is_cut_where_nothing_is_seen_for_long_and_where_least_is_follow
     assert [(each.first, each.last) for each in skipped] == [(300, 349)]
     half = OVERLAP // 2
     # The middle half of 350 to 999 has frame 500 in it, where least is followed.
-    found = [(each.first, each.last) for each in segments]
-    assert found == [(0, 299), (350, 499 + half), (500 - half, 999)] or segments[0].last == 299
+    places = [(each.first, each.last) for each in segments]
+    assert places == [(0, 299), (350, 499 + half), (500 - half, 999)] or segments[0].last == 299
     assert segments[1].last - segments[2].first + 1 == OVERLAP
 
 
@@ -115,15 +115,15 @@ def posed(count, transform=None, noise=0.0, model="sparse/0", first=0):
 def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
     other = (0.4, Rotation.from_rotvec([0.3, -1.0, 2.0]), np.array([5.0, -7.0, 1.0]))
     first, second = posed(20), posed(30, other, first=12)
-    (found,) = joins(BOTH, [posed(4, model="sparse/1", first=90), first], [second])
-    assert (found.reason, found.frames, found.models) == ("", 8, ("sparse/0", "sparse/0"))
+    (join,) = joins(BOTH, [posed(4, model="sparse/1", first=90), first], [second])
+    assert (join.reason, join.frames, join.models) == ("", 8, ("sparse/0", "sparse/0"))
     for name in ("frame_000012", "frame_000019"):
-        place = np.array(found.transform) @ second.c2w[name][:, 3]
+        place = np.array(join.transform) @ second.c2w[name][:, 3]
         np.testing.assert_allclose(place, first.c2w[name][:, 3], atol=1e-9)
     assert (
-        found.joined
-        and found.rotation_deg == pytest.approx(0.0, abs=1e-5)
-        and found.position == pytest.approx(0.0, abs=1e-9)
+        join.joined
+        and join.rotation_deg == pytest.approx(0.0, abs=1e-5)
+        and join.position == pytest.approx(0.0, abs=1e-9)
     )
     assert "3 frames have a pose on both sides" in joins(BOTH, [posed(15)], [posed(9, other, first=12)])[0].reason
     assert "do not agree" in joins(BOTH, [first], [posed(30, other, 20.0, first=12)])[0].reason
@@ -135,14 +135,14 @@ def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
 
 
 @pytest.fixture
-def long_video(done, tmp_path, monkeypatch):
-    """Of 150 frames, cut into segments of at most 60, each posed in three models, with a contact of 40 frames."""
+def long_video(calls, tmp_path, monkeypatch):
+    """Video of 150 frames, cut into segments of at most 60, each posed in three models, with a contact of 40 frames."""
     still = np.zeros((120, 160, 3), np.uint8)
     images = film(range(0, 110))
     write_video([*images[:70], *[still] * 40, *images[70:]], tmp_path / "long.mp4", 15.0)
 
     def poses(context):
-        done.append(f"{context.out.name}/make_poses")
+        calls.append(f"{context.out.name}/make_poses")
         write_atlas(context.posed)
         return StageRecord("31 of 50 images posed")
 
@@ -159,32 +159,32 @@ OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharp
 
 @pytest.mark.thorough
 def test_a_long_video_is_reconstructed_segment_by_segment_and_what_is_done_is_not_done_again(
-    long_video, tmp_path, workers, done
+    long_video, tmp_path, workers, calls
 ):
     executor = workers()
     record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    made = read_contents(tmp_path / "out", record)
-    names = [segment.span.name for segment in made.segments]
+    contents = read_contents(tmp_path / "out", record)
+    names = [segment.span.name for segment in contents.segments]
     plans = [task for task in executor.tasks if task.submap is None]
     assert len(plans) == len(names) >= 3 and executor.tasks[0].submap is None
     cameras = [json.loads(task.settings)["sfm"]["camera"] for task in plans]
     assert cameras[0]["params"] is None and all(camera["params"] is not None for camera in cameras[1:])
-    (skipped,) = made.video.skipped
+    (skipped,) = contents.video.skipped
     assert 70 <= skipped.first <= 72 and 105 <= skipped.last <= 110
-    for name, segment in zip(names, made.video.segments, strict=True):
-        kept = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
-        assert [frame["frame"] for frame in kept] == list(range(segment.first, segment.last + 1))
+    for name, segment in zip(names, contents.video.segments, strict=True):
+        frames = json.loads((tmp_path / "out" / name / "frames" / "frames.json").read_text())["kept"]
+        assert [frame["frame"] for frame in frames] == list(range(segment.first, segment.last + 1))
         assert record.stages[f"{name}/submap-1/report"].state == "done"
-    assert {each.segments for each in made.joins} == set(pairwise(names))
-    assert any("show nothing that can be followed" in each.reason for each in made.joins)
+    assert {each.segments for each in contents.joins} == set(pairwise(names))
+    assert any("show nothing that can be followed" in each.reason for each in contents.joins)
     assert list(Record.of(tmp_path / "out").stages) == list(record.stages)
     assert [path.relative_to(tmp_path) for path in tmp_path.rglob("reconstruction.json")] == [
         Path("out/reconstruction.json")
     ]
     assert "segment-000" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    before, executor = list(done), workers()
+    before, executor = list(calls), workers()
     cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    assert executor.tasks == [] and done == before
+    assert executor.tasks == [] and calls == before
     with pytest.raises(InputError, match="Choose another `output`"):
         cp.reconstruct(long_video, tmp_path / "out", settings={**OPTIONS, "frames.segment": 70})
     workers()
@@ -208,8 +208,8 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
 
     monkeypatch.setattr(steps, "make_poses", poses)
     workers(TaskOutcome("died", "the node died"))
-    given = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
-    assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *given) == 0
+    words = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
+    assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *words) == 0
     stages = Record.of(tmp_path / "out").stages
     states = [stages[f"{name}/poses"].state for name in segments_of(Record.of(tmp_path / "out"))]
     assert sorted(states)[0] == "done" and len(states) >= 3
@@ -238,8 +238,8 @@ def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path
 
     monkeypatch.setattr(steps, "make_poses", poses)
     executor = workers()
-    made = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    states = {name: made.stages[f"{name}/poses"].state for name in segments_of(made)}
+    record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
+    states = {name: record.stages[f"{name}/poses"].state for name in segments_of(record)}
     assert states == {name: "failed" if name == tried[0] else "done" for name in states}
     plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.submap is None]
     assert [params is None for params in plans] == [True, True, False]

@@ -54,9 +54,11 @@ def states_of(out):
 
 def test_sub_maps_have_the_numbers_of_the_video_in_its_order(out):
     contents = read_contents(out)
-    assert {one.name: [*one.names] for one in contents.submaps} == {name: [*own] for name, own in SUBMAPS.items()}
+    assert {submap.name: [*submap.names] for submap in contents.submaps} == {
+        name: [*frames] for name, frames in SUBMAPS.items()
+    }
     assert contents.submaps[4].names[40] == "014.png"
-    assert all(one.stages for one in contents.submaps)
+    assert all(submap.stages for submap in contents.submaps)
     assert list(contents.problems) == []
     assert (len(contents.posed), len(contents.used)) == (57, 58)
 
@@ -64,12 +66,12 @@ def test_sub_maps_have_the_numbers_of_the_video_in_its_order(out):
 def test_every_frame_has_one_state_and_the_earlier_segment_comes_first(out):
     states = states_of(out)
     expected = {frame: name for name, frames in reversed(SUBMAPS.items()) for frame in frames}
-    assert [one.what for one in states[:57]] == [expected[frame] for frame in range(57)]
-    assert {(one.what, one.why) for one in states[57:58]} == {("no pose", "blurred")}
-    assert {(one.what, one.why) for one in states[58:70]} == {("left out", "washed with water")}
-    assert {(one.what, one.why) for one in states[70:90]} == {("no pose", f"poses failed: {FAILURE}")}
-    assert {(one.what, one.why) for one in states[90:]} == {("left out", "in no segment")}
-    colors = [one.style for one in states]
+    assert [state.what for state in states[:57]] == [expected[frame] for frame in range(57)]
+    assert {(state.what, state.why) for state in states[57:58]} == {("no pose", "blurred")}
+    assert {(state.what, state.why) for state in states[58:70]} == {("left out", "washed with water")}
+    assert {(state.what, state.why) for state in states[70:90]} == {("no pose", f"poses failed: {FAILURE}")}
+    assert {(state.what, state.why) for state in states[90:]} == {("left out", "in no segment")}
+    colors = [state.style for state in states]
     assert all(colors[frame] != colors[frame + 1] for frame in (13, 25, 30, 39, 51))
     assert colors[57:] == [None] * 43
 
@@ -77,7 +79,7 @@ def test_every_frame_has_one_state_and_the_earlier_segment_comes_first(out):
 def test_frames_that_were_not_used_share_the_state_of_the_used_one_before(out):
     file = out / "segment-001" / "frames" / "frames.json"
     content = json.loads(file.read_text())
-    content["kept"] = [{**kept, "frame": 26 + 3 * index} for index, kept in enumerate(content["kept"][:10])]
+    content["kept"] = [{**frame, "frame": 26 + 3 * index} for index, frame in enumerate(content["kept"][:10])]
     atlas = {
         "frames": [f"{index:03d}.png" for index in range(10)],
         "joins": [],
@@ -87,8 +89,8 @@ def test_frames_that_were_not_used_share_the_state_of_the_used_one_before(out):
     write_json(file, content)
     write_json(out / "segment-001" / "poses" / "atlas.json", atlas)
     states = states_of(out)
-    assert [one.what for one in states[26:53]] == ["segment-000/2"] * 5 + ["segment-001/0"] * 22
-    assert {one.why for one in states[53:58]} == {"wet"}
+    assert [state.what for state in states[26:53]] == ["segment-000/2"] * 5 + ["segment-001/0"] * 22
+    assert {state.why for state in states[53:58]} == {"wet"}
     assert read_contents(out).submaps[-1].names.keys() == {*range(26, 53, 3)}
 
 
@@ -233,22 +235,22 @@ def test_frames_are_counted_from_where_the_survey_began(out):
     (out / "survey.npz").unlink()
     states = states_of(out)
     assert len(states) == 80
-    assert [one.what for one in states[6:20]] == ["segment-001/0"] * 14
+    assert [state.what for state in states[6:20]] == ["segment-001/0"] * 14
     assert states[0].why == "in no segment"
     assert 'class="curve"' not in page_of(out)
 
 
 def test_a_long_video_has_a_time_line_of_bounded_size(out):
     frames = 8000
-    kept = [{"frame": frame, "name": f"frame_{frame:06d}", "blurred": False} for frame in range(frames)]
+    used = [{"frame": frame, "name": f"frame_{frame:06d}", "blurred": False} for frame in range(frames)]
     atlas = {
-        "frames": [f"{one['name']}.png" for one in kept],
+        "frames": [f"{item['name']}.png" for item in used],
         "submaps": [{"model": "sparse/0", "unit": "unknown", "frames": [*range(0, frames, 2)]}],
         "joins": [],
         "lost": [{"frame": frame, "reason": "blurred"} for frame in range(1, frames, 2)],
     }
     write_json(out / "segment-000" / "poses" / "atlas.json", atlas)
-    write_frames(out / "segment-000", kept)
+    write_frames(out / "segment-000", used)
     change_video(out, frames=frames, segments=[span("segment-000", 0, frames - 1)], skipped=[], joins=[])
     contents = read_contents(out)
     assert len(timeline(contents, frame_states(contents)).values["ribbon"]) <= 2000
@@ -285,7 +287,7 @@ def garble(path):
 
 
 @pytest.mark.parametrize(
-    ("part", "spoil", "told"),
+    ("part", "spoil", "message"),
     [
         ("segment-000/poses/atlas.json", garble, "segment-000: poses/atlas.json"),
         ("segment-000/poses/atlas.json", remove, ""),
@@ -302,17 +304,17 @@ def garble(path):
         ("survey.npz", lambda path: write_survey(path.parent, 99), "a number for each of 100 frames"),
     ],
 )
-def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, short, part, spoil, told):
+def test_what_is_damaged_or_missing_is_said_and_the_rest_shown(out, short, part, spoil, message):
     spoil(out / part)
     text = page_of(out)
-    assert told in text
+    assert message in text
     assert "segment-001/0" in text
     assert ('class="curve"' in text) == (part != "survey.npz")
-    own = short / part.removeprefix("segment-000").lstrip("/")
-    if own != short and own.exists():
-        spoil(own)
+    in_short = short / part.removeprefix("segment-000").lstrip("/")
+    if in_short != short and in_short.exists():
+        spoil(in_short)
         text = page_of(short)
-        assert told.removeprefix("segment-000: ") in text and "24.00" in text
+        assert message.removeprefix("segment-000: ") in text and "24.00" in text
 
 
 def test_an_atlas_that_names_frames_elsewhere_is_not_used(out):
@@ -341,7 +343,7 @@ def test_a_video_without_any_pose_has_a_page_that_says_so(out, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"frames": 0}, "survey: frames"),
         ({"frames": 10**12}, "survey: frames"),
@@ -356,11 +358,11 @@ def test_a_video_without_any_pose_has_a_page_that_says_so(out, tmp_path):
         ({"joins": [join(["a", "b"], ["x", "y"], np.eye(3))]}, "joins: joins.0.transform"),
     ],
 )
-def test_a_damaged_record_is_refused(out, changes, told):
+def test_a_damaged_record_is_refused(out, changes, message):
     change_video(out, **changes)
     with pytest.raises(InputError, match=r"cannot read .*reconstruction\.json") as caught:
         write_page(out)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert not (out / "index.html").exists()
 
 
@@ -373,16 +375,16 @@ def test_sub_maps_are_brought_into_the_frame_of_the_first_they_are_joined_to(out
     """Worlds placed at random: joins between them give their places back, whichever way they are written."""
     worlds = {name: similarity(number) for number, name in enumerate(SUBMAPS)}
 
-    def between(one, other, *, known=True):
-        (a, i), (b, k) = one.split("/"), other.split("/")
-        transform = np.linalg.inv(worlds[one]) @ worlds[other] if known else None
-        return join([a, b], [f"sparse/{i}", f"sparse/{k}"], transform, "" if known else "apart")
+    def between(first, second, *, is_known=True):
+        (a, i), (b, k) = first.split("/"), second.split("/")
+        transform = np.linalg.inv(worlds[first]) @ worlds[second] if is_known else None
+        return join([a, b], [f"sparse/{i}", f"sparse/{k}"], transform, "" if is_known else "apart")
 
     joins = [
         between("segment-001/0", "segment-000/0"),
         between("segment-000/2", "segment-001/0"),
         between("segment-000/2", "segment-001/2"),
-        between("segment-000/1", "segment-001/1", known=False),
+        between("segment-000/1", "segment-001/1", is_known=False),
     ]
     change_video(out, joins=joins)
     placed = common_frames(read_contents(out))

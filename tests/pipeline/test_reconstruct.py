@@ -1,4 +1,4 @@
-"""From a video to the results, as a command and as a function."""
+"""Reconstruction of a video, as a command and as a function."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 _COVERAGE = steps.coverage
 
 
-def test_stages_of_a_video(done, video, tmp_path, capsys):
+def test_stages_of_a_video(calls, video, tmp_path, capsys):
     argv = ("reconstruct", video, "--output", tmp_path / "out", "--steps", 50, "--diameter", 40)
     assert commands.run(*argv) == 0
-    assert done == ["make_frames", *CAPTURE, *TRAINING]
+    assert calls == ["make_frames", *CAPTURE, *TRAINING]
     printed = capsys.readouterr().out
     assert printed.startswith("survey: 15 frames in 1 segment\nframes: 15 of 15 frames, 160 x 120 px")
     assert f"{tmp_path / 'out' / 'frames' / 'images'}: frames of use, PNG" in printed
     page = (tmp_path / "out" / "index.html").read_text()
     assert 'href="frames/images"' in page
     assert "15 of 15 frames, 160 x 120 px" in page
-    done.clear()
+    calls.clear()
     assert commands.run(*argv) == 0
-    assert done == []
+    assert calls == []
     # Of other options, those that no stage that is done depends on are taken.
     message = commands.refused(capsys, *argv[:-3], 60, *argv[-2:])
     assert "stage train was made with steps 50, not 60" in message
     assert commands.run(*argv[:-3], 60, *argv[-2:], "--overwrite") == 0
-    assert done == [*TRAINING]
+    assert calls == [*TRAINING]
 
 
-def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
+def test_so_many_frames_a_second_are_used(calls, tmp_path, capsys):
     video = tmp_path / "film.mp4"
     write_video(film(range(0, 120, 3)), video, 60.0)
     argv = ("reconstruct", video, "--output", tmp_path / "out", "--frames-per-second")
@@ -64,8 +64,10 @@ def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
     write_film(film(range(0, 120, 3)), tmp_path / "variable.mp4", times=times)
     variable = ("reconstruct", tmp_path / "variable.mp4", "--output", tmp_path / "variable", "--frames-per-second")
     assert commands.run(*variable, 10, "--from", 0.2, "--to", "0:04") == 0
-    kept = [frame["frame"] for frame in json.loads((tmp_path / "variable/frames/frames.json").read_text())["kept"]]
-    assert [frame // 5 for frame in kept[:2]] == [2, 3] and kept[2:] == list(range(20, 31))
+    frames_used = [
+        frame["frame"] for frame in json.loads((tmp_path / "variable/frames/frames.json").read_text())["kept"]
+    ]
+    assert [frame // 5 for frame in frames_used[:2]] == [2, 3] and frames_used[2:] == list(range(20, 31))
     images = write_images(tmp_path / "images", film(range(0, 60, 6)))
     assert "Expected one of them" in commands.refused(capsys, *argv, 30, "--every", 2)
     assert "a number between 0 and" in commands.refused(capsys, *argv, 0)
@@ -73,7 +75,7 @@ def test_so_many_frames_a_second_are_used(done, tmp_path, capsys):
     assert "does not tell how many frames a second" in message and "--every N" in message
 
 
-def test_another_video_is_noticed(done, video, tmp_path):
+def test_another_video_is_noticed(calls, video, tmp_path):
     cp.reconstruct(video, tmp_path / "out")
     write_video(film(range(0, 60, 4)), video, 15.0)
     with pytest.raises(InputError, match=r"stage survey was made with source.bytes \d+, not \d+"):
@@ -86,11 +88,11 @@ def test_hidden_files_make_no_other_video(tmp_path):
     assert identity_of(tmp_path / "images") == before
 
 
-def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, video, tmp_path):
+def test_a_scene_with_poses_needs_neither_frames_nor_poses(calls, video, tmp_path):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     cp.reconstruct(scene, tmp_path / "out")
     with_depth = any(path.name.startswith("depth") for path in scene.iterdir())
-    assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINING]
+    assert calls == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINING]
     with pytest.raises(InputError, match=r"stage check was made with source\.name tube, not None"):
         cp.reconstruct(video, tmp_path / "out")
     with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
@@ -98,7 +100,7 @@ def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, video, tmp_path
 
 
 def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_cannot_be_written(
-    done, tmp_path, monkeypatch, caplog
+    calls, tmp_path, monkeypatch, caplog
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     monkeypatch.setattr(steps, "coverage", _COVERAGE)
@@ -160,9 +162,9 @@ def test_a_tube_is_reconstructed_from_its_frames(tmp_path, monkeypatch):
     record = cp.reconstruct(folder, tmp_path / "out", settings=settings)
     assert {stage.state for stage in record.stages.values()} == {"done"}
     assert read_unit(tmp_path / "out" / "poses") == "unknown"
-    found = colmap.read(tmp_path / "out" / "poses" / "sparse" / "0")
+    estimate = colmap.read(tmp_path / "out" / "poses" / "sparse" / "0")
     truth = Trajectory(np.stack([frame.camera.camera_to_world.numpy() for frame in frames]))
-    assert align(found, truth, associate(found, truth, "index"), with_scale=True).ate.rmse < 0.1
+    assert align(estimate, truth, associate(estimate, truth, "index"), with_scale=True).ate.rmse < 0.1
     assert len(read_mesh(tmp_path / "out" / "run" / "mesh" / "mesh.ply")) > 100
     for stage in record.stages.values():
         for path in stage.files:

@@ -58,13 +58,13 @@ def test_the_video_is_found_and_its_camera_scaled_to_the_frames(recording, caplo
     )
 
 
-@pytest.mark.parametrize("given", ["video", "images"])
-def test_a_calibration_file_is_named_as_the_camera(recording, tmp_path, given):
-    source = recording / "Seq_001.MOV" if given == "video" else write_images(tmp_path / "frames", film(range(3)))
+@pytest.mark.parametrize("kind", ["video", "images"])
+def test_a_calibration_file_is_named_as_the_camera(recording, tmp_path, kind):
+    source = recording / "Seq_001.MOV" if kind == "video" else write_images(tmp_path / "frames", film(range(3)))
     named = CameraSettings(model=str(recording / "endoscope.xml"))
     assert opened_recording(source, SfmSettings()) == (source, SfmSettings())
-    found, settings = opened_recording(source, SfmSettings(camera=named))
-    assert found == source
+    source_found, settings = opened_recording(source, SfmSettings(camera=named))
+    assert source_found == source
     assert settings == opened_recording(recording, SfmSettings())[1]
     other = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(9.0, 9.0, 8.0, 8.0)))
     assert opened_recording(recording, other)[1] == other
@@ -81,10 +81,12 @@ def test_images_beside_a_video_without_calibration_are_the_frames(recording):
 
 
 @pytest.mark.thorough
-def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_by_its_folder(done, tmp_path, workers):
+def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_by_its_folder(calls, tmp_path, workers):
     """Images and poses alone, distorted, black outside an octagon (docs/layouts/c3vd-v2.md)."""
     shown = octagon_mask(270, 216)
-    frames = [np.where(shown[..., None], cv2.resize(one, (270, 216)), 0).astype(np.uint8) for one in film(range(70))]
+    frames = [
+        np.where(shown[..., None], cv2.resize(frame, (270, 216)), 0).astype(np.uint8) for frame in film(range(70))
+    ]
     for number, frame in enumerate(frames):
         write_image(tmp_path / "screening" / "rgb" / f"{number:04d}.png", frame)
     folder = tmp_path / "screening"
@@ -92,8 +94,8 @@ def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_b
         cp.reconstruct(folder, tmp_path / "no")
     executor = workers()
     options = {"frames.segment": 50, "frames.least_motion": 0.0, "sfm.camera.model": "c3vd"}
-    made = cp.reconstruct(folder / "rgb", tmp_path / "out", settings=options)
-    video = made.stages["survey"].figures
+    record = cp.reconstruct(folder / "rgb", tmp_path / "out", settings=options)
+    video = record.stages["survey"].figures
     assert len(video["segments"]) == 2 and video["frames"] == 70 and video["size"] == [270, 216]
     assert {json.loads(task.settings)["sfm"]["camera"]["model"] for task in executor.tasks} == {"c3vd"}
     for segment in video["segments"]:
@@ -106,10 +108,10 @@ def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_b
     poses[:, 0, 3] = np.arange(70)
     lines = [",".join(map(str, pose.T.ravel())) for pose in poses]
     (folder / "pose.txt").write_text("\n".join(lines) + "\n")
-    done.clear()
+    calls.clear()
     workers()
     cp.reconstruct(folder, tmp_path / "posed")
-    assert done == [*CAPTURE[1:], *TRAINING]
+    assert calls == [*CAPTURE[1:], *TRAINING]
 
 
 def test_a_recording_without_calibration_is_warned_of(recording, caplog):
@@ -144,20 +146,20 @@ def test_it_is_no_scene(recording):
         find_format(recording)
 
 
-def test_it_is_reconstructed_with_its_camera(done, recording, tmp_path, monkeypatch):
+def test_it_is_reconstructed_with_its_camera(calls, recording, tmp_path, monkeypatch):
     seen = []
     fake = steps.make_poses
     monkeypatch.setattr(steps, "make_poses", lambda context: (seen.append(context.settings), fake(context))[1])
     cp.reconstruct(recording, tmp_path / "out")
-    assert done == ["make_frames", *CAPTURE, *TRAINING]
+    assert calls == ["make_frames", *CAPTURE, *TRAINING]
     assert seen[0].sfm == opened_recording(recording, SfmSettings())[1]
     assert str(tmp_path) not in (tmp_path / "out" / "reconstruction.json").read_text()
     # The camera is known by its numbers: the same file elsewhere is the same, another one is not.
     (recording / "endoscope.xml").rename(tmp_path / "other.xml")
     settings = {"sfm.camera.model": str(tmp_path / "other.xml")}
-    done.clear()
+    calls.clear()
     cp.reconstruct(recording, tmp_path / "out", settings=settings)
-    assert done == []
+    assert calls == []
     (tmp_path / "other.xml").write_text(calibration_text(LENS).replace("767.38", "777.38"))
     with pytest.raises(InputError, match=r"stage poses was made with sfm\.camera\.params"):
         cp.reconstruct(recording, tmp_path / "out", settings=settings)
@@ -166,19 +168,19 @@ def test_it_is_reconstructed_with_its_camera(done, recording, tmp_path, monkeypa
 def test_poses_are_estimated_with_its_camera(recording, tmp_path, monkeypatch):
     from coliags_plugin.reconstruction.structure import sfm
 
-    given = []
+    calls_of_sfm = []
 
     class Stopped(Exception):
         pass
 
     def stop(images, settings, masks, progress):
-        given.append((len(images), settings))
+        calls_of_sfm.append((len(images), settings))
         raise Stopped
 
     monkeypatch.setattr(sfm, "reconstruct", stop)
     with pytest.raises(Stopped):
         commands.run("poses", "sfm", recording, "--output", tmp_path / "out", "--set", "exhaustive_up_to=9")
-    ((count, settings),) = given
+    ((count, settings),) = calls_of_sfm
     assert count == 15 and settings.exhaustive_up_to == 9
     assert settings.camera.params == opened_recording(recording, SfmSettings())[1].camera.params
     assert len(settings.camera.params) == len(

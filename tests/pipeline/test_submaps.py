@@ -58,14 +58,14 @@ def test_each_sub_map_has_its_own_frames_and_unit(atlas, tmp_path, caplog):
     assert "no pose" not in caplog.text  # the atlas says it
     scene = write_atlas(tmp_path / "scene", units=("mm", "unknown", "unknown"))
     scenes = [context.open_posed() for context in context_of(scene, tmp_path / "out").submaps()]
-    assert [one.is_metric for one in scenes] == [True, False]
+    assert [context.is_metric for context in scenes] == [True, False]
     assert float(scenes[0].video[1].camera.camera_to_world[2, 3]) == pytest.approx(1.0, abs=1e-6)
     write_json(scene / ATLAS_FILE, {"frames": 3})
     with pytest.raises(InputError, match=r"atlas.json: frames: .*valid list"):
         read_atlas(scene)
 
 
-def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_path, monkeypatch):
+def test_all_are_reconstructed_and_a_kill_between_them_resumes(calls, atlas, tmp_path, monkeypatch):
     with monkeypatch.context() as patched, pytest.raises(Killed):
         mesh = steps.mesh
 
@@ -76,24 +76,24 @@ def test_all_are_reconstructed_and_a_kill_between_them_resumes(done, atlas, tmp_
 
         patched.setattr(steps, "mesh", killed)
         cp.reconstruct(atlas, tmp_path / "out")
-    assert done == [*SUBMAP, "submap-1/check_data", "submap-1/estimate_depth", "submap-1/train", "submap-1/evaluate"]
-    done.clear()
+    assert calls == [*SUBMAP, "submap-1/check_data", "submap-1/estimate_depth", "submap-1/train", "submap-1/evaluate"]
+    calls.clear()
     record = cp.reconstruct(atlas, tmp_path / "out")
-    assert done == ["submap-1/mesh", "submap-1/coverage", "submap-1/show", "submap-1/report"]
+    assert calls == ["submap-1/mesh", "submap-1/coverage", "submap-1/show", "submap-1/report"]
     assert record.stages["submap-1/mesh"].files == {"submap-1/mesh": "a file"}
     assert record.stages["train"].options["steps"] == 2000
     assert record.stages["submap-1/train"].options["steps"] == 500
-    done.clear()
+    calls.clear()
     cp.reconstruct(atlas, tmp_path / "out", settings={"least_submap": 5})
-    assert done == [f"submap-2/{name}" for name in SUBMAP]
+    assert calls == [f"submap-2/{name}" for name in SUBMAP]
     with pytest.raises(InputError, match="stage train was made with steps 2000, not 4000"):
         cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000})
-    done.clear()
+    calls.clear()
     cp.reconstruct(atlas, tmp_path / "out", settings={"steps": 4000}, overwrite=True)  # depth stands
-    assert done == [*TRAINING, *(f"submap-1/{name}" for name in TRAINING)]
+    assert calls == [*TRAINING, *(f"submap-1/{name}" for name in TRAINING)]
 
 
-def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatch):
+def test_sub_maps_are_known_once_the_poses_are(calls, video, tmp_path, monkeypatch):
     make_poses = steps.make_poses
 
     def poses(context):
@@ -103,14 +103,14 @@ def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatc
 
     monkeypatch.setattr(steps, "make_poses", poses)
     cp.reconstruct(video, tmp_path / "out")
-    assert done == ["make_frames", "make_poses", *SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
+    assert calls == ["make_frames", "make_poses", *SUBMAP, *(f"submap-1/{name}" for name in SUBMAP)]
     (tmp_path / "out" / "submap-1").mkdir()
     (tmp_path / "out" / "submap-1" / "run").mkdir()
-    done.clear()
+    calls.clear()
     with pytest.raises(InputError, match="stage poses was made with diameter None, not 40"):
         cp.reconstruct(video, tmp_path / "out", settings={"diameter": 40.0})
     record = cp.reconstruct(video, tmp_path / "out", settings={"diameter": 40.0}, overwrite=True)
-    assert done == ["make_poses", *SUBMAP]
+    assert calls == ["make_poses", *SUBMAP]
     assert not any(name.startswith("submap-1") for name in record.stages)
     assert not (tmp_path / "out" / "submap-1").exists()
 
@@ -124,7 +124,7 @@ def test_sub_maps_are_known_once_the_poses_are(done, video, tmp_path, monkeypatc
     ],
 )
 def test_a_sub_map_that_fails_does_not_end_the_others(
-    done, atlas, tmp_path, monkeypatch, caplog, error, options, capsys, workers
+    calls, atlas, tmp_path, monkeypatch, caplog, error, options, capsys, workers
 ):
     workers()
     failing = [1]
@@ -138,24 +138,24 @@ def test_a_sub_map_that_fails_does_not_end_the_others(
     monkeypatch.setattr(steps, "estimate_depth", fails)
     argv = ("reconstruct", atlas, "--output", tmp_path / "out", "--set", "least_submap=5", *options)
     assert commands.run(*argv) == 0
-    assert done == [*SUBMAP, "submap-1/check_data", *(f"submap-2/{name}" for name in SUBMAP)]
+    assert calls == [*SUBMAP, "submap-1/check_data", *(f"submap-2/{name}" for name in SUBMAP)]
     stages = Record.of(tmp_path / "out").stages
     assert stages["submap-1/depth"].state == "failed"
     assert stages["submap-1/depth"].summary.startswith(str(error).rstrip("."))
     assert options or "the others go on" in caplog.text
     shutil.rmtree(tmp_path / "out")
     failing[:] = [0]
-    done.clear()
+    calls.clear()
     assert commands.run(*argv) == error.exit_status
     assert str(error).rstrip(".") in capsys.readouterr().err
-    assert done == ["check_data", *(f"submap-{number}/{name}" for number in (1, 2) for name in SUBMAP)]
+    assert calls == ["check_data", *(f"submap-{number}/{name}" for number in (1, 2) for name in SUBMAP)]
     failing.clear()
-    done.clear()
+    calls.clear()
     assert commands.run(*argv) == 0
-    assert done == [name for name in SUBMAP if name != "check_data"]
+    assert calls == [name for name in SUBMAP if name != "check_data"]
 
 
-def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypatch):
+def test_a_failure_is_recorded_without_its_place(calls, atlas, tmp_path, monkeypatch):
     def fails(context):
         raise InputError(f"{context.out / 'depth'} is empty")
 
@@ -167,7 +167,7 @@ def test_a_failure_is_recorded_without_its_place(done, atlas, tmp_path, monkeypa
         assert "depth is empty" in text and str(tmp_path) not in text
 
 
-def test_warnings_and_figures_are_kept(done, atlas, tmp_path, monkeypatch, caplog):
+def test_warnings_and_figures_are_kept(calls, atlas, tmp_path, monkeypatch, caplog):
     outcome = StageRecord("1 suspect finding", {}, ["suspect: the camera jumps. Check it"], {"frames": 14})
     monkeypatch.setattr(steps, "check_data", lambda context: outcome)
     cp.reconstruct(atlas, tmp_path / "out")
@@ -195,13 +195,13 @@ def test_each_model_is_scaled_by_the_diameter_or_else_to_its_median_depth(tmp_pa
         ]
         registered = range(first, first + count)
         posed = frame_model(frames, [images[index].name for index in registered])
-        seen = [SeenPoints(np.ones((len(points), 2)), np.arange(len(points))) for _ in range(count)]
-        add_points(posed, seen, points, np.zeros((len(points), 3), np.uint8))
+        seen_points = [SeenPoints(np.ones((len(points), 2)), np.arange(len(points))) for _ in range(count)]
+        add_points(posed, seen_points, points, np.zeros((len(points), 3), np.uint8))
         return Reconstruction(tuple(images), tuple(registered), poses, tuple(path.name for path in images), posed)
 
     models = (model(0, 6, wall), model(6, 5, wall[:2] + np.array([0.0, 0.0, 9.0])), model(11, 3, wall[:2]))
-    found = Atlas(tuple(images), models, {})
-    monkeypatch.setattr("coliags_plugin.reconstruction.structure.sfm.reconstruct", lambda *arguments: found)
+    atlas_found = Atlas(tuple(images), models, {})
+    monkeypatch.setattr("coliags_plugin.reconstruction.structure.sfm.reconstruct", lambda *arguments: atlas_found)
     settings = ReconstructionSettings(diameter=40.0, least_submap=4)
     context = StageContext(out, tmp_path / "film", settings, None, None, torch.device("cpu"))
     assert "unit mm, by a diameter of 40 mm" in steps.make_poses(context).summary
@@ -212,4 +212,4 @@ def test_each_model_is_scaled_by_the_diameter_or_else_to_its_median_depth(tmp_pa
         for number in range(3)
     ]
     np.testing.assert_allclose(ways, [4.0, UNKNOWN_MEDIAN_DEPTH / models[1].median_depth, 1.0], rtol=1e-6)
-    assert [one.open_posed().is_metric for one in context.submaps()] == [True, False]
+    assert [inside.open_posed().is_metric for inside in context.submaps()] == [True, False]

@@ -165,11 +165,12 @@ def test_colours_are_those_of_the_video_and_times_are_frames(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rate", "wanted", "every"), [(50.0, 10.0, 5), (60.0, 24.0, 2), (59.94, 15.0, 4), (15.0, 30.0, 1), (15.0, 0.5, 30)]
+    ("rate", "target", "every"),
+    [(50.0, 10.0, 5), (60.0, 24.0, 2), (59.94, 15.0, 4), (15.0, 30.0, 1), (15.0, 0.5, 30)],
 )
-def test_of_how_many_frames_one_is_used(rate, wanted, every, caplog):
+def test_of_how_many_frames_one_is_used(rate, target, every, caplog):
     with caplog.at_level(logging.INFO):
-        assert every_of(SimpleNamespace(path="film.mp4", known_rate=rate, is_variable=False), wanted) == every
+        assert every_of(SimpleNamespace(path="film.mp4", known_rate=rate, is_variable=False), target) == every
     assert f"{rate:.4g} frames a second" in caplog.text and f"every {every} is used" in caplog.text
 
 
@@ -194,7 +195,7 @@ def test_a_damaged_stretch_is_black_and_the_rest_is_read(tmp_path, caplog):
             if first <= last:
                 some = list(frame_source(tmp_path / "damaged.mp4", Span(first, last)))
                 assert [name for name, _ in some] == [name for name, _ in read[first : last + 1]]
-                assert all(np.array_equal(one, read[first + n][1]) for n, (_, one) in enumerate(some))
+                assert all(np.array_equal(image, read[first + n][1]) for n, (_, image) in enumerate(some))
 
 
 def test_the_videos_of_a_folder_are_one_in_the_order_of_their_numbers(tmp_path):
@@ -220,7 +221,7 @@ def test_what_comes_before_the_first_key_frame_is_no_frame(tmp_path):
 
 
 def test_an_edit_list_says_which_frames_are_shown(tmp_path):
-    """From frame 10 on, for a second: decoding begins before it."""
+    """The list begins at frame 10, for a second: decoding begins before it."""
     data = bytearray(write_film(FRAMES, tmp_path / "a.mp4", rate=25, **ORDERED).read_bytes())
     place = data.index(b"elst") + 12
     length, start = struct.unpack_from(">Ii", data, place)
@@ -243,8 +244,8 @@ def test_frames_that_a_file_lacks_are_told(tmp_path, name, caplog):
     step = len(data) // 188 // 4 * 188
     path.write_bytes(data[:step] + data[2 * step :] if name == "a.ts" else data[: 2 * step])
     count = len(list(frame_source(path)))
-    said = "there is time for 40" if name == "a.ts" else "its header says 40"
-    assert 15 < count < 38 and f"{name}: {count} frames, though {said}" in caplog.text
+    warning = "there is time for 40" if name == "a.ts" else "its header says 40"
+    assert 15 < count < 38 and f"{name}: {count} frames, though {warning}" in caplog.text
 
 
 def test_colours_that_cannot_be_converted_are_refused(tmp_path):
@@ -262,7 +263,7 @@ def test_colours_that_cannot_be_converted_are_refused(tmp_path):
     ],
 )
 def test_flagged_frames_are_decoded_and_deinterlaced(tmp_path, name, codec, options):
-    """Of a picture that does not look interlaced."""
+    """The picture does not look interlaced."""
     path = write_film(FRAMES[:12], tmp_path / name, codec, 25, **options)
     plain = list(frame_source(path))
     assert [number_of(image) for _, image in plain] == list(range(12))
@@ -337,8 +338,8 @@ def test_pixels_are_square_and_images_turned_as_the_file_says(tmp_path, aspect, 
     right = right[:: -1 if mirrored[1] else 1, :: -1 if mirrored[0] else 1]
     assert image.shape == right.shape
     assert np.median(np.abs(image.astype(int) - right)) <= 3 and np.mean(np.abs(image.astype(int) - right)) < 8
-    said = f"a.mov has pixels that are not square ({aspect}) and is read as {width} x 48"
-    assert caplog.text.count("not square") == (width != 64) and (width == 64 or said in caplog.text)
+    warning = f"a.mov has pixels that are not square ({aspect}) and is read as {width} x 48"
+    assert caplog.text.count("not square") == (width != 64) and (width == 64 or warning in caplog.text)
 
 
 @pytest.mark.parametrize("stored", [True, False])
@@ -415,10 +416,10 @@ def test_packets_that_show_nothing_are_no_frames(tmp_path, codec, name):
                 data = bytes([data[0] & ~0x10]) + data[1:]
             elif number in (26, 27):
                 data = b"\0\0\1\xb6" + (0b0101_0000_0100_1111 | (number - 25) << 7).to_bytes(2, "big")
-            made = av.Packet(data)
-            made.pts, made.dts, made.time_base = packet.pts, packet.dts, packet.time_base
-            made.is_keyframe, made.stream = packet.is_keyframe, copied
-            out.mux(made)
+            copied_packet = av.Packet(data)
+            copied_packet.pts, copied_packet.dts, copied_packet.time_base = packet.pts, packet.dts, packet.time_base
+            copied_packet.is_keyframe, copied_packet.stream = packet.is_keyframe, copied
+            out.mux(copied_packet)
     whole = [image for _, image in frame_source(tmp_path / name)]
     assert len(whole) == VideoFile(tmp_path / name).count == 38
     for first in (24, 25, 30, 37):
