@@ -13,6 +13,7 @@ from typing import cast
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from typing_extensions import override
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.cameras import Camera
@@ -84,7 +85,7 @@ class PixelMaps(ABC):
 
     @abstractmethod
     def read(self, name: str) -> Tensor | None:
-        """See :class:`PixelSource`."""
+        """The map of a name in :data:`PIXEL_MAPS`; None where there is none."""
 
     @property
     def image(self) -> UInt8[Tensor, "H W 3"]:
@@ -152,8 +153,8 @@ class Target(PixelMaps):
     index: int = 0
     chosen: Int[Tensor, "H W"] | None = None
 
+    @override
     def read(self, name: str) -> Tensor | None:
-        """See :class:`PixelMaps`."""
         return self.maps.get(name)
 
     @property
@@ -166,7 +167,7 @@ class Target(PixelMaps):
 
 
 class PixelSource(ABC):
-    """Where the per-pixel maps of a frame come from: memory or files."""
+    """Source of the per-pixel maps of a frame: memory or files."""
 
     @abstractmethod
     def read(self, name: str) -> Tensor | None:
@@ -187,12 +188,12 @@ class PixelTensors(PixelSource):
 
     maps: Mapping[str, Tensor]
 
+    @override
     def read(self, name: str) -> Tensor | None:
-        """See :class:`PixelSource`."""
         return self.maps.get(name)
 
+    @override
     def scaled(self, factor: float) -> PixelTensors:
-        """See :class:`PixelSource`."""
         lengths = {name: factor * values for name, values in self.maps.items() if PIXEL_MAPS[name].is_length}
         return PixelTensors({**self.maps, **lengths})
 
@@ -236,16 +237,18 @@ class Frame(PixelMaps):
         if unknown := maps.keys() - PIXEL_MAPS.keys():
             raise TypeError(f"no per-pixel map is called {', '.join(sorted(unknown))}")
         changed = {**self.source.read_all(), **maps}
-        kept = {name: values for name, values in changed.items() if values is not None}
-        return replace(self, source=PixelTensors(kept))
+        present = {name: values for name, values in changed.items() if values is not None}
+        return replace(self, source=PixelTensors(present))
 
+    @override
     def read(self, name: str) -> Tensor | None:
-        """See :class:`PixelMaps`; files are read at each call unless their source keeps them."""
+        """Files are read at each call unless their source keeps them."""
         return self.source.read(name)
 
     @property
+    @override
     def valid(self) -> Bool[Tensor, "H W"]:
-        """See :class:`PixelMaps`; reads no image."""
+        """Reads no image."""
         mask, camera = self.mask, self.camera
         size, device = (camera.height, camera.width), camera.camera_to_world.device
         return torch.ones(size, dtype=torch.bool, device=device) if mask is None else mask
@@ -335,12 +338,12 @@ class Scene:
 
     @property
     def is_resized(self) -> bool:
-        """Whether images are known to be used at another size than they are stored at."""
+        """True if images are known to be used at another size than they are stored at."""
         return self.provenance.stored_size not in (None, self.provenance.size)
 
     @property
     def is_metric(self) -> bool:
-        """Whether lengths are in mm; False where their unit is unknown."""
+        """True if lengths are in mm; False where their unit is unknown."""
         return self.provenance.unit == "mm"
 
     @property
@@ -398,8 +401,8 @@ class Scene:
             size = depth / (camera.fx * camera.fy) ** 0.5
             sizes.append(size[inside])
             fallback.append(size[depth > 0])
-        found, others = torch.cat(sizes), torch.cat(fallback)
-        return float((found if len(found) else others).median()) if len(others) else math.nan
+        in_view, others = torch.cat(sizes), torch.cat(fallback)
+        return float((in_view if len(in_view) else others).median()) if len(others) else math.nan
 
     def depths_in_view(self) -> Float[Tensor, "K"]:
         """z-depths of the points inside the images of up to 16 training frames, scene units, occluded or not."""

@@ -6,11 +6,13 @@ import logging
 import math
 import re
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
@@ -59,15 +61,15 @@ class SequenceDataManager(RecordedDataManager):
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """The rectification of a sequence's images, and its provenance."""
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         files = self.find(path)
         shots, facts = self._shots(files)
-        test_sets, seen = {}, {"video": find_seen_masks(path / "truth", len(shots))}
+        test_sets, seen_masks = {}, {"video": find_seen_masks(path / "truth", len(shots))}
         if (path / ROTATION).is_dir():
             rotation = self.find(path / ROTATION)
             test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, f"{ROTATION}-")
-            seen[ROTATION] = find_seen_masks(path / ROTATION, len(rotation.images))
+            seen_masks[ROTATION] = find_seen_masks(path / ROTATION, len(rotation.images))
         points = path / POINTS_FILE
         return Recording(
             kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
@@ -77,7 +79,7 @@ class SequenceDataManager(RecordedDataManager):
             test_sets=test_sets,
             own_points=(lambda: load_points(points)) if points.is_file() else None,
             points_source=points,
-            seen=seen,
+            seen=seen_masks,
         )
 
     def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
@@ -123,16 +125,17 @@ class C3VDDataManager(SequenceDataManager):
     name = "c3vd"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         if (path / "camera_pose.txt").is_file() and (path / "images").is_dir():
             return "camera_pose.txt beside images/"
         if (path / "pose.txt").is_file() and next(path.glob("*_color.png"), None) is not None:
             return "pose.txt beside NNNN_color.png"
         return None
 
+    @override
     def find(self, folder: Path) -> SequenceFiles:
-        """See :class:`SequenceDataManager`; ``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
+        """``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
         reading.require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
         raw = [path for path in folder.iterdir() if re.fullmatch(r"\d+_color\.png", path.name)]
         camera = None
@@ -162,8 +165,8 @@ class C3VDDataManager(SequenceDataManager):
                 raise InputError(f"{folder} has images but no {path.name}", LAYOUTS, f"Add {path.name}")
         return SequenceFiles(kind, folder, *reading.paired(folder, images, depths), poses, camera)
 
+    @override
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        """See :class:`SequenceDataManager`."""
         settings = self.settings
         raw = files.camera is None
         facts = {
@@ -193,9 +196,9 @@ CANDIDATE_LENS = OmnidirectionalLens(
     e=0.0,
 )
 
-#: Order of the model's parameters on C3VD's page.
+#: Parameters of the model in the order of C3VD's page, and the values of those that may be left out.
 ORDER = ("width", "height", "cx", "cy", "a0", "a1", "a2", "a3", "a4", "c", "d", "e")
-_NEEDED = frozenset({"cx", "cy", "a0", "a2", "a3", "a4"})
+_OPTIONAL = {"width": 1350.0, "height": 1080.0, "a1": 0.0, "c": 1.0, "d": 0.0, "e": 0.0}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _NAMED = re.compile(rf"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*({_NUMBER.pattern})")
 
@@ -208,70 +211,49 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
     the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
     """
     text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
-    named, bare = _NAMED.findall(text), _bare(text)
-    if named:
-        values = _by_name(path, [(name.lower(), float(number)) for name, number in named])
-    elif bare is not None and len(bare) in (len(ORDER), len(ORDER) - 2):
-        values = dict(zip(ORDER[-len(bare) :], bare, strict=True))
-    else:
-        count = "text" if bare is None else f"{len(bare)} numbers"
-        raise _unclear(path, f"{count} without names")
-    width, height = values.pop("width", 1350.0), values.pop("height", 1080.0)
-    doubt = _doubt(values, width, height)
-    if doubt:
-        raise _unclear(path, doubt)
-    cx, cy, a0, a2, a3, a4, c, d, e = (values[name] for name in ORDER[2:] if name != "a1")
+    pairs = [(name.lower(), float(number)) for name, number in _NAMED.findall(text)]
+    words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
+    if not pairs and all(_NUMBER.fullmatch(word) for word in words) and len(words) in (len(ORDER), len(ORDER) - 2):
+        pairs = [*zip(ORDER[-len(words) :], map(float, words), strict=True)]
+    values = _OPTIONAL | dict(pairs)
+    doubt = next(_doubts([name for name, _ in pairs], values, words), None)
+    if doubt is not None:
+        raise InputError(
+            f"{path} is ambiguous or implausible: {doubt}",
+            f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
+            "Rewrite it in this format, or `datamanager.lens=v2` (an unverified candidate), or v1 (C3VD's own)",
+        )
+    width, height, cx, cy, a0, _, a2, a3, a4, c, d, e = (values[name] for name in ORDER)
     return OmnidirectionalLens(
         width=round(width), height=round(height), cx=cx + 0.5, cy=cy + 0.5, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
     )
 
 
-def _bare(text: str) -> list[float] | None:
-    """Numbers of a text; None if it holds anything else."""
-    words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
-    return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else None
-
-
-def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
-    names = [name for name, _ in pairs]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    unknown = sorted(set(names) - set(ORDER))
-    missing = sorted(_NEEDED - set(names))
-    if repeated or unknown or missing:
-        faults = [
-            f"{what} {', '.join(listed)}"
-            for what, listed in (("no", missing), ("twice", repeated), ("unknown", unknown))
-            if listed
-        ]
-        raise _unclear(path, "; ".join(faults))
-    return {"a1": 0.0, "c": 1.0, "d": 0.0, "e": 0.0, **dict(pairs)}
-
-
-def _doubt(values: dict[str, float], width: float, height: float) -> str:
-    """Reason why a calibration is implausible for an omnidirectional colonoscope, or an empty string."""
-    if not all(map(math.isfinite, (*values.values(), width, height))) or min(width, height) < 1.0:
-        return f"an image of {width:g} x {height:g}, or numbers that are not finite"
-    off_middle = max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5))
-    doubts = {
-        f"an image of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
-        f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}": off_middle
-        > 0.1,
-        f"a focal length a0 = {values['a0']:g} for {width:g} pixels": not 0.2 < values["a0"] / width < 2.0,
-        f"a1 = {values['a1']:g}, which is 0 in this model": values["a1"] != 0.0,
-        f"c, d, e = {values['c']:g}, {values['d']:g}, {values['e']:g}, far from 1, 0, 0": max(
-            abs(values["c"] - 1.0), abs(values["d"]), abs(values["e"])
-        )
-        > 0.1,
+def _doubts(names: list[str], values: dict[str, float], words: list[str]) -> Iterator[str]:
+    """Reasons why numbers are no calibration of an omnidirectional colonoscope; ``words`` are those of the file."""
+    if not names:
+        is_bare = all(_NUMBER.fullmatch(word) for word in words)
+        yield f"{f'{len(words)} numbers' if is_bare else 'text'} without names"
+    faults = {
+        "no": set(ORDER) - set(values),
+        "twice": {name for name in names if names.count(name) > 1},
+        "unknown": set(names) - set(ORDER),
     }
-    return next((doubt for doubt, holds in doubts.items() if holds), "")
-
-
-def _unclear(path: Path, seen: str) -> InputError:
-    return InputError(
-        f"{path} is ambiguous or implausible: {seen}",
-        f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
-        "Rewrite it in this format, or `datamanager.lens=v2` (an unverified candidate), or v1 (C3VD's own)",
-    )
+    if any(faults.values()):
+        yield "; ".join(f"{what} {', '.join(sorted(listed))}" for what, listed in faults.items() if listed)
+    width, height, a0, a1, c, d, e = (values[name] for name in ("width", "height", "a0", "a1", "c", "d", "e"))
+    if not all(map(math.isfinite, values.values())) or min(width, height) < 1.0:
+        yield f"an image of {width:g} x {height:g}, or numbers that are not finite"
+    if width != round(width) or height != round(height):
+        yield f"an image of {width:g} x {height:g} pixels"
+    if max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5)) > 0.1:
+        yield f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}"
+    if not 0.2 < a0 / width < 2.0:
+        yield f"a focal length a0 = {a0:g} for {width:g} pixels"
+    if a1 != 0.0:
+        yield f"a1 = {a1:g}, which is 0 in this model"
+    if max(abs(c - 1.0), abs(d), abs(e)) > 0.1:
+        yield f"c, d, e = {c:g}, {d:g}, {e:g}, far from 1, 0, 0"
 
 
 V2_LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
@@ -302,15 +284,16 @@ class C3VDv2DataManager(SequenceDataManager):
     name = "c3vd-v2"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         numbers = any(re.fullmatch(r"\d+", image.stem) for image in path.glob("rgb/*.png"))
         if numbers and (path / "pose.txt").is_file() and c3vd_poses.recognise(path / "pose.txt"):
             return "pose.txt (16 numbers a line) beside rgb/NNNN.png"
         return None
 
+    @override
     def find(self, folder: Path) -> SequenceFiles:
-        """See :class:`SequenceDataManager`; ``camera`` is the intrinsics file, in it or up to two folders up."""
+        """``camera`` is the intrinsics file, in it or up to two folders up."""
         reading.require_folder(folder, f"a C3VDv2 sequence: {V2_LAYOUT}")
         images = reading.numbered_images(folder / "rgb", "", V2_LAYOUT, "c1_cecum_t1_v1")
         poses = folder / "pose.txt"
@@ -321,8 +304,8 @@ class C3VDv2DataManager(SequenceDataManager):
         camera = next((path / INTRINSICS for path in (here, *here.parents[:2]) if (path / INTRINSICS).is_file()), None)
         return SequenceFiles("c3vd-v2", folder, *reading.paired(folder, images, depths), poses, camera)
 
+    @override
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        """See :class:`SequenceDataManager`."""
         settings = self.settings
         lens, source = self._lens(files)
         facts = {

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
@@ -246,12 +247,12 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
     seen_split = "endogslam"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         return _recognised(path)
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         folder = _scene_folder(path)
         files = _find_sequence(folder, self.settings.params_file)
         params = None if files.params is None else read_params(files.params)
@@ -267,10 +268,10 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             **rectification.facts(),
         }
         shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, depth_format)
-        test_sets, seen = {}, {"video": find_seen_masks(folder / "truth", len(shots))}
+        test_sets, seen_masks = {}, {"video": find_seen_masks(folder / "truth", len(shots))}
         if (folder / ROTATION).is_dir():
             test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, poses)
-            seen[ROTATION] = find_seen_masks(folder / ROTATION, len(test_sets[ROTATION]))
+            seen_masks[ROTATION] = find_seen_masks(folder / ROTATION, len(test_sets[ROTATION]))
         points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
         return Recording(
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
@@ -282,7 +283,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             test_sets=test_sets,
             own_points=None if points_source is None else lambda: _map_points(files.cloud, params, poses),
             points_source=points_source or folder / PARAMS,
-            seen=seen,
+            seen=seen_masks,
         )
 
     def _rectification(self, files: PreparedFiles, params: EndoGslamParams | None) -> Rectification:

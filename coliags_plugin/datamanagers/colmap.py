@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from pydantic import BaseModel, ConfigDict, Field
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
@@ -97,8 +98,8 @@ def find_models(scene: Path, parts: tuple[str, ...] = _PARTS) -> list[Path]:
         parent = scene / name
         numbered = [] if name == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
         candidates = [*sorted(numbered, key=lambda path: int(path.name)), parent]
-        if found := [path for path in candidates if colmap_poses.model_suffix(path, parts) is not None]:
-            return found
+        if models := [path for path in candidates if colmap_poses.model_suffix(path, parts) is not None]:
+            return models
     return []
 
 
@@ -193,7 +194,7 @@ class LostFrame(_Part):
 
 
 class AtlasRecord(_Part):
-    """Which frames of a video have a pose, in which models, and why the others have none."""
+    """Models of the frames of a video, and the reasons why others have no pose."""
 
     frames: list[str]  # names of the images in order: frames are numbered from 0
     submaps: list[AtlasStretch]
@@ -268,11 +269,11 @@ class ColmapDataManager(RecordedDataManager):
     masks_at = "masks/NAME.png"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         # A nerfstudio scene may contain its COLMAP model, but its poses are in transforms.json.
-        found = [] if (path / "transforms.json").is_file() else find_models(path)
-        return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
+        models = [] if (path / "transforms.json").is_file() else find_models(path)
+        return f"a sparse model in {models[0].relative_to(path).as_posix()}" if models else None
 
     @classmethod
     def refuse_nearly(cls, path: Path) -> None:
@@ -281,8 +282,8 @@ class ColmapDataManager(RecordedDataManager):
             for folder in find_models(path, tuple(other for other in _PARTS if other != part)):
                 read_model(folder)
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         settings = self.settings
         if not path.is_dir():
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
@@ -301,7 +302,7 @@ class ColmapDataManager(RecordedDataManager):
         unit = settings.unit or model_unit(path, model.folder, atlas)
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
-        seen = find_seen_masks(path / "truth", len(paths), complete=not others)
+        seen_masks = find_seen_masks(path / "truth", len(paths), complete=not others)
         forms = self._depth_formats(path, depths, params, model, unit)
         shots, used, misplaced = [], 0, 0
         for index, image in enumerate(model.images):
@@ -351,29 +352,29 @@ class ColmapDataManager(RecordedDataManager):
             fingerprint=fingerprint(path, [*paths, *masks, *depths], [*model.files, params]),
             own_points=own_points if len(model.positions) else None,
             points_source=model.files[-1],
-            seen={"video": seen},
+            seen={"video": seen_masks},
             made_from={"points": [index for index, image in enumerate(model.images) if len(image.points)]},
         )
 
     def _model_folder(self, path: Path) -> Path:
         if self.settings.model is not None:
             return path / self.settings.model
-        found = find_models(path)
-        if not found:
+        models = find_models(path)
+        if not models:
             raise InputError(
                 f"{path} holds no COLMAP model",
                 "cameras, images and points3D, all .bin or all .txt, in sparse/0, sparse, colmap/sparse/0, "
                 "colmap/sparse or the folder itself",
                 "Check the path, or choose one with `datamanager.model=FOLDER`",
             )
-        if len(found) > 1:
-            others = ", ".join(folder.relative_to(path).as_posix() for folder in found[1:])
+        if len(models) > 1:
+            others = ", ".join(folder.relative_to(path).as_posix() for folder in models[1:])
             log.warning(
                 "reading %s; there are further models, which `datamanager.model=FOLDER` chooses: %s",
-                found[0],
+                models[0],
                 others,
             )
-        return found[0]
+        return models[0]
 
     def _depth_formats(
         self, path: Path, depths: Sequence[Path | None], params: Path | None, model: SparseModel, unit: Unit
@@ -418,13 +419,13 @@ class ColmapDataManager(RecordedDataManager):
             error = np.linalg.norm(lens.project(local) - image.observed, axis=1)
             k = rectification.pinhole
             pixels = local[:, :2] / local[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
-            kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
-            misplaced = int((~kept).sum())
-            kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
-        kept &= model.track_lengths[image.points] >= settings.min_track_length
+            is_used = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
+            misplaced = int((~is_used).sum())
+            is_used &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
+        is_used &= model.track_lengths[image.points] >= settings.min_track_length
         # One depth per point, even if the image observes it twice.
-        _, first = np.unique(image.points[kept], return_index=True)
-        rows = np.flatnonzero(kept)[np.sort(first)]
+        _, first = np.unique(image.points[is_used], return_index=True)
+        rows = np.flatnonzero(is_used)[np.sort(first)]
         if not len(rows):
             return None, misplaced
         pixels, depth = (torch.from_numpy(values[rows].astype(np.float32)) for values in (pixels, local[:, 2]))
@@ -452,9 +453,11 @@ def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
 
 def _masks(scene: Path, model: SparseModel) -> list[Path | None]:
     """Mask files of any of the images."""
-    folder = next((scene / name for name in ("masks", "mask") if (scene / name).is_dir()), scene / "masks")
+    folder = reading.one_folder(scene, reading.MASK_FOLDERS)
+    if folder is None:
+        return [None] * len(model.images)
     masks = [*reading.sidecar_files(folder, [image.name for image in model.images], reading.MASK_SUFFIXES).values()]
-    if folder.is_dir() and any(folder.iterdir()) and not any(masks):
+    if any(folder.iterdir()) and not any(masks):
         raise InputError(
             f"{folder} holds {reading.inventory(folder)}, and no mask of any image of {model.folder}",
             f"masks named like the images, {model.images[0].name}.png for instance",
@@ -472,8 +475,8 @@ def _depths(folder: Path, model: SparseModel) -> tuple[list[Path | None], Path |
             log.warning("%s is not used, as there is no %s", params, folder)
         return [None] * len(model.images), None
     suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
-    found = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
-    files = reading.for_all(found, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
+    depths = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
+    files = reading.for_all(depths, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
     return files, params if is_inverse else None
 
 

@@ -40,14 +40,14 @@ def fuse_depth(
             "depth files with known depth in them",
             "Check the depth files, or `datamanager.initial_points=file`",
         )
-    taken = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
+    counts = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
     # Sorted to keep the pixel order; the choice is already random.
     chosen = [
         np.sort(generator.choice(there, number, replace=False)) if number < there else np.arange(there)
-        for there, number in zip(available, taken, strict=True)
+        for there, number in zip(available, counts, strict=True)
     ]
-    wanted = [pair for pair in zip(frames, chosen, strict=True) if len(pair[1])]
-    fused = parallel_map(_fused, wanted, "fuse depth", progress)
+    selections = [pair for pair in zip(frames, chosen, strict=True) if len(pair[1])]
+    fused = parallel_map(_fused, selections, "fuse depth", progress)
     positions, colors = zip(*fused, strict=True)
     return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))
 
@@ -57,17 +57,17 @@ def _usable(frame: Frame) -> np.ndarray:
     depth, mask, confidence = frame.depth, frame.mask, frame.depth_confidence
     if depth is None:
         return np.zeros(0, np.int64)
-    known = np.isfinite(depth.numpy())
+    usable = np.isfinite(depth.numpy())
     if mask is not None:
-        known &= mask.numpy()
-    if confidence is not None and (trusted := known & (confidence.numpy() >= _TRUSTED)).any():
-        known = trusted
-    return np.flatnonzero(known)
+        usable &= mask.numpy()
+    if confidence is not None and (trusted := usable & (confidence.numpy() >= _TRUSTED)).any():
+        usable = trusted
+    return np.flatnonzero(usable)
 
 
-def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _fused(selection: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """World positions, computed in float64, and colours of chosen usable pixels."""
-    frame, chosen = wanted[0].to("cpu"), wanted[1]
+    frame, chosen = selection[0].to("cpu"), selection[1]
     if frame.depth is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     pixels = _usable(frame)[chosen]

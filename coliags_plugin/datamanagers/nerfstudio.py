@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
+from typing_extensions import override
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -48,19 +49,19 @@ class NerfstudioTransforms(Transforms):
 
     def images(self) -> list[Path]:
         """The images of all frames."""
-        found = {}
+        paths = {}
         for name in self.names:
             candidates = (self.named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES))
-            found[name] = next((path for path in candidates if path.is_file()), None)
-        missing = [name for name, path in found.items() if path is None]
+            paths[name] = next((path for path in candidates if path.is_file()), None)
+        missing = [name for name, path in paths.items() if path is None]
         if missing:
             folder, shown = self.path.parent, reading.first_few(missing)
             raise InputError(
-                f"{self.path}: {len(missing)} of {len(found)} frames have no image in {folder}: {shown}",
+                f"{self.path}: {len(missing)} of {len(paths)} frames have no image in {folder}: {shown}",
                 f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
                 "Restore them, or remove their frames",
             )
-        return [path for path in found.values() if path is not None]
+        return [path for path in paths.values() if path is not None]
 
     def masks(self) -> list[Path | None]:
         """The masks of any of the frames; warns of other keys that may mean masks."""
@@ -105,10 +106,10 @@ class NerfstudioTransforms(Transforms):
         listed = self.content.get(ESTIMATED_FROM)
         return {} if listed is None else {"depth": self._indices(ESTIMATED_FROM, listed)}
 
-    def depths(self, given: float | None) -> tuple[list[Path | None], float | None]:
+    def depths(self, option: float | None) -> tuple[list[Path | None], float | None]:
         """Depth files of all frames or of none, and world units before applied_scale per stored unit; None: not said.
 
-        The keys of instant-ngp are read where no frame has nerfstudio's. ``given``: an option that replaces the unit.
+        The keys of instant-ngp are read where no frame has nerfstudio's. ``option``: an option that replaces the unit.
         """
         content, named = self.content, {key for frame in self.frames for key, value in frame.items() if value}
         files = self.files("depth_file_path", for_every=True)
@@ -116,14 +117,14 @@ class NerfstudioTransforms(Transforms):
             # As instant-ngp has it, there is no depth without a scale.
             step = read_number({"integer_depth_scale": 0, **content}, "integer_depth_scale", self.path)
             step /= float(content.get("applied_scale", 1.0))  # which it knows nothing of
-            if (step := given or step) > 0.0:
+            if (step := option or step) > 0.0:
                 return self.files("depth_path", for_every=True), step
         if not any(files) and (others := sorted(key for key in named if "depth" in key)):
             expected = "depth_file_path, or depth_path with integer_depth_scale and without enable_depth_loading false"
             log.warning("%s: no depth is read from %s of its frames, only from %s", self.path, others[0], expected)
-        if given is None and "depth_unit_scale_factor" in content:
-            given = read_number(content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
-        return files, given
+        if option is None and "depth_unit_scale_factor" in content:
+            option = read_number(content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
+        return files, option
 
     def _indices(self, key: str, listed: Any) -> list[int]:
         index_of = {_normal(name): index for index, name in enumerate(self.names)}
@@ -177,8 +178,8 @@ class NerfstudioDataManager(RecordedDataManager):
     unit = "unknown"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         if not (path / FILE).is_file() or any((path / name).exists() for name in _ROTATECOLON):
             return None
         return FILE
@@ -193,8 +194,8 @@ class NerfstudioDataManager(RecordedDataManager):
                 "Join the files' frames; train_filenames and test_filenames there list the file_path of each part",
             )
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         settings, file = self.settings, path / FILE
         reading.required_file(file, "a folder with a transforms.json", "Check the path")
         transforms = NerfstudioTransforms(file, settings.outside_files)
@@ -220,7 +221,7 @@ class NerfstudioDataManager(RecordedDataManager):
         others = [path for of_frame in zip(depths, masks, confidences, strict=True) for path in of_frame]
         unposed = reading.unposed_images(images, others)
         reading.warn_of_unposed(file, unposed)
-        seen = find_seen_masks(path / "truth", len(images), complete=not unposed)
+        seen_masks = find_seen_masks(path / "truth", len(images), complete=not unposed)
         shots = [
             Shot(
                 short,
@@ -262,7 +263,7 @@ class NerfstudioDataManager(RecordedDataManager):
             made_from=transforms.made_from(),
             own_points=own_points,
             points_source=source,
-            seen={"video": seen},
+            seen={"video": seen_masks},
         )
 
     def _depth_unit(self, step: float | None, unit: Unit, file: Path | None) -> float:

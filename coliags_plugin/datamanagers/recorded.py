@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Bool
+from typing_extensions import override
 
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
@@ -75,8 +76,9 @@ class RecordedDataManager(DataManager):
             InputError: The folder is missing, or files are missing or invalid.
         """
 
+    @override
     def fingerprint(self, path: Path) -> str:
-        """See :meth:`DataManager.fingerprint`; reads no pixels."""
+        """Reads no pixels."""
         return self.open(Path(path)).fingerprint
 
     def stated_unit(self, path: Path) -> Unit:
@@ -97,8 +99,8 @@ class RecordedDataManager(DataManager):
             rectification.undistortion()  # once, before images are read in parallel
         return rectification
 
+    @override
     def at_stored_size(self) -> DataManager:
-        """See :class:`DataManager`."""
         changes = {"width": None, "height": None, "keep_pixels": False, "initial_points": "none"}
         manager = type(self)(self.settings.model_copy(update=changes))
         manager._bounds = None
@@ -113,11 +115,13 @@ class RecordedDataManager(DataManager):
         path, settings = Path(path), self.settings
         recording = self.open(path)
         train_indices, test_indices = self._split(recording, path)
-        seen = self._valid_seen_masks(recording, train_indices, test_indices, path)
+        seen_masks = self._valid_seen_masks(recording, train_indices, test_indices, path)
         train = self._frames(recording.shots, train_indices, {})
-        test_sets = {"test": self._frames(recording.shots, test_indices, seen.get("video", {}))} if test_indices else {}
+        test_sets = (
+            {"test": self._frames(recording.shots, test_indices, seen_masks.get("video", {}))} if test_indices else {}
+        )
         for name, shots in recording.test_sets.items():
-            test_sets[name] = self._frames(shots, range(len(shots)), seen.get(name, {}))
+            test_sets[name] = self._frames(shots, range(len(shots)), seen_masks.get(name, {}))
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
@@ -171,8 +175,8 @@ class RecordedDataManager(DataManager):
         if masks:
             level = logging.INFO if len(masks) == len(shots) else logging.WARNING
             files = {file for folder in {mask.parent for mask in masks} for file in files_in(folder, FRAME_SUFFIXES)}
-            left = len(files.difference(masks, (shot.image for shot in shots)))
-            others = f"; {left} other files beside the masks" if left else ""
+            unused = len(files.difference(masks, (shot.image for shot in shots)))
+            others = f"; {unused} other files beside the masks" if unused else ""
             log.log(level, "%s: %d of %d frames have a mask%s", path, len(masks), len(shots), others)
         tell_of_alpha(path, [shot.has_alpha for shot in shots])
         used = {path / self.masks_at, *(shot.image for shot in shots), *masks, *(p for m in masks for p in m.parents)}
@@ -187,8 +191,8 @@ class RecordedDataManager(DataManager):
         self, recording: Recording, train: Sequence[int], test: Sequence[int], path: Path
     ) -> Mapping[str, Mapping[int, Path]]:
         """The seen masks if the run trains on the frames they were made for; none else."""
-        meant, _ = divide(self.seen_split, range(len(recording.shots)), recording.own_split)
-        if set(meant) == set(train):
+        intended, _ = divide(self.seen_split, range(len(recording.shots)), recording.own_split)
+        if set(intended) == set(train):
             return recording.seen
         if (test or recording.test_sets) and any(recording.seen.values()):
             log.warning(
@@ -199,12 +203,12 @@ class RecordedDataManager(DataManager):
             )
         return {}
 
-    def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen: Mapping[int, Path]) -> list[Frame]:
+    def _frames(self, shots: Sequence[Shot], indices: Sequence[int], seen_masks: Mapping[int, Path]) -> list[Frame]:
         frames = []
         for index in indices:
             shot = shots[index]
             camera = shot.rectification.camera(shot.camera_to_world)
-            source = StoredPixels(shot, self.settings.keep_pixels, seen.get(index))
+            source = StoredPixels(shot, self.settings.keep_pixels, seen_masks.get(index))
             frames.append(Frame(shot.name, index, source, camera, shot.sparse_depth))
         return frames
 
@@ -231,14 +235,14 @@ class RecordedDataManager(DataManager):
         if settings.initial_points == "none":
             return PointCloud(torch.zeros(0, 3)), PointsRecord(source="none", count=0)
         has_depth = any(shot.depth is not None for shot in recording.shots)
-        own, source = recording.own_points, recording.points_source
+        read_points, source = recording.own_points, recording.points_source
         if settings.initial_points == "file":
             source = path / user_path(settings.points_file)
-            own = partial(load_points, source)
-        elif has_depth and (settings.initial_points == "depth" or own is None):
+            read_points = partial(load_points, source)
+        elif has_depth and (settings.initial_points == "depth" or read_points is None):
             points = fuse_depth(train, settings.points_count, generator, progress)
             return points, self._described_points("depth of the training frames", points, path)
-        if own is None or source is None:
+        if read_points is None or source is None:
             missing = POINTS_FILE if source is None else source.name
             from_file = "`datamanager.initial_points=file` and `datamanager.points_file=FILE`"
             raise NoPointsError(
@@ -247,7 +251,7 @@ class RecordedDataManager(DataManager):
                 f"Estimate depth: coliags depth estimate {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or {from_file}",
             )
-        points = subsampled(own(), settings.points_count, generator, source)
+        points = subsampled(read_points(), settings.points_count, generator, source)
         return points, self._described_points(source, points, path)
 
     def _described_points(self, source: Path | str, points: PointCloud, scene: Path) -> PointsRecord:

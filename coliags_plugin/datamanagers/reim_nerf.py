@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped
 from pydantic import Field
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
@@ -50,18 +51,18 @@ class RayDistance(DepthFormat):
     size: float  # mm per step, along the ray
     cosine: Float32[np.ndarray, "h w"]  # ratio of z-depth to ray distance at each working pixel's source pixel
 
+    @override
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`."""
         return read_gray(path, 16, "a one-channel 16-bit distance map")
 
+    @override
     def z_depth(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        """See :class:`DepthFormat`."""
         depth = self._z(stored)
         depth[(stored == 0) | self._is_clipped(stored, depth)] = np.nan
         return depth
 
+    @override
     def clipped_at(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"] | None:
-        """See :class:`DepthFormat`."""
         depth = self._z(stored)
         clipped = self._is_clipped(stored, depth)
         if not clipped.any():
@@ -102,15 +103,15 @@ class ReimNerfDataManager(RecordedDataManager):
     seen_split = "own"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         if not (path / "transforms_train.json").is_file():
             return None
         beside = next((name for name in ("distmaps", MASK_FILE) if (path / name).exists()), None)
         return None if beside is None else f"transforms_train.json beside {beside}"
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         settings = self.settings
         reading.require_folder(path, EXPECTED)
         files = {part: file for part in PARTS if (file := path / f"transforms_{part}.json").is_file()}

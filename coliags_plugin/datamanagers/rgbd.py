@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 from pydantic import Field
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json, read_number
@@ -38,7 +39,6 @@ log = logging.getLogger(__name__)
 
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
-MASK_FOLDERS = ("mask", "masks")
 CONFIDENCE_FOLDERS = ("confidence",)
 TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*_poses.txt")
 CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
@@ -98,8 +98,8 @@ class RGBDDataManager(RecordedDataManager):
     is_calibrated: ClassVar[bool] = False
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         calibrated = not any((path / name).is_file() for name in CAMERA_FILES) and bool(calibration_files(path))
         images = next((name for name in IMAGE_FOLDERS if (path / name).is_dir()), None)
         trajectory = next((file for file in _trajectories(path) if tum.recognise(file)), None)
@@ -114,8 +114,8 @@ class RGBDDataManager(RecordedDataManager):
             for file in _trajectories(path)[:1]:
                 tum.read(file)
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         settings = self.settings
         images = _find_images(path)
         is_metric = settings.depth == "metric"
@@ -128,8 +128,8 @@ class RGBDDataManager(RecordedDataManager):
         camera_file, lens, stated_scale = _find_camera(path, used[0])
         scale = self._depth_scale(stated_scale, camera_file) if depths else None
         rectification = self.rectification_of(lens, camera_file)
-        seen = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
-        masks = _files_of_images(path, MASK_FOLDERS, used, "mask")
+        seen_masks = find_seen_masks(path / "truth", len(images), len(rows) == len(images) == len(trajectory))
+        masks = _files_of_images(path, reading.MASK_FOLDERS, used, "mask")
         confidences = _files_of_images(path, CONFIDENCE_FOLDERS if is_metric else (), used, "confidence")
         if any(confidences) and not depths:
             raise InputError(
@@ -179,7 +179,7 @@ class RGBDDataManager(RecordedDataManager):
             if points is None
             else partial(_read_mesh_points if points.suffix == ".obj" else load_points, points),
             points_source=points,
-            seen={"video": seen},
+            seen={"video": seen_masks},
         )
 
     def _is_by_time(self, images: Sequence[Path]) -> bool:
@@ -202,37 +202,37 @@ class RGBDDataManager(RecordedDataManager):
         # Names are rounded to microseconds; pairs exactly at the tolerance must match.
         within = tolerance + 1e-6
         images = sorted(images, key=_time)
-        taken = np.array([_time(image) for image in images])
-        for first in np.flatnonzero(np.diff(taken) == 0.0):
+        times = np.array([_time(image) for image in images])
+        for first in np.flatnonzero(np.diff(times) == 0.0):
             raise InputError(f"{images[first]} and {images[first + 1].name} have the same timestamp", "one of them")
-        known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
-        pose = nearest_in_time(taken, known, within)
+        stamps = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
+        pose = nearest_in_time(times, stamps, within)
         posed = np.flatnonzero(pose >= 0)
         if not len(posed):
             raise InputError(
-                f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
-                f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
+                f"no pose of {file} is within {tolerance:g} of an image: images from {times[0]:.6f} to "
+                f"{times[-1]:.6f}, poses from {stamps.min():.6f} to {stamps.max():.6f}",
                 "timestamps of one clock in names and trajectory, in seconds, not nanoseconds",
                 "Shift the trajectory's timestamps, or `datamanager.association=order` if line n is image n's",
             )
         deep = np.zeros(len(posed), np.int64)
         if depths:
-            deep = nearest_in_time(taken[posed], np.array([_time(depth) for depth in depths]), within)
-        kept = posed[deep >= 0]
-        if not len(kept):
+            deep = nearest_in_time(times[posed], np.array([_time(depth) for depth in depths]), within)
+        used = posed[deep >= 0]
+        if not len(used):
             raise InputError(
                 f"no depth file within {tolerance:g} of an image that has a pose",
                 "depth files named by timestamps of the images' clock",
                 "Rename them, or `datamanager.depth=none`",
             )
-        without = {"without_pose": len(images) - len(posed), "without_depth": len(posed) - len(kept)}
+        without = {"without_pose": len(images) - len(posed), "without_depth": len(posed) - len(used)}
         if any(without.values()):
             said = "%s: of %d images %d have no pose and %d no depth within %g s; they are left out"
             log.warning(said, file.parent, len(images), *without.values(), tolerance)
-        difference = float(np.abs(taken[kept] - known[pose[kept]]).max())
+        difference = float(np.abs(times[used] - stamps[pose[used]]).max())
         rows: list[_Row] = [
             (images[index], depths[depth] if depths else None, int(pose[index]))
-            for index, depth in zip(kept, deep[deep >= 0], strict=True)
+            for index, depth in zip(used, deep[deep >= 0], strict=True)
         ]
         return rows, {"by": "time", **without, "largest_difference_s": difference}
 
@@ -276,16 +276,16 @@ class RGBDDataManager(RecordedDataManager):
                 "`datamanager.association=time` if the names are timestamps, or order if these mean nothing",
             )
 
-    def _depth_scale(self, said: float | None, file: Path) -> float:
+    def _depth_scale(self, stated: float | None, file: Path) -> float:
         """Depth steps per scene unit, as the camera's file and the option say."""
-        given = self.settings.depth_scale
-        if said is not None and given is not None and said != given:
+        option = self.settings.depth_scale
+        if stated is not None and option is not None and stated != option:
             raise InputError(
-                f"{file}: depth_scale = {said:g}, but the option depth_scale is {given:g}",
+                f"{file}: depth_scale = {stated:g}, but the option depth_scale is {option:g}",
                 "one depth_scale",
                 "Leave the option out, or correct the file",
             )
-        scale = said if said is not None else given
+        scale = stated if stated is not None else option
         if scale is None:
             raise InputError(
                 f"{file.parent} has depth files, but their number of steps per unit of the trajectory is not given",
@@ -306,22 +306,13 @@ class EndoMapperDataManager(RGBDDataManager):
     is_calibrated = True
 
 
-def _files(folder: Path, names: tuple[str, ...], suffixes: frozenset[str]) -> tuple[Path | None, list[Path]]:
-    """The only folder of one of these names, and its files; None and none without such a folder."""
-    folders = [folder / name for name in names if (folder / name).is_dir()]
-    if len(folders) > 1:
-        listed = " and ".join(f"{path.name}/" for path in folders)
-        raise InputError(f"{folder} holds {listed}", "only one of them", "Move the other away")
-    files = [path for found in folders for path in reading.files_in(found, suffixes)]
-    return next(iter(folders), None), files
-
-
 def _find_images(folder: Path) -> list[Path]:
     """The colour images; there must be one folder of them."""
     reading.require_folder(folder, EXPECTED)
-    image_folder, images = _files(folder, IMAGE_FOLDERS, reading.IMAGE_SUFFIXES)
+    image_folder = reading.one_folder(folder, IMAGE_FOLDERS)
     if image_folder is None:
         raise InputError(f"{folder} holds {reading.inventory(folder)}", EXPECTED, "Name the scene's own folder")
+    images = reading.files_in(image_folder, reading.IMAGE_SUFFIXES)
     if not images:
         raise InputError(f"{image_folder} holds {reading.inventory(image_folder)}", "PNG or JPEG images")
     return images
@@ -329,23 +320,26 @@ def _find_images(folder: Path) -> list[Path]:
 
 def _find_depths(folder: Path) -> list[Path]:
     """The depth files, unordered: images, or arrays where there are none."""
-    depth_folder, depths = _files(folder, DEPTH_FOLDERS, reading.DEPTH_SUFFIXES)
-    depths = depths or _files(folder, DEPTH_FOLDERS, reading.ARRAY_SUFFIXES)[1]
-    if depth_folder is not None and not depths:
-        reading.warn_of_other_kinds(sorted(depth_folder.iterdir()), reading.DEPTH_SUFFIXES | reading.ARRAY_SUFFIXES)
+    depth_folder = reading.one_folder(folder, DEPTH_FOLDERS)
+    if depth_folder is None:
+        return []
+    kinds = (reading.DEPTH_SUFFIXES, reading.ARRAY_SUFFIXES)
+    depths = next(filter(None, (reading.files_in(depth_folder, suffixes) for suffixes in kinds)), [])
+    if not depths:
+        reading.warn_of_other_kinds(sorted(depth_folder.iterdir()), frozenset().union(*kinds))
     return depths
 
 
-def _files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> list[Path | None]:
+def _files_of_images(folder: Path, names: Sequence[str], images: Sequence[Path], what: str) -> list[Path | None]:
     """Files of the stems of images, such as masks, where there is a folder of one of the ``names``, else None for each.
 
     The folder must have one for every image; ``what`` they are is for the error.
     """
-    file_folder, _ = _files(folder, names, reading.FRAME_SUFFIXES)
-    found = dict.fromkeys([image.name for image in images])
-    if file_folder is not None:
-        found = reading.sidecar_files(file_folder, [*found], reading.MASK_SUFFIXES)
-    return reading.for_all(found, file_folder, f"a {what}", or_none=file_folder is None)
+    file_folder = reading.one_folder(folder, names)
+    if file_folder is None:
+        return [None] * len(images)
+    files = reading.sidecar_files(file_folder, [image.name for image in images], reading.MASK_SUFFIXES)
+    return reading.for_all(files, file_folder, f"a {what}", or_none=False)
 
 
 def _find_trajectory(folder: Path, named: str | None) -> Path:
@@ -398,8 +392,8 @@ def _trajectories(folder: Path) -> list[Path]:
 def _read_json(path: Path, image: Path) -> _Camera:
     lens, content = PinholeLens.of(reading.read_intrinsics(path)), read_json(path, "a JSON object")
     expected = "a number above 0: depth steps per scene unit"
-    given = content.get("depth_scale") is not None
-    return path, lens, read_number(content, "depth_scale", path, expected, above=0.0) if given else None
+    has_scale = content.get("depth_scale") is not None
+    return path, lens, read_number(content, "depth_scale", path, expected, above=0.0) if has_scale else None
 
 
 def _read_intrinsics_txt(path: Path, image: Path) -> _Camera:

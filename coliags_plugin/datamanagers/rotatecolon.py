@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from pydantic import Field
+from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
@@ -69,12 +70,12 @@ class RotateColonDataManager(RecordedDataManager):
     seen_split = "all-train"
 
     @classmethod
+    @override
     def recognise(cls, path: Path) -> str | None:
-        """See :class:`DataManager`."""
         return f"{TRAIN} beside {TRAIN_VIEWS}/" if (path / TRAIN).is_file() and (path / TRAIN_VIEWS).is_dir() else None
 
+    @override
     def open(self, path: Path) -> Recording:
-        """See :class:`RecordedDataManager`."""
         require_folder(path, _LAYOUT)
         if self.recognise(path) is None:
             raise InputError(f"{path} holds {inventory(path)}", _LAYOUT, "Name the scene's own folder")
@@ -91,23 +92,23 @@ class RotateColonDataManager(RecordedDataManager):
             parts.append(self._views(test, images, None, "test-"))
         (shots, facts), *others = parts
         complete = not any(part["images_without_pose"] for _, part in parts)
-        test_sets, seen = {}, {}
+        test_sets, seen_masks = {}, {}
         name = _MAIN_SET if self.settings.split in ("all-train", "own") else ROTATION
         for test_sets[name], facts[name] in others:
-            seen[name] = find_seen_masks(path / "truth", len(test_sets[name]), complete)
+            seen_masks[name] = find_seen_masks(path / "truth", len(test_sets[name]), complete)
         points = path / POINTS
-        known = points if points.is_file() else None
+        present_points = points if points.is_file() else None
         pixels = (file for views, _ in parts for file in (*[v.image for v in views], *[v.depth for v in views]))
         return Recording(
             kind="RotateColon layout",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (known, *pixels), (path / TRAIN, test if others else None)),
+            fingerprint=fingerprint(path, (present_points, *pixels), (path / TRAIN, test if others else None)),
             test_sets=test_sets,
             own_split={"train": range(len(shots)), "test": ()},
-            own_points=None if known is None else lambda: _pink(load_points(points)),
+            own_points=None if present_points is None else lambda: _pink(load_points(points)),
             points_source=points,
-            seen=seen,
+            seen=seen_masks,
         )
 
     def _views(

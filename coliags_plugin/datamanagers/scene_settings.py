@@ -80,23 +80,23 @@ def split_options(split: str, block: Sequence[float] = (0.4, 0.6)) -> list[str]:
 def divide(
     split: Split,
     indices: Sequence[int],
-    own: Mapping[str, Sequence[int]] | None = None,
+    own_split: Mapping[str, Sequence[int]] | None = None,
     block: tuple[float, float] = (0.4, 0.6),
 ) -> tuple[list[int], list[int]]:
     """Training and test indices among the used frames of a video, given in video order.
 
-    ``own`` is the dataset's split, ``{"train": ..., "test": ...}``, for split ``own``; the others are as for
+    ``own_split`` is the dataset's split, ``{"train": ..., "test": ...}``, for split ``own``; the others are as for
     :func:`held_out`.
     """
     if split == "own":
-        if own is None:
+        if own_split is None:
             raise ValueError("split 'own' needs the dataset's own split")
         used = set(indices)
-        train, test = ([index for index in own[part] if index in used] for part in ("train", "test"))
+        train, test = ([index for index in own_split[part] if index in used] for part in ("train", "test"))
         return train, test
     is_test = held_out(split, len(indices), block)
-    train = [index for index, held in zip(indices, is_test, strict=True) if not held]
-    return train, [index for index, held in zip(indices, is_test, strict=True) if held]
+    train = [index for index, is_held in zip(indices, is_test, strict=True) if not is_held]
+    return train, [index for index, is_held in zip(indices, is_test, strict=True) if is_held]
 
 
 POINTS_FILE = "points3D.ply"

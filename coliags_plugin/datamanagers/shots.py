@@ -180,7 +180,7 @@ class Shot:
 
     @cached_property
     def has_alpha(self) -> bool:
-        """Whether the image has an alpha channel, by its header."""
+        """True if the image has an alpha channel, by its header."""
         return has_alpha(self.image)
 
     def shown(self) -> Bool[np.ndarray, "H W"] | None:
@@ -213,13 +213,13 @@ class StoredPixels(PixelSource):
 
     Attributes:
         keep: Whether maps are cached; otherwise, every access reads its file.
-        seen: Mask that is black where no training frame sees the surface; None where there is none.
+        seen_mask: Mask that is black where no training frame sees the surface; None where there is none.
         scale: Factor from lengths of the shot to those of the maps.
     """
 
     shot: Shot
     keep: bool = True
-    seen: Path | None = None
+    seen_mask: Path | None = None
     scale: float = 1.0
     _cache: dict[str, np.ndarray | None] = field(default_factory=dict, repr=False)
 
@@ -299,7 +299,7 @@ def _depth(pixels: StoredPixels) -> Shaped[np.ndarray, "H W"] | None:
 
 
 def _seen(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
-    path = pixels.seen
+    path = pixels.seen_mask
     return None if path is None else pixels.shot.rectification.sampled(path, read_mask(path))
 
 

@@ -40,27 +40,29 @@ def formats() -> list[str]:
 
 def find_format(path: Path) -> str:
     """The name of the one data manager that recognises a folder."""
-    known = ", ".join(formats())
+    names = ", ".join(formats())
     if not path.exists():
-        raise InputError(f"no folder {path}", f"a scene in one of the formats {known}", "Check the path")
+        raise InputError(f"no folder {path}", f"a scene in one of the formats {names}", "Check the path")
     if path.is_file():
         raise _no_folder(path)
-    found = recognised(path)
-    if not found and (videos := videos_in(path)):
+    evidence = recognised(path)
+    if not evidence and (videos := videos_in(path)):
         raise _no_scene(path, f"{path} holds the video {videos[0].name}, and no scene")
-    if not found:
+    if not evidence:
         for name in formats():
             registry.datamanagers.get(name).refuse_nearly(path)
         raise InputError(
-            f"{path} holds {inventory(path)}, which none of the formats {known} recognises",
+            f"{path} holds {inventory(path)}, which none of the formats {names} recognises",
             "a scene's own folder",
             "docs/data.md lists what each looks like; `data_format=NAME` chooses one and says what it misses. Images "
             "without poses become a scene by coliags poses sfm; beside depth, rgbd reads them with a TUM trajectory",
         )
-    if len(found) > 1:
-        seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
-        raise InputError(f"{path} may be of several formats ({seen})", "one of them", "Choose with `data_format=NAME`")
-    ((name, reason),) = found.items()
+    if len(evidence) > 1:
+        listed = "; ".join(f"{name}: {reason}" for name, reason in evidence.items())
+        raise InputError(
+            f"{path} may be of several formats ({listed})", "one of them", "Choose with `data_format=NAME`"
+        )
+    ((name, reason),) = evidence.items()
     log.info("%s: format %s (%s)", path, name, reason)
     return name
 
@@ -77,14 +79,14 @@ def videos_in(folder: Path) -> list[Path]:
 
 
 def _no_scene(path: Path, seen: str) -> InputError:
-    """What to do about a recording that was given in the place of a scene's folder."""
+    """Error for a recording that was given in the place of a scene's folder."""
     quoted = shlex.quote(str(path))
     makes = f"coliags reconstruct {quoted} --output FOLDER reconstructs it; coliags poses sfm {quoted} --output FOLDER"
     return InputError(seen, "a scene's folder", f"{makes} makes a scene with poses")
 
 
 def _no_folder(path: Path) -> InputError:
-    """What to do about a file that was given in the place of a scene's folder."""
+    """Error for a file that was given in the place of a scene's folder."""
     if path.suffix.lower() in _VIDEO_SUFFIXES:
         return _no_scene(path, f"{path} is a video")
     if recognised(path.parent):
@@ -172,8 +174,8 @@ def open_scene(
 
 
 def _manager(name: str, options: Sequence[str], **more: str) -> DataManager:
-    own = [option.removeprefix("datamanager.") for option in options]
-    given = override_all(Node({}, "options"), own).plain()
-    component = named_component("datamanagers", {**given, **more, "name": name}, "scene")
+    stripped = [option.removeprefix("datamanager.") for option in options]
+    values = override_all(Node({}, "options"), stripped).plain()
+    component = named_component("datamanagers", {**values, **more, "name": name}, "scene")
     manager: DataManager = component.target(component.settings)
     return manager

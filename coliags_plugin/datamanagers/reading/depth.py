@@ -103,8 +103,8 @@ class InverseDepth(ScaledDepth):
         with np.errstate(over="ignore"):
             inverse = self.scale * (stored / 65536.0) + self.offset
             # The sky, thousands of times as far as the rest, is at no distance.
-            known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
-            return np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0).astype(np.float32)
+            is_known = (inverse > max(0.0, 1e-4 * float(inverse.max()))) & (self.scale > 0.0)
+            return np.where(is_known, 1.0 / np.where(is_known, inverse, 1.0), 0.0).astype(np.float32)
 
 
 #: Stored EXR depth from this value on is background; Blender writes 1e10.

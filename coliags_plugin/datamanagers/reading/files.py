@@ -28,6 +28,8 @@ TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
 FRAME_SUFFIXES = IMAGE_SUFFIXES | TIFF_SUFFIXES | {".bmp", ".webp"}
 #: Of masks; the first counts where there are several.
 MASK_SUFFIXES = (".png", *sorted(FRAME_SUFFIXES - {".png"}))
+#: Folders of masks that lie beside the images.
+MASK_FOLDERS = ("mask", "masks")
 DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
 ARRAY_SUFFIXES = frozenset({".npy"})
 
@@ -36,6 +38,15 @@ def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
     """Files of a folder with one of some suffixes in either case, by name; no hidden ones, as macOS's ``._1.png``."""
     files = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith("."))
     return sorted(path for path in files if path.is_file())
+
+
+def one_folder(scene: Path, names: Sequence[str]) -> Path | None:
+    """The only folder of one of some names; None without any."""
+    folders = [scene / name for name in names if (scene / name).is_dir()]
+    if len(folders) > 1:
+        listed = " and ".join(f"{path.name}/" for path in folders)
+        raise InputError(f"{scene} holds {listed}", "only one of them", "Move the other away")
+    return folders[0] if folders else None
 
 
 def sidecar_files(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> dict[str, Path | None]:
@@ -53,8 +64,8 @@ def sidecar_files(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -
     files: dict[str, Path | None] = {}
     for name in names:
         places = [folder / name, folder / name.replace("\\", "/")]  # the second: a name of Windows
-        found = [held(p.parent).get(p.name) or held(p.parent).get(p.stem) for p in places]
-        files[name] = found[0] or found[1]
+        candidates = [held(p.parent).get(p.name) or held(p.parent).get(p.stem) for p in places]
+        files[name] = candidates[0] or candidates[1]
     return files
 
 
@@ -158,8 +169,8 @@ def inventory(folder: Path) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
-    """The path of a file that another one, ``said`` in messages, names relative to ``folder``; it need not exist.
+def named_file(folder: Path, name: str, source: str, outside: bool) -> Path:
+    """The path of a file that another one, ``source`` in messages, names relative to ``folder``; it need not exist.
 
     ``outside`` tells whether it may lie outside of the folder. Links within the folder may always lead anywhere.
     """
@@ -170,17 +181,17 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
     within = Path(posixpath.normpath(folder.absolute()))
     if not outside and not Path(posixpath.normpath(path.absolute())).is_relative_to(within):
         raise InputError(
-            f"{said} names {name[:200]}, which is outside of {folder}",
+            f"{source} names {name[:200]}, which is outside of {folder}",
             "files in the scene's own folder",
             "If you trust it: `datamanager.outside_files=true`",
         )
     try:
         path.lstat()
     except ValueError as error:  # it has a zero
-        raise InputError(f"{said} names {name[:200]!r}", "the name of a file") from error
+        raise InputError(f"{source} names {name[:200]!r}", "the name of a file") from error
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise InputError(f"{said} names {name[:200]}..., {len(name):,} letters", "the name of a file") from error
+            raise InputError(f"{source} names {name[:200]}..., {len(name):,} letters", "the name of a file") from error
     return path
 
 
@@ -203,13 +214,13 @@ def short_names(paths: Sequence[str]) -> list[str]:
 
 def unposed_images(used: Sequence[Path], excluded: Iterable[Path | None] = ()) -> list[Path]:
     """Images without a pose in the folders of those with one, except other files there (depth, masks)."""
-    known = {*used, *excluded}
+    excluded_paths = {*used, *excluded}
     suffixes = {path.suffix.lower() for path in used}
     return [
         path
         for folder in dict.fromkeys(path.parent for path in used)
         for path in files_in(folder, suffixes)
-        if path not in known
+        if path not in excluded_paths
     ]
 
 
