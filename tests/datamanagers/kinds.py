@@ -448,22 +448,6 @@ def shorten(arrays: dict[str, np.ndarray]) -> None:
     arrays["gt_w2c_all_frames"] = arrays["gt_w2c_all_frames"][:-2]
 
 
-def confident(spoil: Callable[[int, dict], object] = lambda index, frame: None, dtype: str = "uint8") -> Spoil:
-    """Every frame of nerfstudio's gets a confidence, then the frames are spoilt."""
-
-    def change(folder: Path) -> None:
-        def add(index: int, frame: dict) -> None:
-            frame["confidence_file_path"] = frame["depth_file_path"].replace("depth/", "confidence/")
-            pixels = np.zeros((32, 40), dtype if index == 2 else "uint8")
-            (folder / "confidence").mkdir(exist_ok=True)
-            cv2.imwrite(str(folder / frame["confidence_file_path"]), pixels)
-            spoil(index, frame)
-
-        change_frames("transforms.json", add)(folder)
-
-    return change
-
-
 def fourth_without(key: str) -> Callable[[int, dict], object]:
     return lambda index, frame: index == 3 and frame.pop(key)
 
@@ -498,7 +482,6 @@ DAMAGES: dict[str, Callable[[Kind], Spoil]] = {
     "the first image of another size": lambda k: repaint(k.images, 0, half_size),
     "depth of another size": lambda k: repaint(k.depths, 0, half_size),
     "an image cut short": lambda k: cut(k.images, 4),
-    "an empty image": lambda k: cut(k.images, 4, 0.0),
     "an image of one channel": lambda k: repaint(k.images, 4, lambda pixels: pixels[..., 0].copy()),
     "depth cut short": lambda k: cut(k.depths, 5),
     "depth of three channels": lambda k: repaint(k.depths, 5, three_channels),
@@ -556,7 +539,6 @@ an image of another size | all: <4>\.png is 20 x 16, but \S*<size> says 40 x 32.
 the first image of another size | all: (20 x 16.*40 x 32|40 x 32.*20 x 16)
 depth of another size | depth: <0>\.(png|tiff|exr) is 20 x 16, but \S*<size> says 40 x 32
 an image cut short | all: <4>\.png \(\d+ bytes\) cannot be decoded.*a complete image
-an empty image | all: <4>\.png \(0 bytes\) cannot be decoded
 an image of one channel | all: <4>\.png is an image of 1 channel of uint8
 depth cut short | depth: <5>\.(png|tiff|exr) \(\d+ bytes\) cannot be decoded.*complete
 depth of three channels
@@ -762,13 +744,8 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             (change_json("camera.json", depth_scale=scale), "depth reaches from .* scene units")
             for scale in (1e-7, 1e-320, 1e300)
         ),
-        (lambda folder: (folder / "confidence").mkdir(), r"confidence: 0 of 11 frames have a confidence; 1305031102\."),
     ],
     "rgbd-by-order": [
-        (
-            lambda folder: shutil.copytree(folder / "depth", folder / "confidence"),
-            r"confidence/0\.png is an image of 1 channel of uint16.*255 = 1",
-        ),
         (copy("rgb/*.png", "cover.png"), r"cover\.png: no number in its name"),
         (
             lambda folder: (
@@ -776,10 +753,6 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
                 and change_lines("groundtruth.txt", lambda rows: [*rows[:5], *rows[6:]])(folder)
             ),
             r"pose 5 has timestamp 6, but image 5 is 5\.png",
-        ),
-        (
-            lambda folder: [shutil.copytree(folder / "depth", folder / "confidence"), shutil.rmtree(folder / "depth")],
-            "holds confidence/, but no depth",
         ),
     ],
     "colmap": [
@@ -806,13 +779,6 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
     ],
     "nerfstudio": [
         (change_frames("transforms.json", fourth_without("depth_file_path")), "10 of 11 frames have a depth_file_path"),
-        (confident(fourth_without("confidence_file_path")), r"10 of 11 frames have a confidence_file_path; images/f"),
-        (confident(lambda index, entry: entry.pop("depth_file_path")), "confidence_file_path, but no depth_file_path"),
-        (
-            lambda folder: [confident()(folder), repaint("confidence/*.png", 2, half_size)(folder)],
-            r"confidence/frame_00003\.png is 20 x 16, but .* says 40 x 32",
-        ),
-        (confident(dtype="uint16"), r"confidence/frame_00003\.png is an image of 1 channel of uint16.*255 = 1"),
         *(
             (change_json("transforms.json", **content), message)
             for content, message in (

@@ -17,7 +17,6 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings, read_camera_intrinsics
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.phantom.layouts.built_in import depth_steps
 from tests.datamanagers.kinds import remove, repaint
 from tests.datamanagers.wall_scenes import (
     colors,
@@ -36,17 +35,6 @@ def load(folder: Path, name: str = "c3vd", **options) -> Scene:
 
 
 # Depth
-
-
-def test_depth_is_100_mm_in_16_bits():
-    steps = np.array([[0, 1, 32768, 65534, 65535]], np.uint16)
-    depth = C3VD_DEPTH.z_depth(steps)
-    np.testing.assert_array_equal(np.isnan(depth), [[True, False, False, False, True]])
-    np.testing.assert_allclose(depth[0, 1:4], [100 / 65535, 32768 * 100 / 65535, 65534 * 100 / 65535], rtol=1e-6)
-    depth = np.array([[1e-6, 0.5, 42.0, 99.999]])
-    np.testing.assert_allclose(C3VD_DEPTH.z_depth(depth_steps(depth)), depth, atol=100 / 65535)
-    unknown = np.array([[np.nan, 0.0, -3.0, 100.0, np.inf, 250.0]])
-    assert np.isnan(C3VD_DEPTH.z_depth(depth_steps(unknown))).all()
 
 
 def test_simcol_depth_is_read_whole(shared_data):

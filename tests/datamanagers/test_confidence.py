@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, concatenate_targets
 from coliags_plugin.datamanagers.reading.images import resize_nearest
 from coliags_plugin.engine.data_formats import find_format
-from tests.datamanagers.kinds import change_frames, change_json, files
+from tests.datamanagers.kinds import change_frames, change_json, files, half_size, remove, repaint
 from tests.datamanagers.wall_scenes import HEIGHT, WIDTH, manager
 from tests.scenes import camera_at
 
@@ -76,6 +77,35 @@ def test_it_is_part_of_the_fingerprint_and_can_be_left_out(folder):
     scene = load(folder)
     assert scene.provenance.depth_is_estimated is False
     assert scene.train[0].depth_confidence is None and scene.train[0].true_depth is not None
+
+
+def without(part: str, place: int | None = None):
+    """Leave out the files of a part, or one of them."""
+
+    def spoil(folder: Path) -> None:
+        if find_format(folder) == "rgbd":
+            return remove(f"{part}/*.png", place)(folder)
+        change_frames(
+            "transforms.json",
+            lambda index, entry: entry.pop(f"{part}_file_path") if place in (None, index) else None,
+        )(folder)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (without("confidence", 3), r"10 of 11 frames have a confidence(_file_path)?;"),
+        (without("depth"), "confidence.*, but no depth"),
+        (repaint("confidence/*.png", 2, half_size), r"confidence/\S*\.png is 20 x 16, but .* says 40 x 32"),
+        (repaint("confidence/*.png", 2, np.uint16), r"confidence/\S*\.png is an image of 1 channel of uint16.*255 = 1"),
+    ],
+)
+def test_confidence_that_does_not_go_with_depth_is_refused(folder, spoil, message):
+    spoil(folder)
+    with pytest.raises(InputError, match=message):
+        load(folder)
 
 
 def test_initial_points_are_fused_from_trusted_depth(folder):

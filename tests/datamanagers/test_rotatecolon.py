@@ -54,12 +54,6 @@ def test_without_points_they_come_from_depth(mine):
     assert load(mine).provenance.points.source == "depth of the training frames"
 
 
-def test_alpha_is_dropped(mine):
-    image = cv2.imread(str(mine / "train_views/0003.png"))
-    cv2.imwrite(str(mine / "train_views/0003.png"), np.dstack([image, np.full(image.shape[:2], 7, np.uint8)]))
-    np.testing.assert_array_equal(load(mine).train[3].image, image[..., ::-1])
-
-
 def test_numbers_decide_the_order_and_may_be_written_as_paths(mine):
     def change(content: dict) -> None:
         for index, frame in enumerate(content["frames"]):
@@ -72,13 +66,6 @@ def test_numbers_decide_the_order_and_may_be_written_as_paths(mine):
     assert names(scene.train) == [str(index) for index in range(2, FRAMES + 2)]
     found = [frame.camera.camera_to_world for frame in scene.train]
     np.testing.assert_allclose(found, poses(FRAMES), atol=1e-5)
-
-
-def test_images_without_pose_are_left_out_and_counted(mine):
-    change_json("transforms.json", lambda content: content["frames"].pop(4))(mine)
-    scene = load(mine)
-    assert names(scene.train) == [f"{index:04d}" for index in range(FRAMES) if index != 4]
-    assert scene.provenance.images_without_pose == 1
 
 
 def test_test_views_may_be_elsewhere_of_another_camera_or_none(mine):
