@@ -80,92 +80,6 @@ PIXEL_MAPS: Mapping[str, PixelMap] = {
 }
 
 
-class PixelMaps(ABC):
-    """Typed access to per-pixel maps by name; the image is always there, others may be None."""
-
-    @abstractmethod
-    def read(self, name: str) -> Tensor | None:
-        """The map of a name in :data:`PIXEL_MAPS`; None where there is none."""
-
-    @property
-    def image(self) -> UInt8[Tensor, "H W 3"]:
-        """RGB. [H, W, 3]"""
-        return cast(Tensor, self.read("image"))
-
-    @property
-    def mask(self) -> Bool[Tensor, "H W"] | None:
-        """False where a pixel is to be ignored; None means every pixel counts. [H, W]"""
-        return self.read("mask")
-
-    @property
-    def depth(self) -> Float[Tensor, "H W"] | None:
-        """z-depth, mm; NaN where unknown. [H, W]"""
-        return self.read("depth")
-
-    @property
-    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
-        """Depth that the sensor clipped at, mm: the surface lies there or beyond, and ``depth`` is NaN.
-
-        NaN elsewhere. [H, W]
-        """
-        return self.read("depth_at_least")
-
-    @property
-    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
-        """Probability in [0, 1] that the relative error of estimated depth is below 5 %; 0 where it is a mere prior.
-
-        None where ``depth`` is true: measured or rendered. [H, W]
-        """
-        return self.read("depth_confidence")
-
-    @property
-    def seen(self) -> Bool[Tensor, "H W"] | None:
-        """True where a training frame sees the same surface; of test views with ground-truth geometry. [H, W]"""
-        return self.read("seen")
-
-    @property
-    def rgb(self) -> Float[Tensor, "H W 3"]:
-        """The image in [0, 1], float32. [H, W, 3]"""
-        return self.image.to(torch.float32) / 255.0
-
-    @property
-    def valid(self) -> Bool[Tensor, "H W"]:
-        """The mask, all True where there is none. [H, W]"""
-        mask, image = self.mask, self.image
-        return torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
-
-
-@dataclass(frozen=True)
-class Target(PixelMaps):
-    """Ground truth of a training step: a frame, or P pixels of frames as P rows and one column.
-
-    Attributes:
-        name: Name of the frame, or of the frames.
-        maps: Per-pixel maps that have a :attr:`PixelMap.fill`, by name.
-        sparse_depth: Depth at single points of a whole frame; None where there is none.
-        index: Index of a whole frame in the video.
-        chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
-    """
-
-    name: str
-    maps: Mapping[str, Tensor]
-    sparse_depth: SparseDepth | None = None
-    index: int = 0
-    chosen: Int[Tensor, "H W"] | None = None
-
-    @override
-    def read(self, name: str) -> Tensor | None:
-        return self.maps.get(name)
-
-    @property
-    def ids(self) -> Int[Tensor, "H W"]:
-        """A number for every pixel that no other of the training frames has. [H, W]"""
-        if self.chosen is not None:
-            return self.chosen
-        height, width = self.image.shape[:2]
-        return pixel_ids(self.index, torch.arange(height * width, device=self.image.device).view(height, width))
-
-
 class PixelSource(ABC):
     """Source of the per-pixel maps of a frame: memory or files."""
 
@@ -196,6 +110,90 @@ class PixelTensors(PixelSource):
     def scaled(self, factor: float) -> PixelTensors:
         lengths = {name: factor * values for name, values in self.maps.items() if PIXEL_MAPS[name].is_length}
         return PixelTensors({**self.maps, **lengths})
+
+
+class PixelMaps:
+    """Typed access to the maps of a source; the image is always there, others may be None.
+
+    Files are read at each access unless their source keeps them.
+    """
+
+    source: PixelSource
+
+    @property
+    def image(self) -> UInt8[Tensor, "H W 3"]:
+        """RGB. [H, W, 3]"""
+        return cast(Tensor, self.source.read("image"))
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        """False where a pixel is to be ignored; None means every pixel counts. [H, W]"""
+        return self.source.read("mask")
+
+    @property
+    def depth(self) -> Float[Tensor, "H W"] | None:
+        """z-depth, mm; NaN where unknown. [H, W]"""
+        return self.source.read("depth")
+
+    @property
+    def depth_at_least(self) -> Float[Tensor, "H W"] | None:
+        """Depth that the sensor clipped at, mm: the surface lies there or beyond, and ``depth`` is NaN.
+
+        NaN elsewhere. [H, W]
+        """
+        return self.source.read("depth_at_least")
+
+    @property
+    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
+        """Probability in [0, 1] that the relative error of estimated depth is below 5 %; 0 where it is a mere prior.
+
+        None where ``depth`` is true: measured or rendered. [H, W]
+        """
+        return self.source.read("depth_confidence")
+
+    @property
+    def seen(self) -> Bool[Tensor, "H W"] | None:
+        """True where a training frame sees the same surface; of test views with ground-truth geometry. [H, W]"""
+        return self.source.read("seen")
+
+    @property
+    def rgb(self) -> Float[Tensor, "H W 3"]:
+        """The image in [0, 1], float32. [H, W, 3]"""
+        return self.image.to(torch.float32) / 255.0
+
+    @property
+    def valid(self) -> Bool[Tensor, "H W"]:
+        """The mask, all True where there is none. [H, W]"""
+        if (mask := self.mask) is not None:
+            return mask
+        return torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
+
+
+@dataclass(frozen=True)
+class Target(PixelMaps):
+    """Ground truth of a training step: a frame, or P pixels of frames as P rows and one column.
+
+    Attributes:
+        name: Name of the frame, or of the frames.
+        source: Per-pixel maps that have a :attr:`PixelMap.fill`.
+        sparse_depth: Depth at single points of a whole frame; None where there is none.
+        index: Index of a whole frame in the video.
+        chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
+    """
+
+    name: str
+    source: PixelTensors
+    sparse_depth: SparseDepth | None = None
+    index: int = 0
+    chosen: Int[Tensor, "H W"] | None = None
+
+    @property
+    def ids(self) -> Int[Tensor, "H W"]:
+        """A number for every pixel that no other of the training frames has. [H, W]"""
+        if self.chosen is not None:
+            return self.chosen
+        height, width = self.image.shape[:2]
+        return pixel_ids(self.index, torch.arange(height * width, device=self.image.device).view(height, width))
 
 
 @dataclass(frozen=True)
@@ -240,16 +238,10 @@ class Frame(PixelMaps):
         present = {name: values for name, values in changed.items() if values is not None}
         return replace(self, source=PixelTensors(present))
 
-    @override
-    def read(self, name: str) -> Tensor | None:
-        """Files are read at each call unless their source keeps them."""
-        return self.source.read(name)
-
     @property
     @override
     def valid(self) -> Bool[Tensor, "H W"]:
-        """Reads no image."""
-        mask, camera = self.mask, self.camera
+        mask, camera = self.mask, self.camera  # without reading the image
         size, device = (camera.height, camera.width), camera.camera_to_world.device
         return torch.ones(size, dtype=torch.bool, device=device) if mask is None else mask
 
@@ -264,9 +256,9 @@ class Frame(PixelMaps):
         maps = self._target_maps(lambda values: values[row, column][:, None])
         return Target(self.name, maps, chosen=pixel_ids(self.index, row * self.camera.width + column)[:, None])
 
-    def _target_maps(self, select: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        maps = {name: self.read(name) for name, schema in PIXEL_MAPS.items() if schema.fill is not None}
-        return {name: select(values) for name, values in maps.items() if values is not None}
+    def _target_maps(self, select: Callable[[Tensor], Tensor]) -> PixelTensors:
+        maps = {name: self.source.read(name) for name, schema in PIXEL_MAPS.items() if schema.fill is not None}
+        return PixelTensors({name: select(values) for name, values in maps.items() if values is not None})
 
     @property
     def true_depth(self) -> Float[Tensor, "H W"] | None:
@@ -423,15 +415,15 @@ def concatenate_targets(parts: Sequence[Target]) -> Target:
     maps = {
         name: torch.cat([_filled(part, name) for part in parts])
         for name in PIXEL_MAPS
-        if any(name in part.maps for part in parts)
+        if any(name in part.source.maps for part in parts)
     }
     chosen, name = torch.cat([part.ids for part in parts]), ", ".join(part.name for part in parts)
-    return Target(name, maps, chosen=chosen)
+    return Target(name, PixelTensors(maps), chosen=chosen)
 
 
 def _filled(part: Target, name: str) -> Tensor:
     """A map of a target, or its :attr:`PixelMap.fill` everywhere."""
-    if name in part.maps:
-        return part.maps[name]
+    if name in part.source.maps:
+        return part.source.maps[name]
     schema, image = PIXEL_MAPS[name], part.image
     return torch.full(image.shape[:2], cast(float, schema.fill), dtype=schema.dtype, device=image.device)

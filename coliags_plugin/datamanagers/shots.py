@@ -85,9 +85,10 @@ class Rectification:
             return resize_nearest(values, self.width, self.height)
         return self.undistortion().nearest(values, 0)
 
-    def sampled(self, path: Path, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
-        """Values of a file as :meth:`nearest`, after a check of its size as :meth:`checked`."""
-        return self.nearest(self.checked(path, values))
+    def resampled(self, name: str, path: Path, values: Shaped[np.ndarray, "H W ..."]) -> Shaped[np.ndarray, "h w ..."]:
+        """The per-pixel map of a name, read from a file, at the working size; checks its size as :meth:`checked`."""
+        stored = self.checked(path, values)
+        return self.image(stored) if PIXEL_MAPS[name].is_smooth else self.nearest(stored)
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
@@ -278,12 +279,12 @@ class StoredPixels(PixelSource):
 
 def _image(pixels: StoredPixels) -> UInt8[np.ndarray, "H W 3"]:
     shot = pixels.shot
-    return shot.rectification.image(shot.rectification.checked(shot.image, read_rgb(shot.image)))
+    return shot.rectification.resampled("image", shot.image, read_rgb(shot.image))
 
 
 def _mask(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
     shot, rectification = pixels.shot, pixels.shot.rectification
-    mask = None if shot.mask is None else rectification.sampled(shot.mask, read_mask(shot.mask))
+    mask = None if shot.mask is None else rectification.resampled("mask", shot.mask, read_mask(shot.mask))
     shown = shot.shown()
     if shown is not None:  # working pixels that mix in the colour of a hidden one are hidden, too
         shown = rectification.image(shown.astype(np.uint8) * 255) == 255
@@ -294,21 +295,22 @@ def _depth(pixels: StoredPixels) -> Shaped[np.ndarray, "H W"] | None:
     shot = pixels.shot
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth, mask = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)), pixels.stored("mask")
+    depth = shot.rectification.resampled("depth", shot.depth, shot.depth_format.read(shot.depth))
+    mask = pixels.stored("mask")
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 
 def _seen(pixels: StoredPixels) -> Bool[np.ndarray, "H W"] | None:
     path = pixels.seen_mask
-    return None if path is None else pixels.shot.rectification.sampled(path, read_mask(path))
+    return None if path is None else pixels.shot.rectification.resampled("seen", path, read_mask(path))
 
 
 def _confidence(pixels: StoredPixels) -> UInt8[np.ndarray, "H W"] | None:
-    shot = pixels.shot
-    if shot.confidence is None:
+    path = pixels.shot.confidence
+    if path is None:
         return None
-    stored = read_gray(shot.confidence, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
-    return shot.rectification.sampled(shot.confidence, stored)
+    stored = read_gray(path, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
+    return pixels.shot.rectification.resampled("depth_confidence", path, stored)
 
 
 #: Readers of the maps that files hold, by name.
