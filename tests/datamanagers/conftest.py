@@ -14,12 +14,12 @@ from tests.datamanagers.kinds import KINDS, write_kind
 @pytest.fixture(scope="session")
 def walls(tmp_path_factory) -> Callable[[str], Path]:
     """The scene's folder by kind, written when first asked for; never changed."""
-    made: dict[str, Path] = {}
+    written: dict[str, Path] = {}
 
     def wall(name: str) -> Path:
-        if name not in made:
-            made[name] = write_kind(tmp_path_factory.mktemp("walls") / name, name)
-        return made[name]
+        if name not in written:
+            written[name] = write_kind(tmp_path_factory.mktemp("walls") / name, name)
+        return written[name]
 
     return wall
 

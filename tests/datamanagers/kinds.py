@@ -48,7 +48,7 @@ class Kind:
 
     @property
     def is_undistorted(self) -> bool:
-        """Whether images are undistorted when they are read."""
+        """True if images are undistorted when they are read."""
         return self.accuracy > 0.5
 
 
@@ -173,9 +173,9 @@ def write_kind(folder: Path, name: str, frames: int = FRAMES) -> Path:
 
 def files(folder: Path, pattern: str) -> list[Path]:
     """Matching files, at least one, as people count: 2 before 10."""
-    found = sorted(folder.glob(pattern), key=lambda path: [int(digits) for digits in re.findall(r"\d+", path.name)])
-    assert found, pattern
-    return found
+    matches = sorted(folder.glob(pattern), key=lambda path: [int(digits) for digits in re.findall(r"\d+", path.name)])
+    assert matches, pattern
+    return matches
 
 
 # Damage

@@ -1,4 +1,4 @@
-"""What is particular to C3VD and C3VDv2: lenses, the octagon, depth, lens files; and options that all formats share."""
+"""Particular to C3VD and C3VDv2: lenses, the octagon, depth, lens files; and options that all formats share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is particular to EndoGSLAM's data: poses of a SLAM that wanders, its map, 8-bit depth, and PR-Endo's release."""
+"""Particular to EndoGSLAM's data: poses of a SLAM that wanders, its map, 8-bit depth, and PR-Endo's release."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_test_frames_take_true_poses_brought_into_the_mapped_world(mine):
 
 
 def test_a_rigid_error_is_undone_to_the_digit(mine):
-    """As if the map had been made in a turned world: then test frames turn with it."""
+    """Test frames turn with a map that was made in a turned world."""
     turn = rigid(Rotation.from_rotvec([[0.3, -0.2, 0.5]]).as_matrix(), np.array([[4.0, -2.0, 1.0]]))[0]
     colors = {"means3D": np.array([[1.0, 2.0, 3.0]]), "rgb_colors": np.array([[0.5, 0.2, 1.2]])}
     estimate(mine, training(11), lambda pose: turn @ pose, **colors, log_scales=np.zeros((1, 1)))
@@ -237,8 +237,8 @@ def test_intrinsics_of_another_size_are_scaled_where_their_size_is_told(mine, wa
         arrays.update(org_width=np.array(2 * WIDTH), org_height=np.array(2 * HEIGHT))
 
     change_npz(PARAMS, larger)(mine)
-    found, expected = (load(folder).train[0].camera.intrinsics for folder in (mine, walls("c3vd-endogslam")))
-    assert vars(found) == pytest.approx(vars(expected), rel=1e-6)
+    loaded, expected = (load(folder).train[0].camera.intrinsics for folder in (mine, walls("c3vd-endogslam")))
+    assert vars(loaded) == pytest.approx(vars(expected), rel=1e-6)
 
 
 def test_points_come_from_depth_where_the_map_is_empty(mine):

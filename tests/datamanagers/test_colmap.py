@@ -1,4 +1,4 @@
-"""What is particular to COLMAP: every camera of it, sparse depth, where models lie, damaged models, and real ones."""
+"""Particular to COLMAP: every camera of it, sparse depth, where models lie, damaged models, and real ones."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def wall_model(cameras: list[pycolmap.Camera], names: list[str], unit: float = 1
     tracks: list[list[pycolmap.TrackElement]] = [[] for _ in points]
     for index, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
         cam, rotation = cameras[index % len(cameras)], pose[:3, :3].T
-        seen = cam.img_from_cam((points - pose[:3, 3]) @ pose[:3, :3])
+        pixels_seen = cam.img_from_cam((points - pose[:3, 3]) @ pose[:3, :3])
         image = pycolmap.Image(name=name, camera_id=cam.camera_id, image_id=index + 1)
-        inside = (seen > 0).all(axis=1) & (seen < (cam.width, cam.height)).all(axis=1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in seen[inside]])
+        inside = (pixels_seen > 0).all(axis=1) & (pixels_seen < (cam.width, cam.height)).all(axis=1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in pixels_seen[inside]])
         for place, number in enumerate(np.flatnonzero(inside)):
             tracks[number].append(pycolmap.TrackElement(index + 1, place))
         world_to_camera = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:3, 3] / unit)
@@ -227,8 +227,8 @@ def test_files_of_images_with_names_of_windows(tmp_path):
     for name in ("a/1.png", "a/2.jpg.png", r"a\3.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    found = sidecar_files(tmp_path, [r"a\1.jpg", r"a\2.jpg", r"a\3.jpg", r"b\4.jpg"], (".png",))
-    assert [path and path.name for path in found.values()] == ["1.png", "2.jpg.png", r"a\3.png", None]
+    paths = sidecar_files(tmp_path, [r"a\1.jpg", r"a\2.jpg", r"a\3.jpg", r"b\4.jpg"], (".png",))
+    assert [path and path.name for path in paths.values()] == ["1.png", "2.jpg.png", r"a\3.png", None]
 
 
 @pytest.mark.parametrize("name", ["1_mask.png", "frames/1.png", "1.png.txt"])
@@ -257,20 +257,20 @@ def test_depth_files(mine):
 def inverse(mine):
     """Depth as the reference code of 3DGS stores it, and its parameters by image."""
     (mine / "depths").mkdir()
-    said = {
+    entries = {
         f"{i}": {"scale": 0.2 / (1.0 + 0.25 * i), "offset": (-1) ** i * 1e-3, "med_scale": 0.1} for i in range(COUNT)
     }
     for index, pose in enumerate(poses(COUNT)):
-        inverse_depth, (scale, offset, _) = 1.0 / taken(camera(), pose)[0], said[f"{index}"].values()
+        inverse_depth, (scale, offset, _) = 1.0 / taken(camera(), pose)[0], entries[f"{index}"].values()
         steps = np.rint(65536.0 * (inverse_depth - offset) / scale).astype(np.uint16)
         steps[0, 0] = 0  # as far as the offset says; unknown where that is negative
         cv2.imwrite(str(mine / f"depths/{index}.png"), steps)
-    write_json(mine / "sparse/0/depth_params.json", said | {"med_scale": 0.1})
-    return mine, said
+    write_json(mine / "sparse/0/depth_params.json", entries | {"med_scale": 0.1})
+    return mine, entries
 
 
 def test_inverse_depth_with_its_parameters(inverse, caplog):
-    folder, said = inverse
+    folder, entries = inverse
     scenes = {1.0: load(folder), 2.0: load(folder, scale=2.0), 1000.0: load(folder, unit="m")}
     for factor, scene in scenes.items():
         for frame in scene.video:
@@ -278,8 +278,8 @@ def test_inverse_depth_with_its_parameters(inverse, caplog):
             expected[0, 0] = np.nan if frame.index % 2 else 1000.0
             np.testing.assert_allclose(frame.depth.numpy(), factor * expected, rtol=1e-3)
     assert not caplog.records
-    said["3"]["scale"] = -1.0
-    write_json(folder / "sparse/0/depth_params.json", said)
+    entries["3"]["scale"] = -1.0
+    write_json(folder / "sparse/0/depth_params.json", entries)
     unknown = [bool(frame.depth.isnan().all()) for frame in load(folder).video]
     assert unknown == [False, False, False, True, False] and "1 images have no depth" in caplog.text
     shutil.rmtree(folder / "depths")
@@ -289,18 +289,18 @@ def test_inverse_depth_with_its_parameters(inverse, caplog):
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        (lambda said: "{", {}, r"depth_params\.json is not JSON"),
-        (lambda said: json.dumps([said]), {}, r"depth_params\.json has no 0\. Expected scale and offset"),
-        (lambda said: json.dumps(said | {"3": None}), {}, r"depth_params\.json has no 3\. .*for this model"),
-        (lambda said: json.dumps(said | {"3": {"scale": 1.0}}), {}, r"depth_params\.json, 3: offset is None"),
-        (lambda said: json.dumps(said | {"3": {"scale": "1"}}), {}, r"depth_params\.json, 3: scale is '1'"),
+        (lambda entries: "{", {}, r"depth_params\.json is not JSON"),
+        (lambda entries: json.dumps([entries]), {}, r"depth_params\.json has no 0\. Expected scale and offset"),
+        (lambda entries: json.dumps(entries | {"3": None}), {}, r"depth_params\.json has no 3\. .*for this model"),
+        (lambda entries: json.dumps(entries | {"3": {"scale": 1.0}}), {}, r"depth_params\.json, 3: offset is None"),
+        (lambda entries: json.dumps(entries | {"3": {"scale": "1"}}), {}, r"depth_params\.json, 3: scale is '1'"),
         (json.dumps, {"depth_unit": 1.0}, r"depth_unit = 1, but .*depth_params\.json.*one of the two"),
-        (lambda said: None, {}, r"has depths/, but .*not given.*datamanager\.depth_unit=0\.001"),
+        (lambda entries: None, {}, r"has depths/, but .*not given.*datamanager\.depth_unit=0\.001"),
     ],
 )
 def test_what_depth_files_hold_is_said_wholly_or_asked_for(inverse, change, options, message):
-    (folder, said), file = inverse, inverse[0] / "sparse/0/depth_params.json"
-    text = change(said)
+    (folder, entries), file = inverse, inverse[0] / "sparse/0/depth_params.json"
+    text = change(entries)
     file.unlink() if text is None else file.write_text(text)
     with pytest.raises(InputError, match=message):
         load(folder, **options)
@@ -312,9 +312,9 @@ def test_what_depth_files_hold_is_said_wholly_or_asked_for(inverse, change, opti
 def test_points_are_initial_points_in_their_colours(wall, walls):
     scene = load(wall)
     model = pycolmap.Reconstruction(str(wall / "sparse/0"))
-    known = {tuple(np.float32(point.xyz)): tuple(point.color) for point in model.points3D.values()}
+    color_of = {tuple(np.float32(point.xyz)): tuple(point.color) for point in model.points3D.values()}
     pairs = zip(scene.points.positions.numpy(), scene.points.colors.numpy(), strict=True)
-    assert {tuple(position): tuple(color) for position, color in pairs} == known and len(known) == POINTS
+    assert {tuple(position): tuple(color) for position, color in pairs} == color_of and len(color_of) == POINTS
     observing = [frame.name for frame in scene.test_sets["test"] if frame.sparse_depth is not None]
     assert observing and scene.provenance.held_out_used == {"points": observing}
     assert not load(wall, split="all-train").provenance.held_out_used
@@ -378,18 +378,18 @@ def test_a_point_seen_twice_in_an_image_has_one_depth(mine):
     before = opened(mine).shots[0].sparse_depth
     model, doubled = wall_model([camera()], NAMES), pycolmap.Reconstruction()
     doubled.add_camera_with_trivial_rig(camera())
-    seen = model.image(1).points2D
+    points = model.image(1).points2D
     tracks = {number: list(point.track.elements) for number, point in model.points3D.items()}
-    tracks[seen[0].point3D_id].append(pycolmap.TrackElement(1, len(seen)))
+    tracks[points[0].point3D_id].append(pycolmap.TrackElement(1, len(points)))
     for number, image in sorted(model.images.items()):
-        places = [point.xy for point in image.points2D] + [seen[0].xy + 0.5] * (number == 1)
+        places = [point.xy for point in image.points2D] + [points[0].xy + 0.5] * (number == 1)
         copied = pycolmap.Image(name=image.name, camera_id=1, image_id=number)
         copied.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in places])
         doubled.add_image_with_trivial_frame(copied, image.cam_from_world())
     for number, track in sorted(tracks.items()):
         doubled.add_point3D(model.point3D(number).xyz, pycolmap.Track(track), model.point3D(number).color)
     doubled.write_binary(str(mine / "sparse/0"))
-    assert doubled.image(1).num_points3D == len(seen) + 1
+    assert doubled.image(1).num_points3D == len(points) + 1
     after = opened(mine).shots[0].sparse_depth
     torch.testing.assert_close(after.pixels.sort(dim=0).values, before.pixels.sort(dim=0).values)
 
@@ -460,9 +460,9 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
 def test_undistorting_is_what_colmap_did(shared_data):
     """Features of the SIMPLE_RADIAL model through our lens are the PINHOLE model's, which COLMAP undistorted."""
     before, after = (read_model(shared_data / "colmap_23img" / place) for place in ("distorted_sparse", "sparse"))
-    for one, other in zip(before.images, after.images, strict=True):
+    for distorted, other in zip(before.images, after.images, strict=True):
         pinhole = after.cameras[other.camera].pinhole
-        directions = before.cameras[one.camera].unproject(one.observed)[:, :2]
+        directions = before.cameras[distorted.camera].unproject(distorted.observed)[:, :2]
         pixels = directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
         np.testing.assert_allclose(pixels, other.observed, rtol=0, atol=1e-6)
 
@@ -477,5 +477,5 @@ def test_a_real_scene_loads(shared_data):
     for frame in scene.train:
         assert frame.image.shape[:2] == (frame.camera.height, frame.camera.width)
         assert len(frame.sparse_depth.depth) > 150
-    found = torch.stack([frame.camera.camera_to_world for frame in scene.video]).numpy()
-    np.testing.assert_allclose(found, colmap_poses.read(folder / "sparse").camera_to_world, atol=1e-6)
+    loaded = torch.stack([frame.camera.camera_to_world for frame in scene.video]).numpy()
+    np.testing.assert_allclose(loaded, colmap_poses.read(folder / "sparse").camera_to_world, atol=1e-6)

@@ -111,8 +111,8 @@ def test_confidence_that_does_not_go_with_depth_is_refused(folder, spoil, messag
 def test_initial_points_are_fused_from_trusted_depth(folder):
     cv2.imwrite(str(files(folder, "confidence/*.png")[1]), np.full((HEIGHT, WIDTH), 127, np.uint8))
     scene = load(folder)
-    known = {frame.index: torch.isfinite(frame.depth).numpy() for frame in scene.train}
-    trusted = {index: pixels & (stored(index) >= 128) if index != 1 else pixels for index, pixels in known.items()}
+    finite = {frame.index: torch.isfinite(frame.depth).numpy() for frame in scene.train}
+    trusted = {index: pixels & (stored(index) >= 128) if index != 1 else pixels for index, pixels in finite.items()}
     assert len(scene.points) == sum(pixels.sum() for pixels in trusted.values())
 
 

@@ -1,4 +1,4 @@
-"""What every data manager does alike: each kind of layout is read exactly, left as it is, and every fault is told."""
+"""Contract of data managers: each kind of layout is read exactly, left as it is, and every fault is told."""
 
 from __future__ import annotations
 
@@ -56,15 +56,15 @@ def in_order(scene: Scene, name: str) -> list[Frame]:
 
 
 def to_true_world(name: str) -> np.ndarray:
-    """From the world of the scene that is read: EndoGSLAM's is that of the first camera. [4, 4]"""
+    """Transform from the world of the scene that is read: EndoGSLAM's is that of the first camera. [4, 4]"""
     return poses(1)[0] if KINDS[name].params else np.eye(4)
 
 
-def equal(one: Frame, other: Frame) -> bool:
-    """Whether the pixels and poses of two frames are equal to the bit."""
-    pairs = [(getattr(one, part), getattr(other, part)) for part in ("image", "depth", "mask", "seen")]
-    pairs.append((one.camera.camera_to_world, other.camera.camera_to_world))
-    return one.index == other.index and all(
+def equal(first: Frame, other: Frame) -> bool:
+    """True if the pixels and poses of two frames are equal to the bit."""
+    pairs = [(getattr(first, part), getattr(other, part)) for part in ("image", "depth", "mask", "seen")]
+    pairs.append((first.camera.camera_to_world, other.camera.camera_to_world))
+    return first.index == other.index and all(
         (a is None and b is None) or torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in pairs
     )
 
@@ -104,9 +104,9 @@ def test_a_scene_is_read_as_it_was_written(walls, caplog, name):
             assert difference.max() < kind.accuracy and np.median(difference) < max(0.12, 0.6 * kind.accuracy)
     points = scene.points.positions.double().numpy() @ world[:3, :3].T + world[:3, 3]
     assert len(points) > 100 and off_wall(points).max() < 1e-3 + kind.accuracy
-    said = json.loads(json.dumps(scene.provenance.record(), allow_nan=False))
-    assert said["dataset"] == kind.format and said["stored_size"] == said["size"] == [WIDTH, HEIGHT]
-    assert said["unit"] == "mm"
+    record = json.loads(json.dumps(scene.provenance.record(), allow_nan=False))
+    assert record["dataset"] == kind.format and record["stored_size"] == record["size"] == [WIDTH, HEIGHT]
+    assert record["unit"] == "mm"
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -125,14 +125,14 @@ def test_a_scene_is_the_same_again_read_from_disk_each_time_or_at_once(walls, na
 def test_the_fingerprint_is_that_of_the_files(walls, copied, name):
     kind, folder = KINDS[name], copied(name)
     reader = manager(kind.format)
-    found = [reader.fingerprint(walls(name)), reader.fingerprint(folder)]
+    hashes = [reader.fingerprint(walls(name)), reader.fingerprint(folder)]
     (folder / "notes.txt").write_text("hello")
-    assert {*found, reader.fingerprint(folder)} == {found[0]}
+    assert {*hashes, reader.fingerprint(folder)} == {hashes[0]}
     (folder / kind.poses).open("ab").write(b"\n") if kind.poses else None
-    found.append(reader.fingerprint(folder))
+    hashes.append(reader.fingerprint(folder))
     repaint(kind.images, 3, lambda pixels: 0 * pixels)(folder)
-    found.append(reader.fingerprint(folder))
-    assert len(set(found)) == (3 if kind.poses else 2)
+    hashes.append(reader.fingerprint(folder))
+    assert len(set(hashes)) == (3 if kind.poses else 2)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -281,8 +281,8 @@ def test_seen_masks_are_read_for_the_training_frames_that_they_are_for(walls, ca
     has_rotation = layout_of(kind.layout).has_rotation and not kind.has_own_tests
     assert len(scene.test_sets.get("rotation", ())) == (2 if has_rotation else 0)
     for frame in apart(scene):
-        seen = frame.seen.numpy()
-        assert seen[:, : WIDTH // 2 - 1].all() and not seen[:, WIDTH // 2 + 1 :].any()
+        mask = frame.seen.numpy()
+        assert mask[:, : WIDTH // 2 - 1].all() and not mask[:, WIDTH // 2 + 1 :].any()
     assert all(frame.seen is None for frame in scene.train)
     for options in ({"max_frames": 6}, {"frame_step": 2}, {"split": "block"}):
         caplog.clear()
@@ -462,8 +462,8 @@ def test_names_of_windows(copied, walls, name):
 def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, walls):
     folder = copied("rgbd")
     remove("rgb/*.png", 3)(folder)
-    found, expected = load(folder, "rgbd").video, load(walls("rgbd"), "rgbd").video
-    for frame, other in zip(found, [*expected[:3], *expected[4:]], strict=True):
+    loaded, expected = load(folder, "rgbd").video, load(walls("rgbd"), "rgbd").video
+    for frame, other in zip(loaded, [*expected[:3], *expected[4:]], strict=True):
         assert frame.name == other.name
         assert torch.equal(frame.camera.camera_to_world, other.camera.camera_to_world)
         assert torch.equal(frame.depth, other.depth)

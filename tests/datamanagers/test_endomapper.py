@@ -1,4 +1,4 @@
-"""What is particular to EndoMapper: its calibration, against OpenCV's fisheye, and which folders are its."""
+"""Particular to EndoMapper: its calibration, against OpenCV's fisheye, and which folders are its."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def test_more_of_the_field_of_view_is_kept_without_its_dark_surroundings(walls):
     assert 0.5 < lit.mean() < 1.0
     pixels = stored_pixels(frame.camera, folder)
     inside = ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all(axis=-1)
-    seen = np.zeros(inside.shape, bool)
-    seen[inside] = lit[pixels[inside, 1], pixels[inside, 0]]
-    assert 0.2 < seen.mean() < 0.95
+    is_lit = np.zeros(inside.shape, bool)
+    is_lit[inside] = lit[pixels[inside, 1], pixels[inside, 0]]
+    assert 0.2 < is_lit.mean() < 0.95
     # Colour is averaged over an area, so that pixels at the rim are left out.
     mask = frame.mask.numpy()
-    assert not (mask & ~seen).any() and mask.sum() > 0.9 * seen.sum()
+    assert not (mask & ~is_lit).any() and mask.sum() > 0.9 * is_lit.sum()
     assert (frame.image.numpy()[mask].max(axis=1) > 0).all()
     assert not np.isfinite(frame.depth.numpy()[~mask]).any()
 

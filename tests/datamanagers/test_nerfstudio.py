@@ -1,4 +1,4 @@
-"""What is particular to nerfstudio: cameras, the change of its world, its split, units of depth, a real sequence."""
+"""Particular to nerfstudio: cameras, the change of its world, its split, units of depth, a real sequence."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, mi
     write_ply(mine / "sparse_pc.ply", point_properties(moved_points, np.zeros(points.shape, np.uint8)))
     change_json(FILE, applied_transform=applied.tolist(), applied_scale=0.5, ply_file_path="sparse_pc.ply")(mine)
     before, after = load(wall), load(mine)
-    for one, other in zip(before.train, after.train, strict=True):
-        torch.testing.assert_close(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
+    for first, other in zip(before.train, after.train, strict=True):
+        torch.testing.assert_close(first.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
     assert off_wall(after.points.positions.numpy()).max() < 1e-3
     assert any("undone" in remark for remark in after.provenance.pose_convention["remarks"])
 
@@ -303,13 +303,13 @@ def test_the_real_sequence_loads_once_it_has_points(shared_data, tmp_path):
     inside = ((pixels > 3) & (pixels < 267)).all(dim=1).numpy() & ((source > 3) & (source < 797)).all(axis=1)
     assert inside.sum() > 2000
     # Colours of the undistorted image there, against those of the distorted one where the points were seen.
-    smooth, seen = cv2.blur(read_rgb(folder / "0000_color_crop800.jpg"), (3, 3)), source[inside]
-    expected = cv2.remap(smooth, seen[None, :, 0], seen[None, :, 1], cv2.INTER_LINEAR)[0].astype(float)
+    smooth, places = cv2.blur(read_rgb(folder / "0000_color_crop800.jpg"), (3, 3)), source[inside]
+    expected = cv2.remap(smooth, places[None, :, 0], places[None, :, 1], cv2.INTER_LINEAR)[0].astype(float)
     target, image = (pixels[inside].numpy() - 0.5).astype(np.float32), frame.image.numpy()
 
     def difference(shift: float) -> float:
-        found = cv2.remap(image, target[None, :, 0] + shift, target[None, :, 1], cv2.INTER_LINEAR)[0]
-        return np.abs(found.astype(float) - expected).mean()
+        shades = cv2.remap(image, target[None, :, 0] + shift, target[None, :, 1], cv2.INTER_LINEAR)[0]
+        return np.abs(shades.astype(float) - expected).mean()
 
     # A quarter of a pixel shows, to either side.
     assert difference(0.0) < 1.5

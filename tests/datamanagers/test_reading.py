@@ -125,12 +125,12 @@ def test_masks_of_one_value_of_one_bit_and_of_a_colour(tmp_path):
 
 
 def test_what_holds_several_images_or_another_format_is_refused_by_name(tmp_path):
-    one, small = (PIL.Image.fromarray(COLORS[: 4 // n]) for n in (1, 2))
-    for name, others, count in (("a.tif", [one] * 3, 4), ("a.png", [PIL.Image.fromarray(COLORS // 2)], 2)):
-        one.save(tmp_path / name, save_all=True, append_images=others)
+    single, small = (PIL.Image.fromarray(COLORS[: 4 // n]) for n in (1, 2))
+    for name, others, count in (("a.tif", [single] * 3, 4), ("a.png", [PIL.Image.fromarray(COLORS // 2)], 2)):
+        single.save(tmp_path / name, save_all=True, append_images=others)
         with pytest.raises(InputError, match=f"{name} holds {count} images. Expected one image in a file"):
             read_rgb(tmp_path / name)
-    one.save(tmp_path / "preview.tif", save_all=True, append_images=[small])
+    single.save(tmp_path / "preview.tif", save_all=True, append_images=[small])
     np.testing.assert_array_equal(read_rgb(tmp_path / "preview.tif"), COLORS)
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
     with pytest.raises(InputError, match=r"a\.heic .* is HEIF \(\.heic, \.avif\): convert it"):

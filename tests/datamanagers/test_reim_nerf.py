@@ -1,4 +1,4 @@
-"""What is particular to REIM-NeRF's data: normalised poses, distance along the ray, its mask and its split."""
+"""Particular to REIM-NeRF's data: normalised poses, distance along the ray, its mask and its split."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def scene(folder):
 
 @pytest.fixture
 def mine(tmp_path):
-    """To be spoilt."""
+    """A scene to be spoilt."""
     return write_wall(tmp_path / "wall", "reim-nerf", 9, WIDTH, HEIGHT)
 
 
@@ -91,9 +91,11 @@ def test_stored_distances_end_on_the_wall(folder):
     row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = LENS.unproject(np.stack([column.ravel(), row.ravel()], 1)).reshape(HEIGHT, WIDTH, 3)
     expected, _ = look(poses(FRAMES)[10], rays)
-    known = (stored > 0) & (expected < FAR)
-    assert known.sum() > 3000
-    np.testing.assert_allclose((stored * step(folder) * cosines())[known], expected[known], atol=0.51 * step(folder))
+    measured = (stored > 0) & (expected < FAR)
+    assert measured.sum() > 3000
+    np.testing.assert_allclose(
+        (stored * step(folder) * cosines())[measured], expected[measured], atol=0.51 * step(folder)
+    )
 
 
 def test_working_depth_is_that_of_the_nearest_stored_pixel(folder, scene):
@@ -101,9 +103,9 @@ def test_working_depth_is_that_of_the_nearest_stored_pixel(folder, scene):
     stored = cv2.imread(str(folder / "distmaps" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
     columns, rows = (np.rint(part).astype(int) for part in undistortion_map(LENS, LENS.pinhole))
     expected = (stored * step(folder) * cosines())[rows, columns]
-    known = torch.isfinite(frame.depth).numpy()
-    assert known.mean() > 0.9
-    np.testing.assert_allclose(frame.depth.numpy()[known], expected[known], atol=2e-4)
+    finite = torch.isfinite(frame.depth).numpy()
+    assert finite.mean() > 0.9
+    np.testing.assert_allclose(frame.depth.numpy()[finite], expected[finite], atol=2e-4)
 
 
 def test_what_ends_at_c3vds_range_is_there_or_beyond(mine):
@@ -115,11 +117,11 @@ def test_what_ends_at_c3vds_range_is_there_or_beyond(mine):
     cv2.imwrite(str(mine / "distmaps/0000_color.png"), steps.astype(np.uint16))
     cv2.imwrite(str(mine / "distmaps/0005_color.png"), np.full((HEIGHT, WIDTH), 9000, np.uint16))
     spoilt, unclipped = load(mine).train
-    left, middle, right = (np.s_[20:50, start : start + 15] for start in (5, 38, 70))
+    clipped, middle, right = (np.s_[20:50, start : start + 15] for start in (5, 38, 70))
     depth, bound = spoilt.depth, spoilt.depth_at_least
-    assert torch.isnan(depth[left]).all() and torch.isnan(depth[right]).all()
+    assert torch.isnan(depth[clipped]).all() and torch.isnan(depth[right]).all()
     torch.testing.assert_close(depth[middle], torch.full((30, 15), 99.9), atol=step(mine), rtol=0)
-    torch.testing.assert_close(bound[left], torch.full((30, 15), 100.0), atol=step(mine), rtol=0)
+    torch.testing.assert_close(bound[clipped], torch.full((30, 15), 100.0), atol=step(mine), rtol=0)
     assert torch.isnan(bound[middle]).all() and torch.isnan(bound[right]).all()
     assert unclipped.depth_at_least is None
 

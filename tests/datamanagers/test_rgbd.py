@@ -1,4 +1,4 @@
-"""What is particular to TUM's RGB-D layout: association by time or order, scales of depth, and Gaussian Pancakes."""
+"""Particular to TUM's RGB-D layout: association by time or order, scales of depth, and Gaussian Pancakes."""
 
 from __future__ import annotations
 
@@ -71,8 +71,10 @@ def test_times_are_associated(walls):
 
 
 def test_clocks_that_nearly_agree(mine):
-    known = tum.read(mine / "groundtruth.txt")
-    tum.write(mine / "groundtruth.txt", Trajectory(known.camera_to_world, timestamps=known.timestamps + 0.009))
+    trajectory = tum.read(mine / "groundtruth.txt")
+    tum.write(
+        mine / "groundtruth.txt", Trajectory(trajectory.camera_to_world, timestamps=trajectory.timestamps + 0.009)
+    )
     for path in files(mine, "depth/*.png"):
         path.rename(path.with_name(f"{float(path.stem) - 0.008:.6f}.png"))
     scene = load(mine)
@@ -92,9 +94,9 @@ def test_images_without_a_pose_or_depth_are_left_out_and_counted(mine, caplog):
     change_lines("groundtruth.txt", lambda rows: [*rows[:3], *rows[4:-1]])(mine)
     files(mine, "depth/*.png")[4].unlink()
     scene = load(mine)
-    kept = [index for index in range(FRAMES) if index not in (2, 4, 10)]
-    assert names(scene.video) == [stamps(TIMES)[index] for index in kept]
-    assert_right(scene.video, kept)
+    indices = [index for index in range(FRAMES) if index not in (2, 4, 10)]
+    assert names(scene.video) == [stamps(TIMES)[index] for index in indices]
+    assert_right(scene.video, indices)
     assert scene.provenance.association["without_pose"] == 2
     assert scene.provenance.association["without_depth"] == 1
     assert "of 11 images 2 have no pose and 1 no depth" in caplog.text
@@ -131,11 +133,11 @@ def test_a_name_that_is_no_time(numbered):
 def test_nearest_in_time(wanted, known, tolerance):
     wanted, known = np.array(wanted, float), np.array(known, float)
     partner = nearest_in_time(wanted, known, tolerance)
-    made = partner >= 0
-    assert len(set(partner[made])) == made.sum()
-    assert (np.abs(wanted[made] - known[partner[made]]) <= tolerance).all()
+    matched = partner >= 0
+    assert len(set(partner[matched])) == matched.sum()
+    assert (np.abs(wanted[matched] - known[partner[matched]]) <= tolerance).all()
     # Whoever went without had nothing nearer than what its candidates got.
-    for index in np.flatnonzero(~made):
+    for index in np.flatnonzero(~matched):
         for candidate in np.flatnonzero(np.abs(known - wanted[index]) <= tolerance):
             (owner,) = np.flatnonzero(partner == candidate)
             assert abs(wanted[owner] - known[candidate]) <= abs(wanted[index] - known[candidate])
@@ -148,15 +150,15 @@ def test_whole_numbers_can_be_times(numbered):
     change_lines("groundtruth.txt", lambda rows: [*rows[:5], *rows[6:]])(numbered)
     with pytest.raises(InputError, match=r"groundtruth.txt has 10 poses for 11 images.*association=time"):
         load(numbered)
-    kept = [index for index in range(FRAMES) if index != 5]
+    indices = [index for index in range(FRAMES) if index != 5]
     scene = load(numbered, association="time")
-    assert names(scene.video) == [str(index) for index in kept]
-    assert_right(scene.video, kept)
+    assert names(scene.video) == [str(index) for index in indices]
+    assert_right(scene.video, indices)
     # A pose and another image lost: as many poses as images, but not of the same frames.
     for part in ("rgb", "depth"):
         (numbered / part / "7.png").unlink()
     assert len(load(numbered, association="order").video) == 10
-    assert_right(load(numbered, association="time").video, [index for index in kept if index != 7])
+    assert_right(load(numbered, association="time").video, [index for index in indices if index != 7])
 
 
 # Depth, cameras and points

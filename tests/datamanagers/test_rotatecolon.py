@@ -1,4 +1,4 @@
-"""What is particular to RotateColon: EXR depth and its divisor, test views without depth, frames named by number."""
+"""Particular to RotateColon: EXR depth and its divisor, test views without depth, frames named by number."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def test_a_split_of_the_training_views_leaves_the_test_views_another_name(walls)
     assert names(scene.test_sets["test"]) == ["0000", "0008"]
     assert names(scene.test_sets["rotation"]) == ["test-0000", "test-0001"]
     assert scene.test_sets["test"][0].depth is not None
-    own = load(walls("rotatecolon"), split="own")
-    assert len(own.train) == FRAMES and len(own.test_sets["test"]) == 2
+    scene_of_own = load(walls("rotatecolon"), split="own")
+    assert len(scene_of_own.train) == FRAMES and len(scene_of_own.test_sets["test"]) == 2
 
 
 @pytest.mark.parametrize("divisor", [1.0, 2.5])
 def test_another_divisor_scales_depth(walls, divisor):
-    found, right = (load(walls("rotatecolon"), depth_divisor=each).train[2].depth for each in (divisor, 1.4))
-    torch.testing.assert_close(found, right * (1.4 / divisor))
+    loaded, right = (load(walls("rotatecolon"), depth_divisor=each).train[2].depth for each in (divisor, 1.4))
+    torch.testing.assert_close(loaded, right * (1.4 / divisor))
 
 
 def test_without_points_they_come_from_depth(mine):
@@ -64,8 +64,8 @@ def test_numbers_decide_the_order_and_may_be_written_as_paths(mine):
     renumber("train_views/*.png", "depth_train/*.exr", change=lambda number: number + 2)(mine)
     scene = load(mine)
     assert names(scene.train) == [str(index) for index in range(2, FRAMES + 2)]
-    found = [frame.camera.camera_to_world for frame in scene.train]
-    np.testing.assert_allclose(found, poses(FRAMES), atol=1e-5)
+    matrices = [frame.camera.camera_to_world for frame in scene.train]
+    np.testing.assert_allclose(matrices, poses(FRAMES), atol=1e-5)
 
 
 def test_test_views_may_be_elsewhere_of_another_camera_or_none(mine):

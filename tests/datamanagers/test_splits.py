@@ -1,4 +1,4 @@
-"""Which frames are held out, in the official sequences too, and the unit of length that a scene states."""
+"""Held-out frames, in the official sequences too, and the unit of length that a scene states."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def test_frames_that_are_held_out(arguments, test):
 
 @given(count=st.integers(1, 300), start=st.floats(0, 0.9), length=st.floats(0.05, 0.5))
 def test_a_block_is_one_stretch_of_about_its_share(count, start, length):
-    held = held_out("block", count, (start, min(start + length, 1.0)))
-    assert (np.diff(np.flatnonzero(held)) == 1).all()
-    assert abs(held.sum() - (min(start + length, 1.0) - start) * count) <= 1.0
+    is_test = held_out("block", count, (start, min(start + length, 1.0)))
+    assert (np.diff(np.flatnonzero(is_test)) == 1).all()
+    assert abs(is_test.sum() - (min(start + length, 1.0) - start) * count) <= 1.0
 
 
 @pytest.mark.parametrize(

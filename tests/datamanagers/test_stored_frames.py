@@ -114,10 +114,10 @@ def test_what_is_kept_is_as_small_as_on_disk_and_goes_with_the_frame(folder):
     parts = frame.source._cache
     assert parts["depth"].dtype == np.uint16 and parts["mask"] is None
     assert sum(parts[name].nbytes for name in ("image", "depth", "seen")) == WIDTH * HEIGHT * (3 + 2 + 1)
-    kept = weakref.ref(parts["image"])
+    image = weakref.ref(parts["image"])
     del frame, parts
     gc.collect()
-    assert kept() is None
+    assert image() is None
 
 
 # Threads
@@ -134,10 +134,10 @@ def test_many_threads_at_one_frame_see_the_same(folder, keep):
 
 
 def test_results_come_in_order_and_progress_is_told():
-    told = []
-    squares = parallel_map(lambda number: number**2, list(range(50)), "square", lambda *said: told.append(said))
+    calls = []
+    squares = parallel_map(lambda number: number**2, list(range(50)), "square", lambda *call: calls.append(call))
     assert squares == [number**2 for number in range(50)]
-    assert told == [("square", done, 50) for done in range(1, 51)]
+    assert calls == [("square", done, 50) for done in range(1, 51)]
     assert parallel_map(lambda number: number, [], "nothing") == []
 
 
@@ -156,8 +156,8 @@ def test_the_first_failure_is_raised_and_the_rest_left_undone():
 
 @pytest.mark.parametrize("keep_pixels", [True, False])
 def test_loading_tells_how_far_it_is(folder, keep_pixels):
-    told = []
-    manager("c3vd", keep_pixels=keep_pixels).load(folder, lambda *said: told.append(said))
-    assert (("read images", FRAMES + 2, FRAMES + 2) in told) == keep_pixels
-    assert ("fuse depth", FRAMES - 2, FRAMES - 2) in told
-    assert all(0 < done <= total for _, done, total in told)
+    calls = []
+    manager("c3vd", keep_pixels=keep_pixels).load(folder, lambda *call: calls.append(call))
+    assert (("read images", FRAMES + 2, FRAMES + 2) in calls) == keep_pixels
+    assert ("fuse depth", FRAMES - 2, FRAMES - 2) in calls
+    assert all(0 < done <= total for _, done, total in calls)

@@ -105,8 +105,8 @@ def write_wall(
     parts = {"video": poses(frames)} | (
         {"rotation": poses(frames)[[2 % frames, 6 % frames]] @ turn} if writer.has_rotation else {}
     )
-    directions, seen = rays(lens), np.zeros((height, width), np.uint8)
-    seen[:, : width // 2] = 255
+    directions, mask = rays(lens), np.zeros((height, width), np.uint8)
+    mask[:, : width // 2] = 255
     for part, matrices in parts.items():
         for index, matrix in enumerate(matrices):
             depth, color = look(matrix, directions)
@@ -116,7 +116,7 @@ def write_wall(
             if part == "rotation" or writer.is_test(index):
                 path = writer.seen_mask(folder, part, index)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                cv2.imwrite(str(path), seen)
+                cv2.imwrite(str(path), mask)
     for part, matrices in parts.items():
         writer.write_sequence(folder, part, matrices, lens)
     if writer.has_points:

@@ -169,7 +169,7 @@ def _edit(name: str, path: Path) -> st.SearchStrategy[Edit]:
 
 
 def _json_paths(value: Any) -> list[list[Any]]:
-    """Where every value of a JSON file lies; of lists the first and the last entry."""
+    """Paths of the values of a JSON file; of lists the first and the last entry."""
     if isinstance(value, dict):
         keys: list[Any] = sorted(value)
     else:

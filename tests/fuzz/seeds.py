@@ -107,8 +107,8 @@ def _meshes(folder: Path, surface: TriangleMesh) -> None:
         write_mesh(folder / f"mesh.{suffix}", small)
     mesh = open3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
     open3d.io.write_triangle_mesh(str(folder / "text.ply"), mesh, write_ascii=True)
-    seen = np.arange(len(small)) % 2 == 0
-    np.savez(folder / "mesh_seen.npz", face_seen=seen, face_seen_by_any_frame=seen)
+    is_seen = np.arange(len(small)) % 2 == 0
+    np.savez(folder / "mesh_seen.npz", face_seen=is_seen, face_seen_by_any_frame=is_seen)
 
 
 def _splats(folder: Path, scene: Path) -> None:
@@ -124,9 +124,9 @@ def _runs(folder: Path) -> None:
     target.mkdir()
     scene = target / "scene"
     shutil.copytree(folder / "c3vd", scene, ignore=shutil.ignore_patterns("truth", "rotation"))
-    given = {key: json.loads(value) for key, value in (setting.split("=") for setting in TINY)}
-    given["schedule.checkpoint_every"] = 2
-    run = train(METHOD, scene, target / "run", steps=3, settings=given)
+    options = {key: json.loads(value) for key, value in (setting.split("=") for setting in TINY)}
+    options["schedule.checkpoint_every"] = 2
+    run = train(METHOD, scene, target / "run", steps=3, settings=options)
     run.evaluate()
     shutil.copytree(target / "run", folder / "results/run", ignore=shutil.ignore_patterns("checkpoints"))
     shutil.rmtree(target / "run/eval")

@@ -1,4 +1,4 @@
-"""What is read: for every kind of file, the way by which a user has it read."""
+"""Ways by which users have files read, for every kind of file."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Target:
 
 
 def _within(values: Any, most: float) -> bool:
-    """Whether all are finite and within a bound."""
+    """True if all are finite and within a bound."""
     return bool(np.all(np.abs(np.asarray(values, np.float64)) <= most))
 
 
@@ -69,8 +69,8 @@ def _scene(path: str, **settings: object) -> Callable[[Path], None]:
             for pixels in (frame.image, frame.depth, frame.mask, frame.seen):
                 assert pixels is None or tuple(pixels.shape[:2]) == (camera.height, camera.width), frame.name
             if frame.depth is not None:
-                known = frame.depth[~torch.isnan(frame.depth)]
-                assert bool((known > 0.0).all()) and _within(known, _LENGTH), frame.name
+                finite = frame.depth[~torch.isnan(frame.depth)]
+                assert bool((finite > 0.0).all()) and _within(finite, _LENGTH), frame.name
         assert _within(scene.points.positions, _LENGTH) and np.isfinite(scene.extent)
 
     return read
@@ -166,11 +166,11 @@ def _methods(folder: Path) -> None:
 def _prior(folder: Path) -> None:
     camera = Camera(50.0, 50.0, 32.0, 25.5, 64, 51, torch.eye(4, dtype=torch.float64))
     frames = [Frame.of(f"{index:04d}", index, torch.zeros(51, 64, 3, dtype=torch.uint8), camera) for index in range(3)]
-    known, weight = np.full((51, 64), np.log(30.0), np.float32), np.ones((51, 64), np.float32)
+    log_depth, weight = np.full((51, 64), np.log(30.0), np.float32), np.ones((51, 64), np.float32)
     for part in ("npy", "png"):
         prior = FilePrior.of(folder / part, frames)
         for frame in frames:
-            assert np.isfinite(prior.log_depth(frame, np.ones((51, 64), bool), known, weight, 30.0)).all()
+            assert np.isfinite(prior.log_depth(frame, np.ones((51, 64), bool), log_depth, weight, 30.0)).all()
 
 
 def _video(folder: Path) -> None:

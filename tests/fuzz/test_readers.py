@@ -46,11 +46,11 @@ def limits(seconds: float, memory: int) -> Iterator[None]:
     def stop(number, frame):
         raise HangError(f"more than {seconds} s of processor time")
 
-    taken = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmSize"))
+    size = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmSize"))
     before = resource.getrlimit(resource.RLIMIT_AS)
     handler = signal.signal(signal.SIGPROF, stop)
     faulthandler.dump_traceback_later(LAST, exit=True)
-    resource.setrlimit(resource.RLIMIT_AS, (int(taken.split()[1]) * 1024 + memory, before[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (int(size.split()[1]) * 1024 + memory, before[1]))
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
@@ -62,7 +62,7 @@ def limits(seconds: float, memory: int) -> Iterator[None]:
 
 
 def read(seeds, target, damages, seconds=LIMIT, memory=MEMORY):
-    """Whether a target reads its files after these edits, or refuses them by a message."""
+    """True if a target reads its files after these edits, or refuses them by a message."""
     with TemporaryDirectory() as place:
         folder = Path(place) / "seed"
         shutil.copytree(seeds / target.seeds, folder, copy_function=shutil.copy if target.writes else os.link)

@@ -75,7 +75,7 @@ ROWS = [
 
 
 def _work(words, when, kind, folder):
-    """What the child does; it writes how many operations it counted, and ends with the status of the command."""
+    """Work of the child, which writes how many operations it counted, and ends with the status of the command."""
     sys.stdout = sys.stderr = open(folder / "log.txt", "w")
     os.umask(0o077)
     status = TRACEBACK
@@ -116,8 +116,8 @@ def run():
 
 def files(place):
     """Content of every file at its final place, by name: not that of locks, nor of what was not finished."""
-    found = content(place)
-    return {name: data for name, data in found.items() if not any(part.startswith(".") for part in Path(name).parts)}
+    contents = content(place)
+    return {name: data for name, data in contents.items() if not any(part.startswith(".") for part in Path(name).parts)}
 
 
 def scratch(place):
@@ -125,7 +125,7 @@ def scratch(place):
 
 
 def is_whole(name, data, new):
-    """Whether a file is written to its end, as in a run that nobody disturbed."""
+    """True if a file is written to its end, as in a run that nobody disturbed."""
     if name.endswith((".safetensors", "per_frame.csv")):
         return data == new  # training and evaluation end in the same to the bit
     if name.endswith(".json"):
@@ -137,11 +137,13 @@ def is_whole(name, data, new):
     return data.rstrip().endswith(end) if name.endswith(TEXTS) else len(data) == len(new)
 
 
-def wrong(found, old, new):
-    """What is neither as before nor whole, of the files and folders that are replaced as one."""
-    units = {name.split("/")[0] for name in (*found, *old, *new)}
+def wrong(current, old, new):
+    """Files that are neither as before nor whole, of the files and folders that are replaced as one."""
+    units = {name.split("/")[0] for name in (*current, *old, *new)}
     for unit in units:
-        now, before, after = ({n: d for n, d in some.items() if n.split("/")[0] == unit} for some in (found, old, new))
+        now, before, after = (
+            {n: d for n, d in some.items() if n.split("/")[0] == unit} for some in (current, old, new)
+        )
         if now != before:
             yield from now.keys() ^ after.keys()
             yield from (name for name in now.keys() & after.keys() if not is_whole(name, now[name], after[name]))
@@ -159,10 +161,10 @@ def test_nothing_is_lost(seeds, run, tmp_path, writer):
             shutil.copytree(seeds / writer.needs, out / Path(writer.needs).name)
 
     prepare()
-    given = set(out.rglob("*"))
+    before = set(out.rglob("*"))
     assert run(words, tmp_path)[0] == 0, (tmp_path / "log.txt").read_text()
     count = int((tmp_path / "count.txt").read_text())
-    for path in set(out.rglob("*")) - given:
+    for path in set(out.rglob("*")) - before:
         assert path.stat().st_mode & 0o077 == 0, f"{path} can be read by others"
     shutil.copytree(out, reference)
     new = files(out)
@@ -177,24 +179,24 @@ def test_nothing_is_lost(seeds, run, tmp_path, writer):
                     file = unit if unit.is_file() else max(path for path in unit.rglob("*") if path.is_file())
                     file.write_bytes(file.read_bytes() + b"\n# old\n")
             old = files(out)
-            status, told = run(f"{words} {writer.again if old and not writer.needs else ''}", tmp_path, when, kind)
-            found = files(out)
+            status, log = run(f"{words} {writer.again if old and not writer.needs else ''}", tmp_path, when, kind)
+            current = files(out)
             if writer.goes_on or writer.needs:
                 growing = (".jsonl", ".log", ".db")
-                broken = [n for n in found.keys() & new.keys() - old.keys() if not n.endswith(growing)]
-                assert not [name for name in broken if not is_whole(name, found[name], new[name])]
+                broken = [n for n in current.keys() & new.keys() - old.keys() if not n.endswith(growing)]
+                assert not [name for name in broken if not is_whole(name, current[name], new[name])]
             elif (
-                found or kind is no_space
+                current or kind is no_space
             ):  # a kill between the two renames of a folder leaves the next write to put it back
-                assert not list(wrong(found, old, new)), (when, kind, told)
+                assert not list(wrong(current, old, new)), (when, kind, log)
             if kind is killed:
                 assert status == KILLED
             else:
-                assert (status == 0 and found.keys() == new.keys()) or ("space" in told and status in (1, 2)), told
+                assert (status == 0 and current.keys() == new.keys()) or ("space" in log and status in (1, 2)), log
                 assert not scratch(out)
             again = writer.again if files(out) and not (writer.needs and files(out) == old) else ""
-            status, told = run(f"{words} {again}", tmp_path)
-            assert status == 0, told
+            status, log = run(f"{words} {again}", tmp_path)
+            assert status == 0, log
             assert not list(wrong(files(out), {}, new)) and not scratch(out)
 
 

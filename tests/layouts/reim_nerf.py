@@ -55,8 +55,8 @@ class ReimNerfLayout(Layout):
         stored = np.clip(steps, 0.0, 65535.0).astype(np.uint16)
         write_image(folder / "images" / _name(frame.index), frame.color)
         write_image(folder / "distmaps" / _name(frame.index), stored)
-        known = stored[stored > 0] * (DISTMAP_SCALE / 65535.0)
-        nearest, farthest = float(known.min(initial=DISTMAP_SCALE)), float(known.max(initial=0.0))
+        measured = stored[stored > 0] * (DISTMAP_SCALE / 65535.0)
+        nearest, farthest = float(measured.min(initial=DISTMAP_SCALE)), float(measured.max(initial=0.0))
         self._ranges[frame.index] = (0.9 * nearest, 1.1 * farthest)
 
     def write_sequence(self, folder, part, poses, lens):
