@@ -117,9 +117,6 @@ def _mesh(name: str) -> Callable[[Path], None]:
     return read
 
 
-_READ_SPLATS = [name for name in SPLAT_FORMATS if reader_of(name)]
-
-
 def _splats(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         cloud = read_splats(folder / f"cloud.{name}")
