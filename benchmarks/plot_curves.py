@@ -6,6 +6,7 @@ python benchmarks/plot_curves.py --out docs/curves/c3vd.svg --curves "coliags=RU
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,8 +16,8 @@ import tyro
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.reporting.charts import Series
-from coliags_plugin.reporting.html_page import chart_svg
-from coliags_plugin.reporting.model import Chart
+from coliags_plugin.reporting.html_page import html_blocks
+from coliags_plugin.reporting.model import Chart, Figures
 
 #: What is drawn: key of a row, axis label, whether the axis is logarithmic.
 PANELS = (
@@ -68,7 +69,8 @@ def panel(curves: list[tuple[str, list[dict[str, Any]]]], key: str, label: str, 
         Series(name, style, [row["step"] for row in rows if key in row], [row[key] for row in rows if key in row])
         for style, (name, rows) in enumerate(curves)
     ]
-    return chart_svg(Chart(series, "step", label, log_y=log_y))
+    page = html_blocks([Figures([Chart(series, "step", label, log_y=log_y)])])  # nothing where there is no point
+    return "".join(re.findall("(?s)<svg.*</svg>", page))
 
 
 def legend(names: list[str], top: int) -> list[str]:

@@ -151,11 +151,11 @@ def color_bar(
 
 
 def side_by_side(
-    images: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
+    images: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str]
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
-    """Images of one height in a row on white, ``gap`` px apart, each under its ASCII label, shortened to its width."""
+    """Images of one height in a row on white, 8 px apart, each under its ASCII label, shortened to its width."""
     arrays = [as_array(image) for image in images]
-    band, scale = 24, 0.5
+    band, gap, scale = 24, 8, 0.5
     height = band + arrays[0].shape[0]
     width = sum(array.shape[1] for array in arrays) + gap * (len(arrays) - 1)
     sheet = np.full((height, width, 3), 255, np.uint8)

@@ -22,7 +22,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.reporting.charts import Axes, color_stops, style_classes
 from coliags_plugin.reporting.image_files import EncodedImage
-from coliags_plugin.reporting.model import Block, Chart, Figure, Page
+from coliags_plugin.reporting.model import Block, Figure, Page
 from coliags_plugin.reporting.numbers import DASH, counted, linear_ticks, sentence, tick_label, unit_text
 
 #: Largest page, bytes; pictures that have no room in it are written into a folder beside it.
@@ -53,14 +53,9 @@ def html_text(page: Page, output: Path | None = None, limit: int = PAGE_LIMIT) -
 
 
 def html_blocks(blocks: Sequence[Block | Figure]) -> str:
-    """Blocks as HTML without a page around them, all pictures within the text."""
+    """Blocks or figures as HTML without a page around them, all pictures within the text."""
     writer = _Writer()
     return _with_pictures("".join(map(writer.show, blocks)), writer.pictures)
-
-
-def chart_svg(chart: Chart) -> str:
-    """A line chart as SVG, or an empty string where it has no point to draw."""
-    return str(_Writer().filled("chart.svg", chart=chart)) if chart.has_points else ""
 
 
 def refuse_folder(output: Path) -> None:

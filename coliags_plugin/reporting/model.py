@@ -273,10 +273,10 @@ class Page:
         return [section for section in self.sections if section.blocks and not section.screen_only]
 
 
-def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]], title: str = "") -> Table:
+def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]]) -> Table:
     """A table of headings, the first of which is that of the rows' labels, and rows of as many values."""
     columns = [Column(name, words=not index) for index, name in enumerate(head)]
-    return Table(title, columns, [dict(zip(head, row, strict=True)) for row in rows])
+    return Table("", columns, [dict(zip(head, row, strict=True)) for row in rows])
 
 
 def ranked_cells(

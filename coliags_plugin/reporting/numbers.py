@@ -66,9 +66,9 @@ def number_text(value: float, decimals: int) -> str:
     return text.removeprefix("-") if not text.strip("-0.") else text
 
 
-def short_number(value: float | None, factor: float = 1.0, sign: str = "") -> str | None:
-    """A number times ``factor`` with three significant digits; None for None. ``sign`` is that of a format."""
-    return None if value is None else f"{value * factor:{sign}.3g}"
+def short_number(value: float | None, factor: float = 1.0) -> str | None:
+    """A number times ``factor`` with three significant digits; None for None."""
+    return None if value is None else f"{value * factor:.3g}"
 
 
 def column_decimals(unit: str, values: Iterable[float | None]) -> int:

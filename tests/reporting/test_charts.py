@@ -8,13 +8,14 @@ from hypothesis import strategies as st
 
 from coliags_plugin.reporting.charts import Series, style_classes
 from coliags_plugin.reporting.colormaps import color_table
-from coliags_plugin.reporting.html_page import chart_svg, html_blocks
-from coliags_plugin.reporting.model import Chart, ColorBar
+from coliags_plugin.reporting.html_page import html_blocks
+from coliags_plugin.reporting.model import Chart, ColorBar, Figures
 from coliags_plugin.reporting.numbers import linear_ticks, log_ticks, round_up, tick_label
 
 
 def line_chart(*arguments, **options):
-    return chart_svg(Chart(*arguments, **options))
+    page = html_blocks([Figures([Chart(*arguments, **options)])])
+    return "".join(re.findall("(?s)<svg.*</svg>", page))
 
 
 def texts(svg):

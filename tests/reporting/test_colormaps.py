@@ -94,13 +94,13 @@ def test_color_bar_runs_through_the_map_and_is_labelled():
 
 def test_side_by_side():
     first, second = np.full((10, 40, 3), 9, np.uint8), np.full((10, 60, 3), 200, np.uint8)
-    sheet = side_by_side([first, torch.from_numpy(second)], ["a", "b"], gap=6)
-    assert sheet.shape[1] == 40 + 6 + 60
+    sheet = side_by_side([first, torch.from_numpy(second)], ["a", "b"])
+    assert sheet.shape[1] == 40 + 8 + 60
     np.testing.assert_array_equal(sheet[-10:, :40], first)
-    np.testing.assert_array_equal(sheet[-10:, 46:], second)
-    assert (sheet[:, 40:46] == 255).all()
+    np.testing.assert_array_equal(sheet[-10:, 48:], second)
+    assert (sheet[:, 40:48] == 255).all()
     assert (sheet[:-10, :40] < 128).any()
-    assert (sheet[:-10, 46:] < 128).any()
+    assert (sheet[:-10, 48:] < 128).any()
     long = side_by_side([first, second], ["a label much longer than its image", ""])
     assert (long[:-10, 40:] == 255).all()
 
