@@ -13,6 +13,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.tensors import bilinear
 from coliags_plugin.geometry.poses.rigid import w_first
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, quiet_colmap
 from coliags_plugin.reconstruction.structure.matching import Pose, have_positive_depths, mutual_matches, rays
@@ -102,9 +103,7 @@ class Pair:
         pose = change(self._source.camera_to_world.double())
         camera = changed(self._target, change)
         pixels, z = camera.project(self._points[::every] * scale @ pose[:3, :3].T + pose[:3, 3])
-        column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
-        lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        hit = row[lands] * camera.width + column[lands]
+        lands, hit = _pixels_hit(pixels, z, camera)
         there = self._depth_there[hit] * scale
         difference = (z[lands] - there).abs()
         finite = torch.isfinite(difference)
@@ -158,19 +157,21 @@ def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
 
 def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
-    depth = _trusted_depth(target)
-    pixels, z = changed(source.camera).project(changed(target.camera).unproject(depth).reshape(-1, 3))
-    camera = source.camera
-    grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
-    image = source.image.permute(2, 0, 1)[None].double()
-    painted = torch.nn.functional.grid_sample(image, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
-    z_there = torch.nn.functional.grid_sample(
-        _trusted_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
-    )[0, 0]
-    z = z.reshape(depth.shape)
+    depth, camera = _trusted_depth(target), source.camera
+    pixels, z = changed(camera).project(changed(target.camera).unproject(depth).reshape(-1, 3))
+    painted = bilinear(source.image.double(), pixels.nan_to_num(0.0).reshape(*depth.shape, 2))
+    lands, hit = _pixels_hit(pixels, z, camera)
     # Points occluded in the source image are left out.
-    shown = (grid[0].abs() <= 1).all(-1) & (z > 0) & ((z_there - z).abs() < 0.05 * z)
-    return painted / 255.0, shown
+    shown = torch.zeros_like(lands)
+    shown[lands] = (_trusted_depth(source).reshape(-1)[hit] - z[lands]).abs() < 0.05 * z[lands]
+    return painted / 255.0, shown.reshape(depth.shape)
+
+
+def _pixels_hit(pixels: Tensor, z: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Mask of projected points that land in the image, in front of the camera, and the pixel index of each of these."""
+    column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
+    lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return lands, row[lands] * camera.width + column[lands]
 
 
 def _trusted_depth(frame: Frame) -> Float[Tensor, "H W"]:
