@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import random
 from dataclasses import replace
+from pathlib import Path
+from runpy import run_path
 
 import torch
 from pydantic import BaseModel, ConfigDict, field_validator
@@ -12,7 +14,6 @@ from torch import nn
 
 from coliags_plugin.contracts import (
     Draw,
-    GaussianField,
     Loss,
     LossSettings,
     Protocol,
@@ -23,30 +24,28 @@ from coliags_plugin.contracts import (
     ViewModule,
 )
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.tensors import masked_mean
 from coliags_plugin.engine.samplers import FrameSampler
 from coliags_plugin.renderers.cpu_renderer import CpuRenderer
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer
 
+EXAMPLE = Path(__file__).parents[2] / "docs" / "example_package" / "coliags_round" / "field.py"
+RoundGaussians = run_path(str(EXAMPLE))["RoundGaussians"]
 
-class Balls(GaussianField):
-    """A round Gaussian at some of the initial points."""
+
+class Balls(RoundGaussians):
+    """The example's field of round Gaussians, at some of the initial points, with a buffer that has rows."""
 
     class Settings(Settings):
         """One option."""
 
         size: float = 2.0
 
-    primitive = "gaussians3d"
     elements = "balls"
 
     def __init__(self, settings, count):
-        super().__init__()
-        self.settings = settings
-        self.means = nn.Parameter(torch.zeros(count, 3))
-        self.logits = nn.Parameter(torch.zeros(count, 4))
+        super().__init__(settings, count)
         self.register_buffer("ages", torch.zeros(count))
 
     @property
@@ -55,34 +54,8 @@ class Balls(GaussianField):
 
     @classmethod
     def from_scene(cls, scene, settings, generator):
-        if not len(scene.points):
-            raise InputError("no points", "some")
-        positions = scene.points.positions[::25]
-        field = cls(settings, len(positions))
-        field.means.data.copy_(positions)
-        return field
-
-    @classmethod
-    def from_state(cls, state, settings):
-        field = cls(settings, len(state["means"]))
-        field.load_state_dict(state)
-        return field
-
-    def gaussians(self, camera):
-        count = len(self.means)
-        rows, values = torch.arange(count), self.logits.sigmoid()
-        return Gaussians(
-            means=self.means,
-            quats_wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
-            scales=torch.full((count, 3), self.settings.size),
-            opacities=values[:, 0],
-            colors=values[:, 1:],
-            source_index=rows,
-            visible_sources=rows,
-        )
-
-    def parameter_groups(self):
-        return {"means": [self.means], "logits": [self.logits]}
+        points = replace(scene.points, positions=scene.points.positions[::25], colors=None)
+        return super().from_scene(replace(scene, points=points), settings, generator)
 
 
 class Fog(RadianceField):
@@ -155,7 +128,8 @@ class Division(Strategy):
         return {"grown": born}
 
     def add(self, field, rows, born):
-        rows.add_rows({"means": field.means[:born] + 1.0, "logits": field.logits[:born]})
+        moved = {"means": field.means[:born] + 1.0, "sizes": field.log_sizes[:born], "logits": field.logits[:born]}
+        rows.add_rows(moved)
         field.ages = torch.cat([field.ages, torch.zeros(born)])
         self.steps = torch.cat([self.steps, torch.zeros(born)])
 
@@ -214,7 +188,7 @@ class HasAnUngroupedParameter(Balls):
 AcceptsAnyOption = changed(Colour, Settings=LooseSettings)
 CrashesWhenMade = changed(Balls, from_scene=lambda scene, settings, generator: 1 / 0)
 SharesAParameter = changed(
-    Balls, parameter_groups=lambda self: {"means": [self.means], "logits": [self.logits, self.means]}
+    Balls, parameter_groups=lambda self: {**Balls.parameter_groups(self), "logits": [self.logits, self.means]}
 )
 
 
@@ -381,6 +355,7 @@ ForgetsTheBuffer, ForgetsTheCounter = forgetting("ages", of_field=True), forgett
 class GoesPastAdam(Division):
     def add(self, field, rows, born):
         field.means = nn.Parameter(torch.cat([field.means, field.means[:born]]))
+        field.log_sizes = nn.Parameter(torch.cat([field.log_sizes, field.log_sizes[:born]]))
         field.logits = nn.Parameter(torch.cat([field.logits, field.logits[:born]]))
 
 

@@ -16,7 +16,7 @@ field: Balls
 renderer: auto
 strategy: {name: Division}
 losses: {colour: {name: Colour, weight: 1.0}}
-optimizers: {means: {lr: 0.01}, logits: {lr: 0.05}}
+optimizers: {means: {lr: 0.01}, sizes: {lr: 0.0}, logits: {lr: 0.05}}
 """
 FOG = """
 datamanager: auto
@@ -78,7 +78,7 @@ QUICK = {"builds", "trains", "renders", "resumes"}
 def registered(monkeypatch):
     """The components of components.py under the names of their classes, the protocol under its own."""
     kinds = {
-        components.GaussianField: registry.fields,
+        components.RoundGaussians: registry.fields,
         components.RadianceField: registry.fields,
         components.Loss: registry.losses,
         components.Strategy: registry.strategies,
