@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("phantom", type=Path)
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
     arguments = parser.parse_args()
-    options = parse_assignments(arguments.options, "NAME=VALUE")
+    options = parse_assignments(arguments.options)
     settings = validated(MeshSettings, options, "mesh option")
     for name, value in errors(open_scene(arguments.scene), arguments.phantom, settings).items():
         print(f"{name:20s} {value:10.4f}")

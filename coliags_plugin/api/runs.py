@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.config.assignments import assignments, settings_of
 from coliags_plugin.config.options import (
     CoverageOptions,
     EvaluateOptions,
@@ -182,16 +182,14 @@ class Run:
             InputError: See :meth:`load`; an option is unknown or invalid, the method renders no such depth, there is no
                 surface, the truth is of another world or unit, or the folder exists or cannot be written.
         """
-        from coliags_plugin.core.settings import validated
         from coliags_plugin.surface.meshing.fusion import mesh_run
         from coliags_plugin.surface.meshing.views import MeshSettings
 
-        values: dict[str, object] = {"color": options.color, "texture": 4.0 if options.texture else 0.0}
-        values |= parse_assignments(options.settings, "KEY=VALUE, for instance depth=median")
-        if options.voxel is not None:
-            values["voxel_size"] = options.voxel
-        chosen, folder = validated(MeshSettings, values, "mesh option"), options.output or self.path / "mesh"
-        return mesh_run(self.load(), folder, chosen, options.formats, options.truth, options.overwrite)
+        named = assignments({"color": options.color, "texture": 4.0 if options.texture else 0.0})
+        voxel = assignments(None if options.voxel is None else {"voxel_size": options.voxel})
+        settings = settings_of(MeshSettings, (*named, *options.settings, *voxel))
+        folder = options.output or self.path / "mesh"
+        return mesh_run(self.load(), folder, settings, options.formats, options.truth, options.overwrite)
 
     def export(self, output: ExportOptions | str | Path | None = None, *formats: str, **options: Any) -> list[Exported]:
         """Write the run's Gaussians to files, and a JSON record of each to ``FILE.json`` beside it.
@@ -223,7 +221,8 @@ class Run:
             InputError: See :meth:`load`; an option is unknown or invalid, the mesh cannot be read or is not where the
                 cameras look, or the folder exists or cannot be written.
         """
-        from coliags_plugin.api.scenes import coverage_settings, measure_scene_coverage
+        from coliags_plugin.api.scenes import measure_scene_coverage
+        from coliags_plugin.surface.coverage.visibility import CoverageSettings
         from coliags_plugin.surface.coverage.writing import measure_scene
         from coliags_plugin.surface.meshing.fusion import fuse_run
 
@@ -231,7 +230,7 @@ class Run:
         if options.mesh is not None or mesh.is_file():
             data = self.data or self.folder.identity().scene_path
             return measure_scene_coverage(data, replace(options, mesh=mesh, output=output))
-        settings = coverage_settings(options)
+        settings = settings_of(CoverageSettings, options.settings)
         refuse_existing(output, options.overwrite)
         trained = self.load()
         return measure_scene(trained.scene, fuse_run(trained).mesh, output, settings, options.overwrite)

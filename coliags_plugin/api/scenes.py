@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin.config.assignments import assignments, parse_assignments
+from coliags_plugin.config.assignments import assignments, settings_of
 from coliags_plugin.config.options import CoverageOptions, ReconstructOptions, takes
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing, user_path
@@ -14,7 +14,6 @@ from coliags_plugin.core.files import refuse_existing, user_path
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.pipeline.stages import Record
-    from coliags_plugin.surface.coverage.visibility import CoverageSettings
     from coliags_plugin.surface.coverage.writing import MeasuredCoverage
 
 
@@ -68,25 +67,17 @@ def measure_scene_coverage(data: str | Path, options: CoverageOptions) -> Measur
             together; or the folder exists or cannot be written.
     """
     from coliags_plugin.geometry.meshes.files import read_mesh
+    from coliags_plugin.surface.coverage.visibility import CoverageSettings
     from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
 
     if options.mesh is None or options.output is None:
         raise InputError(
             f"{data} is not a run folder", "a run folder, or a scene's folder with `mesh=FILE` and `output=FOLDER`"
         )
-    chosen = coverage_settings(options)
+    settings = settings_of(CoverageSettings, options.settings)
     refuse_existing(options.output, options.overwrite)
     recording, wall = open_recording(user_path(data)), read_mesh(options.mesh)
-    return measure_scene(recording, wall, options.output, chosen, options.overwrite)
-
-
-def coverage_settings(options: CoverageOptions) -> CoverageSettings:
-    """Settings of coverage measurement, which say what counts as seen, from options."""
-    from coliags_plugin.core.settings import validated
-    from coliags_plugin.surface.coverage.visibility import CoverageSettings
-
-    values = parse_assignments(options.settings, "KEY=VALUE, for instance region_diameter=10")
-    return validated(CoverageSettings, values, "coverage option")
+    return measure_scene(recording, wall, options.output, settings, options.overwrite)
 
 
 @takes(ReconstructOptions)
@@ -103,7 +94,6 @@ def reconstruct(options: ReconstructOptions) -> Record:
         InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.
         InterruptedRunError: Ctrl-C in training, after the state was saved.
     """
-    from coliags_plugin.config.assignments import settings_of
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.progress import progress_callback
     from coliags_plugin.engine.tasks import ExecutionOptions

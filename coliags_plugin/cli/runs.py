@@ -102,7 +102,7 @@ class RenderCommand(RunCommand, options.RenderOptions):
         """Render, and print the output folder."""
         from coliags_plugin.config.assignments import parse_assignments
 
-        lamp = parse_assignments(self.light, "KEY=VALUE, for instance power=10")
+        lamp = parse_assignments(self.light)
         if lamp and self.flatten:
             raise InputError("--light and --flatten together", "one of them")
         run = self.opened()

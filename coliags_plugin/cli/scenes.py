@@ -63,7 +63,7 @@ class PhantomCommand:
             options["width"], options["height"] = arguments.parse_size(self.size)
         if self.light_offset is not None:
             options["light_offset"] = arguments.parse_vector("--light-offset", self.light_offset)
-        options |= parse_assignments(self.set, expected="KEY=VALUE")
+        options |= parse_assignments(self.set)
         folder = make_phantom(self.output, **options)
         print_summary(facts={"settings": options}, written=[folder], then=[train_command(folder)], as_json=self.json)
 

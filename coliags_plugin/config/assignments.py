@@ -10,20 +10,14 @@ from coliags_plugin.config.yaml_tree import Node, dump_inline, override_all, par
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, invalid_reported
 
-#: An assignment as messages explain it.
-EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
 
-
-def parse_assignments(texts: Iterable[str], expected: str = EXAMPLE) -> dict[str, object]:
-    """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place.
-
-    ``expected`` is for messages.
-    """
+def parse_assignments(texts: Iterable[str]) -> dict[str, object]:
+    """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place."""
     values: dict[str, object] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
-            raise InputError(f"setting '{text}'", expected)
+            raise InputError(f"setting '{text}'", "KEY=VALUE")
         values.pop(key.strip(), None)
         values[key.strip()] = parse_value(value)
     return values

@@ -100,7 +100,7 @@ def _problem(item: Mapping[str, Any], content: str) -> str:
 
 
 def validated(kind: type[Model], values: Mapping[str, object], place: str, do: str = "") -> Model:
-    """Settings of plain values by name; ``place`` is what messages call one of them, for instance ``mesh option``."""
+    """Settings of plain values by name; ``place`` is what messages call one of them, for instance ``lamp option``."""
     with invalid_reported(f"{place} ", do=do):
         return kind.model_validate(dict(values))
 

@@ -162,8 +162,8 @@ def test_input_that_cannot_be_measured_is_refused():
         facing_cameras(mesh, [], DEFAULTS)
     with pytest.raises(InputError, match="without triangles"):
         see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))], DEFAULTS)
-    with pytest.raises(InputError, match=r"coverage option far: .*got -3\.0"):
-        validated(CoverageSettings, {"far": -3.0}, "coverage option")
+    with pytest.raises(InputError, match=r"setting far: .*got -3\.0"):
+        validated(CoverageSettings, {"far": -3.0}, "setting")
 
 
 def test_neighbours_share_edges_and_regions_are_what_is_connected():
