@@ -70,7 +70,7 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether colours depend on where the lamp is, which can be held; default: if it is modelled apart."""
+        """True if colours depend on where the lamp is, which can be held; default: if it is modelled apart."""
         return self.lamp_is_apart
 
     def with_lamp(self, lamp: Lamp) -> Self:
@@ -243,7 +243,7 @@ class Head(nn.Module, ABC, Generic[SettingsT]):
             "'networks' if the kernels may decode by its networks instead"
         )
 
-    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+    def networks(self, anchors: SeenAnchors) -> HeadNetworks:
         """MLPs of this head and their inputs, where ``decoding`` is "networks"."""
         raise NotImplementedError(f"{type(self).__name__} has no networks for kernels to decode by")
 
@@ -256,7 +256,7 @@ class GeometryHead(Head[SettingsT]):
     """Anchor feature and viewing direction -> opacity, scale and rotation of every child."""
 
     @abstractmethod
-    def forward(self, seen: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+    def forward(self, anchors: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors.
 
         Returns:
@@ -270,12 +270,12 @@ class AppearanceHead(Head[SettingsT]):
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether colours depend on distance or angle to the lamp."""
+        """True if colours depend on distance or angle to the lamp."""
         return True
 
     @property
     def uses_normals(self) -> bool:
-        """Whether :meth:`forward` and :meth:`apply_light` are given the normals of the wall; default: not."""
+        """True if :meth:`forward` and :meth:`apply_light` are given the normals of the wall; default: not."""
         return False
 
     def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
@@ -289,7 +289,7 @@ class AppearanceHead(Head[SettingsT]):
         """Adapt the initial parameters to the colours of the scene, before training."""
 
     @abstractmethod
-    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
+    def forward(self, anchors: SeenAnchors) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours: RGB in (0, 1). [V, K, 3]"""
 
     def apply_light(

@@ -26,7 +26,7 @@ RenderedT = TypeVar("RenderedT", bound=Field, default=Any)
 
 @dataclass(frozen=True)
 class Availability:
-    """Whether a renderer can run here, and why or why not."""
+    """Answer to the question if a renderer can run here, with the reason."""
 
     ok: bool
     reason: str
@@ -61,7 +61,7 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
     @classmethod
     @abstractmethod
     def availability(cls) -> Availability:
-        """Whether this machine can run it."""
+        """Check if this machine can run it."""
 
     @classmethod
     def outputs_of(cls, primitive: str) -> frozenset[str]:

@@ -196,7 +196,7 @@ class LossSettings(Settings):
         return self
 
     def active(self, step: int, schedule: Schedule) -> bool:
-        """Whether the term counts at a step, counted from 1."""
+        """True if the term counts at a step, counted from 1."""
         return step > schedule.at(self.from_step) and (self.until_step is None or step <= schedule.at(self.until_step))
 
     def weight_at(self, step: int, steps: int) -> float:

@@ -156,7 +156,7 @@ def _images_in(file: PIL.Image.Image) -> int:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether all chunks of a PNG, up to IEND, lie within the file.
+    """True if all chunks of a PNG, up to IEND, lie within the file.
 
     OpenCV accepts truncated files, and allocates whatever length a chunk states.
     """

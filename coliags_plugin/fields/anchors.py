@@ -158,7 +158,7 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
 
     @property
     def knows_lamp(self) -> bool:
-        """Whether colours depend on the lamp, as the appearance head says."""
+        """True if colours depend on the lamp, as the appearance head says."""
         return self.appearance_head.knows_lamp
 
     @property
@@ -220,18 +220,18 @@ class AnchorField(GaussianField[AnchorFieldSettings]):
         visible = self.visible_anchors(camera)
         anchors, features = (unique_rows(rows, visible) for rows in (self.anchors, self.features))
         normals = None if self.normals is None else self.normals.index_select(0, visible)
-        seen = _seen(anchors, features, normals, camera, light)
-        networks = self._networks(seen) if fit_kernels(self.anchors) else None
+        head_inputs = _seen(anchors, features, normals, camera, light)
+        networks = self._networks(head_inputs) if fit_kernels(self.anchors) else None
         if networks is not None:
             return fused_children(self._rows, visible, features, *networks), visible
-        opacities, covariances = self.geometry_head(seen)
-        return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(seen)), visible
+        opacities, covariances = self.geometry_head(head_inputs)
+        return drawn_children(self._rows, visible, opacities, covariances, self.appearance_head(head_inputs)), visible
 
-    def _networks(self, seen: SeenAnchors) -> tuple[HeadNetworks, HeadNetworks] | None:
+    def _networks(self, head_inputs: SeenAnchors) -> tuple[HeadNetworks, HeadNetworks] | None:
         """Networks of both heads for the kernels; None where one decodes by its ``forward`` alone."""
         if any(head.decoding == "forward" for head in (self.geometry_head, self.appearance_head)):
             return None
-        return self.geometry_head.networks(seen), self.appearance_head.networks(seen)
+        return self.geometry_head.networks(head_inputs), self.appearance_head.networks(head_inputs)
 
 
 def _seen(

@@ -51,8 +51,8 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         self.settings = settings
         self.children_per_anchor = children
         self.features = features
-        seen = SeenAnchors(*(torch.zeros(1, width) for width in (features, self.direction_channels, 1, 1)))
-        inputs = self.inputs(seen).shape[1] + 2 * self.embedded * self.frequencies
+        anchors = SeenAnchors(*(torch.zeros(1, width) for width in (features, self.direction_channels, 1, 1)))
+        inputs = self.inputs(anchors).shape[1] + 2 * self.embedded * self.frequencies
         self.color_mlp = mlp(features + inputs, settings.hidden, 3 * children, generator)
 
     @property
@@ -60,12 +60,12 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """Number of frequencies of the positional encoding; 0 means none."""
         return 0
 
-    def embed_direction(self, seen: SeenAnchors) -> Float[Tensor, "V D"]:
+    def embed_direction(self, anchors: SeenAnchors) -> Float[Tensor, "V D"]:
         """Encoding of the viewing direction that the MLP gets."""
-        return seen.directions
+        return anchors.directions
 
     @abstractmethod
-    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
+    def inputs(self, anchors: SeenAnchors) -> Float[Tensor, "V R"]:
         """Inputs of the MLP besides the feature: the direction as encoded, then the distance if :attr:`knows_lamp`."""
 
     @torch.no_grad()
@@ -87,14 +87,14 @@ class MLPAppearanceHead(AppearanceHead[AppearanceT]):
         """The MLP."""
         return {"color_mlp": list(self.color_mlp.parameters())}
 
-    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+    def networks(self, anchors: SeenAnchors) -> HeadNetworks:
         """The MLP."""
-        inputs = self.inputs(seen._replace(directions=self.embed_direction(seen)))
+        inputs = self.inputs(anchors._replace(directions=self.embed_direction(anchors)))
         return HeadNetworks(inputs, self.embedded, self.frequencies, (self.color_mlp,))
 
-    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
+    def forward(self, anchors: SeenAnchors) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours."""
-        (colors,) = outputs(seen.features, self.networks(seen))
+        (colors,) = outputs(anchors.features, self.networks(anchors))
         return colors.view(len(colors), self.children_per_anchor, 3).sigmoid()
 
 
@@ -114,9 +114,11 @@ class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
         """True where the distance to the lamp is an input of the MLP."""
         return self.settings.distance
 
-    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
+    def inputs(self, anchors: SeenAnchors) -> Float[Tensor, "V R"]:
         """v, and d if that is an input."""
-        return torch.cat([seen.directions, seen.distances], dim=1) if self.settings.distance else seen.directions
+        return (
+            torch.cat([anchors.directions, anchors.distances], dim=1) if self.settings.distance else anchors.directions
+        )
 
 
 class IMIAAppearanceSettings(AppearanceSettings):
@@ -137,12 +139,12 @@ class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
 
     @property
     def frequencies(self) -> int:
-        """As set: gamma(cos theta) has 11 numbers at five."""
+        """Number of frequencies for the cosine: gamma(cos theta) has 11 numbers at five."""
         return self.settings.frequencies
 
-    def inputs(self, seen: SeenAnchors) -> Float[Tensor, "V R"]:
+    def inputs(self, anchors: SeenAnchors) -> Float[Tensor, "V R"]:
         """v, d and cos theta."""
-        return torch.cat([seen.directions, seen.distances, seen.cosines], dim=1)
+        return torch.cat([anchors.directions, anchors.distances, anchors.cosines], dim=1)
 
 
 class GlintAppearanceHead(IMIAAppearanceHead):
@@ -173,13 +175,13 @@ class GlintAppearanceHead(IMIAAppearanceHead):
         """The MLP with the layer of the tilts."""
         return {"color_mlp": [*self.color_mlp.parameters(), *self.tilt_layer.parameters()]}
 
-    def embed_direction(self, seen: SeenAnchors) -> Float[Tensor, "V D"]:
+    def embed_direction(self, anchors: SeenAnchors) -> Float[Tensor, "V D"]:
         """v, and the facets' components and lobes."""
-        assert seen.normals is not None, "the field keeps normals, as uses_normals says"
-        tilts = MAX_TILT * self.tilt_layer(seen.features).tanh()
-        across = tangent_components(seen.directions, seen.normals) - tilts
+        assert anchors.normals is not None, "the field keeps normals, as uses_normals says"
+        tilts = MAX_TILT * self.tilt_layer(anchors.features).tanh()
+        across = tangent_components(anchors.directions, anchors.normals) - tilts
         squares = across.square().sum(1, keepdim=True)
-        return torch.cat([seen.directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
+        return torch.cat([anchors.directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
 
 
 def tangent_components(directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"]) -> Float[Tensor, "V 2"]:

@@ -79,7 +79,7 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
 
     @property
     def uses_normals(self) -> bool:
-        """Whether the law has an exponent of incidence, or the head below uses them."""
+        """True if the law has an exponent of incidence, or the head below uses them."""
         return self._knows_incidence or self.head.uses_normals
 
     @torch.no_grad()
@@ -97,8 +97,8 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         if fitted is None:
             return
         angles = self.exponents.shape[1] - 1
-        for column, found in enumerate((fitted.cosine_exponents, fitted.incidence_exponents)[:angles], 1):
-            bounded = found.clamp(0.0, _LARGEST_EXPONENT)
+        for column, fitted_exponents in enumerate((fitted.cosine_exponents, fitted.incidence_exponents)[:angles], 1):
+            bounded = fitted_exponents.clamp(0.0, _LARGEST_EXPONENT)
             self.exponents[:, column] = bounded.mean() if self.settings.channels == 1 else bounded
         self.lamp_offset.copy_(MAX_OFFSET * torch.atanh((fitted.lamp_offset / MAX_OFFSET).clamp(-0.9, 0.9)))
 
@@ -106,13 +106,13 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         """Groups of the head, of the exponents, and of the lamp's offset, which needs a rate in scene units."""
         return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
 
-    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+    def networks(self, anchors: SeenAnchors) -> HeadNetworks:
         """Networks of the head below."""
-        return self.head.networks(seen)
+        return self.head.networks(anchors)
 
-    def forward(self, seen: SeenAnchors) -> Float[Tensor, "V K 3"]:
+    def forward(self, anchors: SeenAnchors) -> Float[Tensor, "V K 3"]:
         """The colours before attenuation."""
-        colors: Tensor = self.head(seen)
+        colors: Tensor = self.head(anchors)
         return colors
 
     @property
@@ -153,8 +153,8 @@ class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
         if fit_kernels(colors) and len(colors) >= _FEWEST:
             exponents = functional.pad(self.exponents, (0, 3 - self.exponents.shape[1])).expand(3, 3)
             bounds = torch.stack([torch.tensor([_MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE]), self.reference.expand(3)])
-            seen = (lamp, camera.optical_axis, exponents, positions, facing, bounds)
-            attenuated: Tensor = _Attenuate.apply(colors, *seen)  # type: ignore[no-untyped-call]
+            arguments = (lamp, camera.optical_axis, exponents, positions, facing, bounds)
+            attenuated: Tensor = _Attenuate.apply(colors, *arguments)  # type: ignore[no-untyped-call]
             return attenuated
         rays = positions - lamp
         distances = rays.norm(dim=1).clamp_min(1e-9)
@@ -199,13 +199,13 @@ class _Attenuate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, of_result: Tensor) -> tuple[Tensor | None, ...]:
         from coliags_plugin.core.numba_kernels.threads import workers
         from coliags_plugin.fields.numba_kernels.attenuation import SLABS, attenuate_backward
 
-        of_colors, sums = torch.empty(given.shape), torch.empty(SLABS, 16)
+        of_colors, sums = torch.empty(of_result.shape), torch.empty(SLABS, 16)
         with workers() as run:
-            run(attenuate_backward, *ctx.seen, *tables(given, of_colors, sums))
+            run(attenuate_backward, *ctx.seen, *tables(of_result, of_colors, sums))
         total = sums.sum(0)
         # Of logarithms to base 2, and of their powers, the exponents' derivatives have the factor ln 2.
         return of_colors, total[9:12], total[12:15], math.log(2.0) * total[:9].view(3, 3), None, None, None

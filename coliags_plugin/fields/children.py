@@ -68,9 +68,9 @@ def visible_anchors(rows: AnchorRows, camera: Camera) -> Int[Tensor, "V"]:
 
     camera = camera.to(torch.device("cpu"), torch.float32)
     visible = torch.empty(len(rows.positions), dtype=torch.bool)
-    given = tables(rows.positions, rows.offsets, rows.scalings.exp(), camera.center, frustum_planes(camera))
+    arguments = tables(rows.positions, rows.offsets, rows.scalings.exp(), camera.center, frustum_planes(camera))
     with workers() as run:
-        run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *given, camera.near_plane, visible.numpy())
+        run(find_visible, rows.offsets.shape[1], DRAWN_SIGMAS, *arguments, camera.near_plane, visible.numpy())
     return visible.nonzero().squeeze(1)
 
 
@@ -120,14 +120,14 @@ def _scales_first(values: Float[Tensor, "7K *H"], children: int) -> Float[Tensor
 
 
 @cache
-def _waves(given: int, embedded: int, frequencies: int) -> tuple[Tensor, Tensor]:
+def _waves(plain: int, embedded: int, frequencies: int) -> tuple[Tensor, Tensor]:
     """Octaves and quadrants of ``numba_kernels.decoding.Inputs``: inputs as they are, then gamma of the last ones."""
-    octaves = torch.zeros(embedded, given + 2 * embedded * frequencies)
-    blocks = octaves[:, given:].view(embedded, frequencies, 2, embedded)
+    octaves = torch.zeros(embedded, plain + 2 * embedded * frequencies)
+    blocks = octaves[:, plain:].view(embedded, frequencies, 2, embedded)
     for place in range(embedded):
         blocks[place, :, :, place] = 2.0 ** torch.arange(frequencies)[:, None]
     quadrants = torch.zeros(octaves.shape[1])
-    quadrants[given:].view(frequencies, 2, embedded)[:, 1] = 1.0
+    quadrants[plain:].view(frequencies, 2, embedded)[:, 1] = 1.0
     return _filled(octaves.t()).t().contiguous(), _filled(quadrants)
 
 
@@ -180,7 +180,7 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
         from coliags_plugin.core.numba_kernels.threads import workers
         from coliags_plugin.fields.numba_kernels import decoding as kernels
 
@@ -190,12 +190,12 @@ class _Fused(torch.autograd.Function):
         zeros = features.new_zeros
         of_features = zeros(len(visible), features.shape[1] + _missing(features.shape[1]))
         of_embedded = [
-            zeros(len(visible), len(seen.quadrants)) if ctx.needs_input_grad[7 + place] else None
-            for place, seen in enumerate(ctx.seen[1:])
+            zeros(len(visible), len(inputs_of_head.quadrants)) if ctx.needs_input_grad[7 + place] else None
+            for place, inputs_of_head in enumerate(ctx.seen[1:])
         ]
         sums = torch.zeros(kernels.SLABS, sum(network.numel() for network in networks))
         transposed = [_filled(weight).t() for weight in networks if weight.dim() == 2]
-        found = [*of_rows, of_features, *(zeros(0) if embedded is None else embedded for embedded in of_embedded)]
+        written = [*of_rows, of_features, *(zeros(0) if embedded is None else embedded for embedded in of_embedded)]
         with workers() as run:
             run(
                 kernels.decode_backward,
@@ -205,8 +205,8 @@ class _Fused(torch.autograd.Function):
                 *ctx.hidden,
                 ctx.starts,
                 ctx.drawn,
-                kernels.Given(*tables(*given[:5])),
-                kernels.Found(*tables(*found)),
+                kernels.Given(*tables(*of_outputs[:5])),
+                kernels.Found(*tables(*written)),
                 sums.numpy(),
             )
         of_inputs = [
@@ -222,11 +222,11 @@ def _embedding_backward(
     of_embedded: Float[Tensor, "V E"], inputs: Float[Tensor, "V R"], embedded: int, frequencies: int
 ) -> Float[Tensor, "V R"]:
     """Derivative with respect to inputs, the last of which are embedded."""
-    given = inputs.shape[1]
-    of_inputs = of_embedded[:, :given].clone()
-    of_waves = of_embedded[:, given : given + 2 * embedded * frequencies].reshape(len(inputs), frequencies, 2, embedded)
+    plain = inputs.shape[1]
+    of_inputs = of_embedded[:, :plain].clone()
+    of_waves = of_embedded[:, plain : plain + 2 * embedded * frequencies].reshape(len(inputs), frequencies, 2, embedded)
     octaves = 2.0 ** torch.arange(frequencies, device=inputs.device)[:, None]
-    phases = octaves * inputs[:, None, given - embedded :]
+    phases = octaves * inputs[:, None, plain - embedded :]
     of_phases = of_waves[:, :, 0] * phases.cos() - of_waves[:, :, 1] * phases.sin()
-    of_inputs[:, given - embedded :] += (octaves * of_phases).sum(1)
+    of_inputs[:, plain - embedded :] += (octaves * of_phases).sum(1)
     return of_inputs

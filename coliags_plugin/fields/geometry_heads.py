@@ -58,13 +58,13 @@ class PlainGeometryHead(GeometryHead[GeometryT]):
             "covariance_mlp": list(self.covariance_mlp.parameters()),
         }
 
-    def networks(self, seen: SeenAnchors) -> HeadNetworks:
+    def networks(self, anchors: SeenAnchors) -> HeadNetworks:
         """The two MLPs."""
-        return HeadNetworks(seen.directions, 3, self.frequencies, (self.opacity_mlp, self.covariance_mlp))
+        return HeadNetworks(anchors.directions, 3, self.frequencies, (self.opacity_mlp, self.covariance_mlp))
 
-    def forward(self, seen: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+    def forward(self, anchors: SeenAnchors) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors."""
-        opacities, covariances = outputs(seen.features, self.networks(seen))
+        opacities, covariances = outputs(anchors.features, self.networks(anchors))
         return opacities.tanh(), covariances.view(len(opacities), self.children_per_anchor, 7)
 
 
@@ -81,5 +81,5 @@ class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
 
     @property
     def frequencies(self) -> int:
-        """As set: gamma(v) has 63 numbers at ten."""
+        """Number of frequencies for the viewing direction: gamma(v) has 63 numbers at ten."""
         return self.settings.frequencies

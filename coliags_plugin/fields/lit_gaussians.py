@@ -214,7 +214,9 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         """The Gaussians in view; noise is on the network's inputs, and its products are in ``network_precision``."""
         return self._gaussians(camera, generator)
 
-    def _gaussians(self, camera: Camera, generator: torch.Generator | None, held: HeldLight | None = None) -> Gaussians:
+    def _gaussians(
+        self, camera: Camera, generator: torch.Generator | None, held_light: HeldLight | None = None
+    ) -> Gaussians:
         camera = camera.to(self.means.device, self.means.dtype)
         bright = self.opacities.detach().sigmoid() >= MIN_OPACITY
         visible = (self._in_view(camera) & bright).nonzero().squeeze(1)
@@ -225,7 +227,9 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         albedos = albedos.clamp_min(0.0)
         roughness = roughness.clamp(*self.settings.roughness_range)
         f0 = f0.clamp(*self.settings.f0_range)
-        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator, held)
+        light, factors = self._reflected(
+            camera, means, third_axes(quats), albedos, roughness, f0, generator, held_light
+        )
         return Gaussians(
             means=means,
             quats_wxyz=quats,
@@ -246,26 +250,26 @@ class LitGaussians(ExplicitField[LitGaussiansSettings]):
         roughness: Float[Tensor, "V"],
         f0: Float[Tensor, "V"],
         generator: torch.Generator | None,
-        held: HeldLight | None,
+        held_light: HeldLight | None,
     ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Linear light from Gaussians to the camera, and the factors of their diffuse reflection."""
         views = camera.center - means
         facing = (axes * views).sum(1)
         normals = torch.where((facing < 0)[:, None], -axes, axes)
-        if held is None:
+        if held_light is None:
             lamps = views if self.lamp.at_camera else self.lamp.position(camera) - means
             lengths = lamps.norm(dim=1, keepdim=True).clamp_min(_MIN_DISTANCE)
             lamps = lamps / lengths
         else:
-            lamps, lengths = held.towards(means, normals), held.incidence(means)[0][:, None]
+            lamps, lengths = held_light.towards(means, normals), held_light.incidence(means)[0][:, None]
         distances = lengths / self.extent
-        if held is None and self.lamp.at_camera:
+        if held_light is None and self.lamp.at_camera:
             cosines = Cosines.retroreflected((normals * lamps).sum(1).clamp_min(0.0))
         else:
             cosines = Cosines.of(normals, nn.functional.normalize(views, dim=1), lamps)
         intensity, falloff, exponent = self.lamp_parameters.clamp_min(0.0).unbind()
         arriving = intensity / (1.0 + falloff * distances[:, 0].pow(exponent))
-        if held is None and self.lamp != Lamp():
+        if held_light is None and self.lamp != Lamp():
             arriving = arriving * self.lamp.spread(-lamps, camera)
         factors = self._factors(albedos, distances, normals, lamps, generator)
         mirrored = fresnel(cosines, f0)

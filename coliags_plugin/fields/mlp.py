@@ -28,7 +28,7 @@ def reduced_dtype(precision: Precision, inputs: Tensor) -> torch.dtype:
 
 @cache
 def _cpu_multiplies_bfloat16() -> bool:
-    """Whether the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
+    """True if the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
     capabilities: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 

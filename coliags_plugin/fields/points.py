@@ -63,7 +63,7 @@ def frustum_planes(camera: Camera) -> Float[Tensor, "5 3"]:
 
 
 def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera) -> Bool[Tensor, "M"]:
-    """Whether any part of a sphere may lie inside the viewing pyramid beyond the camera's near plane.
+    """True if any part of a sphere may lie inside the viewing pyramid beyond the camera's near plane.
 
     Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused. World frame, scene units.
     """

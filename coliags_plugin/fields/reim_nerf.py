@@ -61,10 +61,10 @@ class SceneNormalisation(nn.Module):
                 "points spread over the surface, whose size is the field's unit of length",
                 "Give the data manager points or depth",
             )
-        made = cls()
-        made.center.copy_(center)
-        made.unit.copy_(unit)
-        return made
+        normalisation = cls()
+        normalisation.center.copy_(center)
+        normalisation.unit.copy_(unit)
+        return normalisation
 
     def forward(self, positions: Float[Tensor, "*P 3"]) -> Float[Tensor, "*P 3"]:
         """Scene units to normalised coordinates."""
@@ -79,19 +79,19 @@ def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
     points = initial_positions(scene).double()
     points = points[:: max(1, len(points) // _POINTS)]
     radii = points.new_zeros(len(points))
-    found = []
+    distances_in_view = []
     for frame in scene.train:
         camera = frame.camera.to(points.device, points.dtype)
         distances = (points - camera.center).norm(dim=1)
-        found.append(distances[spheres_in_frustum(points, radii, replace(camera, near_plane=0.0))])
-    seen = torch.cat(found)
-    if not len(seen):
+        distances_in_view.append(distances[spheres_in_frustum(points, radii, replace(camera, near_plane=0.0))])
+    all_distances = torch.cat(distances_in_view)
+    if not len(all_distances):
         raise InputError(
             "no training camera has an initial point in view",
             "points on the surface that the cameras see, between which and the cameras rays are sampled",
             "Look at poses and points with `coliags data check`",
         )
-    return torch.stack([NEAR_MARGIN * seen.min(), FAR_MARGIN * seen.max()])
+    return torch.stack([NEAR_MARGIN * all_distances.min(), FAR_MARGIN * all_distances.max()])
 
 
 class ReimNerfFieldSettings(Settings):
@@ -128,10 +128,10 @@ class RadianceMLP(nn.Module):
         self.trunk = nn.ModuleList([glorot_linear(size, width, generator) for size in inputs])
         self.density = glorot_linear(width, 1, generator)
         self.feature = glorot_linear(width, width, generator)
-        seen = _embedding_size(settings.direction_frequencies)
+        embedded_size = _embedding_size(settings.direction_frequencies)
         if settings.light:
-            seen += _embedding_size(settings.light_frequencies)
-        self.color = glorot_linear(width + seen, settings.color_width, generator)
+            embedded_size += _embedding_size(settings.light_frequencies)
+        self.color = glorot_linear(width + embedded_size, settings.color_width, generator)
         self.rgb = glorot_linear(settings.color_width, 3, generator)
 
     def hidden(self, positions: Float[Tensor, "P S 3"], in_rendering: bool = False) -> Float[Tensor, "P*S W"]:
@@ -166,15 +166,15 @@ class RadianceMLP(nn.Module):
         its product with the colour layer is one smaller matrix.
         """
         settings = self.settings
-        seen = cosine_embedding(directions, settings.direction_frequencies)
+        embedded = cosine_embedding(directions, settings.direction_frequencies)
         if settings.light:
             lamp = cosine_embedding(light, settings.light_frequencies)
-            seen = torch.cat([seen, lamp.expand(len(seen), -1)], dim=1)
+            embedded = torch.cat([embedded, lamp.expand(len(embedded), -1)], dim=1)
         from_feature, from_ray = self.color.weight[:, : settings.width], self.color.weight[:, settings.width :]
         constant = self.color.bias + from_feature @ self.feature.bias
-        of_ray = functional.linear(seen, from_ray, constant)
+        of_ray = functional.linear(embedded, from_ray, constant)
         of_point = functional.linear(hidden, (from_feature @ self.feature.weight).to(hidden.dtype))
-        mixed = (of_point.view(len(seen), -1, settings.color_width) + of_ray[:, None]).relu_()
+        mixed = (of_point.view(len(embedded), -1, settings.color_width) + of_ray[:, None]).relu_()
         return functional.linear(mixed, self.rgb.weight, self.rgb.bias).sigmoid()
 
 

@@ -64,13 +64,13 @@ class DepthLoss(Loss[DepthLossT]):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term; 0 where no valid pixel has a depth that is trusted at all."""
-        depth, known = _known_depth(step.target)
+        depth, has_depth = _known_depth(step.target)
         rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, rendered > 0, self.settings.empty_depth)
         truth = depth.to(rendered.dtype)
-        penalties = self.penalty(zero_outside(rendered, known) - zero_outside(truth, known))
-        return weighted_mean(penalties, known, step.target.depth_confidence)
+        penalties = self.penalty(zero_outside(rendered, has_depth) - zero_outside(truth, has_depth))
+        return weighted_mean(penalties, has_depth, step.target.depth_confidence)
 
 
 class DepthL1Loss(DepthLoss):
@@ -81,7 +81,7 @@ class DepthL1Loss(DepthLoss):
     """
 
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Their absolute values, mm."""
+        """Absolute values of the differences, mm."""
         return differences.abs()
 
 
@@ -132,12 +132,12 @@ class DistanceL1Loss(Loss[DistanceL1Settings]):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term in ``unit``; 0 where no pixel counts."""
-        depth, known = _known_depth(step.target)
+        depth, has_depth = _known_depth(step.target)
         if self.settings.share < 1.0:
-            known = known & (fixed_uniform(step.target.ids, self.settings.seed) < self.settings.share)
+            has_depth = has_depth & (fixed_uniform(step.target.ids, self.settings.seed) < self.settings.share)
         rendered = step.output[self.settings.depth]
-        difference = zero_outside(rendered, known) - zero_outside(depth.to(rendered.dtype), known)
-        error = weighted_mean(difference.abs() * step.output["ray_lengths"], known, step.target.depth_confidence)
+        difference = zero_outside(rendered, has_depth) - zero_outside(depth.to(rendered.dtype), has_depth)
+        error = weighted_mean(difference.abs() * step.output["ray_lengths"], has_depth, step.target.depth_confidence)
         return error / step.model.field.length_unit if self.settings.unit == "field" else error
 
 
@@ -175,15 +175,15 @@ class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term; 0 where no valid pixel has a depth."""
-        depth, known = _known_depth(step.target)
-        known = known & (depth > 0)
+        depth, has_depth = _known_depth(step.target)
+        has_depth = has_depth & (depth > 0)
         rendered, options = step.output[self.settings.depth], self.settings
-        estimate = torch.where(known, depth, 1.0).to(rendered.dtype)
-        rendered, known = _where_drawn(rendered, known, options.depth)
-        penalty = _smooth_l1((zero_outside(rendered - estimate, known) / estimate).abs(), options.delta)
+        estimate = torch.where(has_depth, depth, 1.0).to(rendered.dtype)
+        rendered, has_depth = _where_drawn(rendered, has_depth, options.depth)
+        penalty = _smooth_l1((zero_outside(rendered - estimate, has_depth) / estimate).abs(), options.delta)
         if step.target.depth_confidence is not None:
             penalty = penalty * step.target.depth_confidence.to(penalty.dtype).clamp_min(options.floor)
-        return masked_mean(penalty, known)
+        return masked_mean(penalty, has_depth)
 
 
 class SparseDepthSettings(LossSettings):

@@ -19,12 +19,13 @@ def _drawn_channel(step: TrainingStep, channel: str) -> Float[Tensor, "N C"]:
 
 
 def _refuse_without_channel(model: TrainedModel, channel: str, loss: str) -> None:
-    known = sorted(model.field.feature_channels)
-    if channel not in known:
+    channels = sorted(model.field.feature_channels)
+    if channel not in channels:
         raise InputError(
-            f"loss '{loss}' reads channel '{channel}' of the Gaussians, and the field has {', '.join(known) or 'none'}",
+            f"loss '{loss}' reads channel '{channel}' of the Gaussians, and the field has "
+            f"{', '.join(channels) or 'none'}",
             "a channel of the field",
-            did_you_mean(channel, known) or "Remove the term, or choose another field, such as lit-gaussians",
+            did_you_mean(channel, channels) or "Remove the term, or choose another field, such as lit-gaussians",
         )
 
 
@@ -118,5 +119,5 @@ class SurfaceNormalsLoss(Loss[SurfaceNormalsSettings]):
         normals = step.model.field.normals_and_references
         if step.step % self.settings.every or normals is None:
             return step.output.alpha.new_zeros(())
-        own, references = normals
-        return (1.0 - (own * references).sum(1).abs()).mean()
+        axes, references = normals
+        return (1.0 - (axes * references).sum(1).abs()).mean()

@@ -55,8 +55,8 @@ class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
         if output.camera is None:
             raise InputError("normals of single pixels", "whole images", "Set `sampler=frames`")
         depth = output[self.settings.depth]
-        known = depth > 0 if mask is None else (depth > 0) & mask
-        of_depth = depth_normals(depth, output.camera, known) * zero_outside(output.alpha.detach(), mask)[..., None]
+        is_known = depth > 0 if mask is None else (depth > 0) & mask
+        of_depth = depth_normals(depth, output.camera, is_known) * zero_outside(output.alpha.detach(), mask)[..., None]
         return masked_mean(1.0 - (zero_outside(output["normals"], mask) * of_depth).sum(-1), mask)
 
 
@@ -100,11 +100,11 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
         module = model.view_modules.get(self.settings.module)
         curve = None if module is None else module.gain_curve
         if curve is None:
-            known = [name for name, module in model.view_modules.items() if module.gain_curve is not None]
+            modules = [name for name, module in model.view_modules.items() if module.gain_curve is not None]
             raise InputError(
                 f"loss 'smooth-gain' reads the gains of module '{self.settings.module}'",
-                f"the name of a module 'gain', one of {', '.join(known)}" if known else "a module 'gain'",
-                did_you_mean(self.settings.module, known),
+                f"the name of a module 'gain', one of {', '.join(modules)}" if modules else "a module 'gain'",
+                did_you_mean(self.settings.module, modules),
             )
         return curve
 
@@ -119,7 +119,7 @@ class SmoothGainLoss(Loss[SmoothGainSettings]):
 
 
 def depth_normals(
-    depth: Float[Tensor, "H W"], camera: Camera, known: Bool[Tensor, "H W"] | None = None
+    depth: Float[Tensor, "H W"], camera: Camera, is_known: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "H W 3"]:
     """Unit normals in camera axes, facing the camera: cross products of central differences of unprojected pixels.
 
@@ -131,10 +131,12 @@ def depth_normals(
         return depth.new_zeros(height, width, 3)
     # Without a pose, points are in camera axes.
     local = replace(camera, camera_to_world=torch.eye(4, dtype=depth.dtype, device=depth.device))
-    points = local.unproject(zero_outside(depth, known))
+    points = local.unproject(zero_outside(depth, is_known))
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, right), dim=-1)
-    if known is not None:
-        normals = zero_outside(normals, known[2:, 1:-1] & known[:-2, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2])
+    if is_known is not None:
+        normals = zero_outside(
+            normals, is_known[2:, 1:-1] & is_known[:-2, 1:-1] & is_known[1:-1, 2:] & is_known[1:-1, :-2]
+        )
     return torch.nn.functional.pad(normals, (0, 0, 1, 1, 1, 1))

@@ -137,22 +137,24 @@ class SparseDepthError(Metric[SparseDepthErrorSettings]):
 
     def __call__(self, comparison: Comparison) -> float:
         """The metric of one frame; unavailable without points, or if nothing was drawn at any."""
-        rendered, known = comparison.point_depth, comparison.true_point_depth
-        if rendered is None or known is None:
+        rendered, true_depth = comparison.point_depth, comparison.true_point_depth
+        if rendered is None or true_depth is None:
             raise UnavailableError("this frame has no points of known depth")
-        if not len(known):
+        if not len(true_depth):
             raise UnavailableError("nothing was drawn at the points of known depth")
-        errors = (rendered.double() - known.double()).abs() / known.double()
+        errors = (rendered.double() - true_depth.double()).abs() / true_depth.double()
         return 100.0 * float(torch.quantile(errors, self.settings.quantile))
 
 
-def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
+def depth_steps(
+    depth: Float[Tensor, "H W"], is_known: Bool[Tensor, "H W"], relative_step: float
+) -> Bool[Tensor, "H W"]:
     """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
 
     Unknown pixels make no step themselves; two known surfaces on either side of one do. The depth is z-depth.
     """
-    farthest = _window_max(torch.where(known, depth, -torch.inf), 1)
-    nearest = -_window_max(torch.where(known, -depth, -torch.inf), 1)
+    farthest = _window_max(torch.where(is_known, depth, -torch.inf), 1)
+    nearest = -_window_max(torch.where(is_known, -depth, -torch.inf), 1)
     return farthest - nearest > relative_step * nearest
 
 

@@ -218,7 +218,7 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 D h w"]:
-        """Both expansions, the 1x1 one first."""
+        """Concatenated expansions, the 1x1 one first."""
         squeezed = self.squeeze(x).relu_()
         return torch.cat([self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1).relu_()
 

@@ -53,14 +53,14 @@ class Published:
 
 
 def _backbone(net: str, **copies: str) -> Published:
-    """From torchvision. The digits in its name begin its checksum; torch checks no more than these either."""
+    """Torchvision's backbone. The digits in its name begin its checksum; torch checks no more than these either."""
     names = BACKBONE_FILES[net]
     known = {name.removesuffix(".pth").rpartition("-")[2]: name for name in names}
     return Published(f"https://download.pytorch.org/models/{names[0]}", known | {copies[name]: name for name in copies})
 
 
 def _heads(net: str, sha256: str) -> Published:
-    """From the repository of LPIPS's authors; the checksum is that of the file at commit 082bb24."""
+    """Linear heads from the repository of LPIPS's authors; the checksum is that of the file at commit 082bb24."""
     url = f"https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/{net}.pth"
     return Published(url, {sha256: f"v0.1/{net}.pth"})
 

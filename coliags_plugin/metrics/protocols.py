@@ -66,8 +66,8 @@ class PaperProtocol(Protocol):
         depth = output[self.depth].detach()
         image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
         if frame.sparse_depth is not None:
-            rendered, known = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
-            image = replace(image, point_depth=rendered, true_point_depth=known)
+            rendered, true_depth = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
+            image = replace(image, point_depth=rendered, true_point_depth=true_depth)
         if (truth := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         return replace(image, depth=depth, true_depth=truth, depth_valid=torch.isfinite(truth) & frame.valid)
@@ -129,16 +129,16 @@ class AuthorsCodeProtocol(Protocol):
         """Rendered and true image and depth as read back from the files; every pixel counts."""
         everywhere = torch.ones_like(frame.valid)
         image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
-        if (known := frame.true_depth) is None:
+        if (true_depth := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         rendered = 1.0 / output["inverse_depth_accumulated"].detach()  # infinite where nothing was drawn
         if frame.depth_at_least is not None:
-            known = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, known)
-        known = torch.where(torch.isfinite(known), known, 0.0)
+            true_depth = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, true_depth)
+        true_depth = torch.where(torch.isfinite(true_depth), true_depth, 0.0)
         return replace(
             image,
             depth=through_16_bit(rendered, self.rendered_full_scale),
-            true_depth=through_16_bit(known, self.true_full_scale),
+            true_depth=through_16_bit(true_depth, self.true_full_scale),
             depth_valid=everywhere,
         )
 

@@ -37,7 +37,7 @@ class FrameRows:
         return self.rows.get(view.name) if view is not None and view.trained else None
 
     def is_beside(self, view: View) -> bool:
-        """Whether a view is of a test set beside the video."""
+        """True if a view is of a test set beside the video."""
         return view.name in self._nearest
 
     def neighbours(self, view: View) -> tuple[int, int, float]:

@@ -97,13 +97,13 @@ class Metering(nn.Module):
         for frame in self._scene.train:
             sparse, depth = frame.sparse_depth, frame.depth
             if depth is not None:
-                known = depth.cpu()[frame.valid.cpu()]
+                depths = depth.cpu()[frame.valid.cpu()]
             else:
-                known = torch.zeros(0) if sparse is None else sparse.depth.cpu()
-            known = known[known > 0.0].double()  # NaN is not
-            if not len(known):
+                depths = torch.zeros(0) if sparse is None else sparse.depth.cpu()
+            depths = depths[depths > 0.0].double()  # NaN is not
+            if not len(depths):
                 return None
-            means.append(known.reciprocal().mean().log())
+            means.append(depths.reciprocal().mean().log())
         return torch.stack(means)
 
     def response(self, gains: Float[Tensor, "F"], before: int, after: int) -> float:

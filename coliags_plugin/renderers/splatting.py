@@ -167,7 +167,7 @@ def split_channels(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) ->
 
 
 def is_surfels(gaussians: Gaussians) -> bool:
-    """Whether Gaussians are surfels, with two scales each; InputError if they have neither two nor three."""
+    """True if Gaussians are surfels, with two scales each; InputError if they have neither two nor three."""
     scales = gaussians.scales
     if scales.ndim != 2 or scales.shape[1] not in (2, 3):
         raise InputError(
@@ -255,5 +255,9 @@ def _first_of(auto: Component, primitive: str, device: torch.device) -> ChosenRe
 def _others(primitive: str, device: torch.device) -> str:
     """Hint that names the renderers of a primitive on a device; empty without any."""
     classes = {name: registry.renderers.get(name) for name in candidates("renderers")}
-    able = [name for name, found in classes.items() if primitive in found.primitives and device.type in found.devices]
+    able = [
+        name
+        for name, renderer_class in classes.items()
+        if primitive in renderer_class.primitives and device.type in renderer_class.devices
+    ]
     return f"Set `renderer=NAME`, NAME being {' or '.join(able)}" if able else ""

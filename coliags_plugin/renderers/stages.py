@@ -100,12 +100,12 @@ def _draw_gaussians(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: CutSettings, grid: TileGrid, stages: Stages
 ) -> DrawnView:
     placed = stages.place_gaussians(gaussians, camera, "normals" in wants, settings, grid)
-    own: dict[str, Tensor] = {}
+    depth_channels: dict[str, Tensor] = {}
     if {"depth_accumulated", "depth_expected"} & {*wants}:
-        own["depth_accumulated"] = placed.depths
+        depth_channels["depth_accumulated"] = placed.depths
     if "inverse_depth_accumulated" in wants:
-        own["inverse_depth_accumulated"] = placed.depths.reciprocal()
-    features = _features(gaussians, placed, own, wants)
+        depth_channels["inverse_depth_accumulated"] = placed.depths.reciprocal()
+    features = _features(gaussians, placed, depth_channels, wants)
     depths = placed.depths.detach() if "depth_median" in wants else None
     table = torch.cat([*placed.columns, *features.values()], dim=-1)
     sums, medians = stages.composite_gaussians(table, depths, placed.pairs, grid, settings)
@@ -139,10 +139,10 @@ def _over_background(maps: dict[str, Tensor], placed: Placed, settings: CutSetti
 
 
 def _features(
-    gaussians: Gaussians, placed: Placed, own: dict[str, Tensor], wants: Sequence[str]
+    gaussians: Gaussians, placed: Placed, depth_channels: dict[str, Tensor], wants: Sequence[str]
 ) -> dict[str, Float[Tensor, "N C"]]:
     """Channels to composite by output: colour, 1 (its sum is alpha), some of their own, and feature channels wanted."""
-    parts = {"rgb": gaussians.colors, "alpha": torch.ones_like(gaussians.opacities), **own}
+    parts = {"rgb": gaussians.colors, "alpha": torch.ones_like(gaussians.opacities), **depth_channels}
     if "normals" in wants and placed.normals is not None:
         parts["normals"] = placed.normals
     parts |= {name: gaussians.features[name] for name in wants if name in gaussians.features}

@@ -112,8 +112,8 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
     low, high = grid.boxes(column, row, means2d.dtype)
     table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
     nearest = _squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
-    kept = (nearest <= table[:, 8]).nonzero().squeeze(-1)
-    return _pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
+    touching = (nearest <= table[:, 8]).nonzero().squeeze(-1)
+    return _pairs_by_tile(drawn[owner[touching]], column[touching], row[touching], grid)
 
 
 @dataclass(frozen=True)
@@ -188,12 +188,12 @@ def bin_surfels(projected: ProjectedSurfels, extents: SurfelExtents, grid: TileG
     drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
     owner, column, row = _tiles_of_boxes(extents.low[drawn], extents.high[drawn], grid)
     low, high = grid.boxes(column, row, extents.low.dtype)
-    kept = _overlaps(extents, drawn[owner], low, high).nonzero().squeeze(-1)
-    return _pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
+    touching = _overlaps(extents, drawn[owner], low, high).nonzero().squeeze(-1)
+    return _pairs_by_tile(drawn[owner[touching]], column[touching], row[touching], grid)
 
 
 def _overlaps(extents: SurfelExtents, index: Tensor | slice, low: Tensor, high: Tensor) -> Bool[Tensor, "M"]:
-    """Whether surfels reach rectangles. [M], [M, 2], [M, 2]"""
+    """True if surfels reach rectangles. [M], [M, 2], [M, 2]"""
     in_ellipse = _squared_distance_to_box(
         extents.ellipse_centers[index], extents.covariances[index], extents.whitenings[index], low, high
     )

@@ -49,7 +49,7 @@ class VolumeRendererSettings(Settings):
     importance_samples: int = Field(default=0, ge=0)
     """Samples added where those of a first pass, through the field's coarse level, have weight; 0: a single pass."""
     jitter: bool = False
-    """In training, place samples at random; rendering is not affected."""
+    """Random places of samples in training; rendering is not affected."""
     opaque_end: bool = False
     """The last sample of a ray absorbs everything where its density is above 0: rays end on tissue."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -284,9 +284,9 @@ def _samples_until_opaque(
     rows = torch.arange(len(places), device=places.device)
     for first in range(0, places.shape[1], _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
-        density[rows, part], found = _samples(level, camera, lines, places[rows, part], rows, colors)
-        if rgb is not None and found is not None:
-            rgb[rows, part] = found
+        density[rows, part], sample_colors = _samples(level, camera, lines, places[rows, part], rows, colors)
+        if rgb is not None and sample_colors is not None:
+            rgb[rows, part] = sample_colors
         absorbed += (density[:, part] * lengths[:, part]).sum(1)
         going_on = int((absorbed < -math.log(OPAQUE)).sum())
         if going_on == 0:

@@ -82,15 +82,15 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
         if len(self.drawn) != len(field.means):
             self._forget(field.means)
         self._count(step.output)
-        done = {}
+        changes = {}
         if step.step in self.events:
             grown = self._densify(field, rows)
-            done = {"grown": grown, "pruned": self._prune(field, rows, step.step)}
+            changes = {"grown": grown, "pruned": self._prune(field, rows, step.step)}
             self._forget(field.means)
         if step.step in self.resets:
             highest = math.log(self.settings.reset_opacity / (1.0 - self.settings.reset_opacity))
             rows.replace_values("opacities", field.opacities.clamp_max(highest))
-        return done
+        return changes
 
     def _forget(self, like: Tensor) -> None:
         self.load_state_dict({name: like.new_zeros(len(like)) for name in self.counters})
@@ -107,9 +107,9 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings]):
     def _densify(self, field: Any, rows: ParameterRows) -> int:
         """Clone and split Gaussians; returns the increase in their number."""
         before = len(field.means)
-        wanted = self.gradient_sum / self.drawn.clamp_min(1.0) >= self.settings.gradient_threshold
+        is_steep = self.gradient_sum / self.drawn.clamp_min(1.0) >= self.settings.gradient_threshold
         large = field.scales.amax(dim=1).exp() > self.settings.dense_share * self.extent
-        clones, splits = (wanted & ~large).nonzero().squeeze(1), (wanted & large).nonzero().squeeze(1)
+        clones, splits = (is_steep & ~large).nonzero().squeeze(1), (is_steep & large).nonzero().squeeze(1)
         parents = torch.cat([clones, splits.repeat(_SPLIT_PARTS)])
         if len(parents) == 0:
             return 0

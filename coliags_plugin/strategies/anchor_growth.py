@@ -165,12 +165,12 @@ def one_per_free_cell(
         cell: Edge of a cell, scene units.
         limit: Largest number of new anchors.
     """
-    taken = torch.unique(torch.round(anchors / cell), dim=0)
+    occupied_cells = torch.unique(torch.round(anchors / cell), dim=0)
     cells, member_of = torch.unique(torch.round(positions / cell), dim=0, return_inverse=True)
-    _, place = torch.unique(torch.cat([taken, cells]), dim=0, return_inverse=True)
-    occupied = torch.zeros(len(taken) + len(cells), dtype=torch.bool, device=cells.device)
-    occupied[place[: len(taken)]] = True
-    free = ~occupied[place[len(taken) :]]
+    _, place = torch.unique(torch.cat([occupied_cells, cells]), dim=0, return_inverse=True)
+    occupied = torch.zeros(len(occupied_cells) + len(cells), dtype=torch.bool, device=cells.device)
+    occupied[place[: len(occupied_cells)]] = True
+    free = ~occupied[place[len(occupied_cells) :]]
     # Sorted by gradient; the first of each cell is kept.
     order = torch.argsort(gradients, descending=True, stable=True)
     order = order[free[member_of[order]]]

@@ -25,7 +25,7 @@ HALF = [0.5, 0.479426, 0.877583, 0.841471, 0.540302, 0.909297, -0.416147, -0.756
 
 
 def make(node, seed=0, **options):
-    """With random offsets and features."""
+    """Field with random offsets and features."""
     field = make_field(**{**node, **options}, seed=seed)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -87,8 +87,8 @@ def test_decoding_step_by_step():
             geometry = torch.cat([field.features[anchor], gamma(v, 10)])
             opacity = torch.tanh(field.geometry_head.opacity_mlp(geometry))
             shape = field.geometry_head.covariance_mlp(geometry).view(10, 7)
-            seen = torch.cat([field.features[anchor], v, distance[None], gamma(cosine[None], 5)])
-            color = torch.sigmoid(field.appearance_head.color_mlp(seen)).view(10, 3)
+            recorded = torch.cat([field.features[anchor], v, distance[None], gamma(cosine[None], 5)])
+            color = torch.sigmoid(field.appearance_head.color_mlp(recorded)).view(10, 3)
             scale = field.scalings[anchor].exp()
             for child in range(10):
                 if opacity[child] > 0:
@@ -175,16 +175,16 @@ def test_spheres_that_touch_the_pyramid_are_kept(x, y, z, radius, yaw):
 
 def test_anchors_behind_the_camera_have_cosine_zero():
     field = make(COLIAGS)
-    seen = {}
+    recorded = {}
     head = field.appearance_head
     inputs = head.inputs
-    head.inputs = lambda anchors: seen.setdefault("cosines", anchors.cosines) is None or inputs(anchors)
+    head.inputs = lambda anchors: recorded.setdefault("cosines", anchors.cosines) is None or inputs(anchors)
     with torch.no_grad():
         field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
         field.scalings.fill_(3.0)
     field.gaussians(replace(camera_at(0.0, 0.0, 0.1), near_plane=0.0))
-    assert seen["cosines"].min() == 0.0
-    assert seen["cosines"].max() <= 1.0
+    assert recorded["cosines"].min() == 0.0
+    assert recorded["cosines"].max() <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -198,8 +198,8 @@ def test_hidden_units_start_over_the_distances_that_occur(head, column):
     cameras = [frame.camera for frame in wall_scene().train]
     with torch.no_grad():
         initial = make_field(**{**COLIAGS, "appearance_head": head})
-        seen = [initial.anchors[initial.visible_anchors(camera)] - camera.center for camera in cameras]
-    distances = np.sort(np.concatenate([sight.norm(dim=1).numpy() for sight in seen]))
+        recorded = [initial.anchors[initial.visible_anchors(camera)] - camera.center for camera in cameras]
+    distances = np.sort(np.concatenate([sight.norm(dim=1).numpy() for sight in recorded]))
     kinks = distances[((np.arange(32) + 0.5) / 32 * len(distances)).astype(int)]
     before, after = default.appearance_head.color_mlp[0], spread.appearance_head.color_mlp[0]
     assert torch.equal(before.weight, after.weight)

@@ -31,21 +31,23 @@ def make(scene=None, **options):
 def test_one_faint_round_gaussian_at_every_point(name):
     scene = colored_wall()
     field = make_field(name, scene)
-    seen = field.gaussians(camera_at(0, 0, -50))
-    points = scene.points.positions[seen.source_index]
-    torch.testing.assert_close(seen.means, points)
-    torch.testing.assert_close(seen.opacities, torch.full((len(points),), 0.1))
-    torch.testing.assert_close(seen.colors, scene.points.colors[seen.source_index] / 255.0)
+    gaussians = field.gaussians(camera_at(0, 0, -50))
+    points = scene.points.positions[gaussians.source_index]
+    torch.testing.assert_close(gaussians.means, points)
+    torch.testing.assert_close(gaussians.opacities, torch.full((len(points),), 0.1))
+    torch.testing.assert_close(gaussians.colors, scene.points.colors[gaussians.source_index] / 255.0)
     # Points on a grid of 0.5 mm: inner ones have three neighbours at that distance.
-    assert seen.scales.median().item() == pytest.approx(0.5, rel=1e-5)
-    assert seen.scales.shape[1] == (2 if name == "surfels" else 3) and torch.equal(seen.scales[:, 0], seen.scales[:, 1])
+    assert gaussians.scales.median().item() == pytest.approx(0.5, rel=1e-5)
+    assert gaussians.scales.shape[1] == (2 if name == "surfels" else 3) and torch.equal(
+        gaussians.scales[:, 0], gaussians.scales[:, 1]
+    )
     if name == "gaussians":
-        assert torch.equal(seen.quats_wxyz, torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4))
+        assert torch.equal(gaussians.quats_wxyz, torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4))
 
 
 def test_points_without_colours_are_grey_and_no_points_are_refused():
-    seen = make(wall_scene()).gaussians(camera_at(0, 0, 0))
-    torch.testing.assert_close(seen.colors, torch.full_like(seen.colors, 0.5))
+    gaussians = make(wall_scene()).gaussians(camera_at(0, 0, 0))
+    torch.testing.assert_close(gaussians.colors, torch.full_like(gaussians.colors, 0.5))
     with pytest.raises(InputError, match="no initial points"):
         make(replace(wall_scene(), points=PointCloud(torch.zeros(0, 3))))
 
@@ -54,11 +56,14 @@ def test_culling_changes_no_image():
     field, camera = make(), camera_at(0.3, 0.2, 3.0, yaw=0.3)
     with torch.no_grad():
         field.scales += torch.randn(field.scales.shape, generator=torch.Generator().manual_seed(1))
-    seen = field.gaussians(camera)
-    assert 0 < len(seen) < len(field.means)
+    gaussians = field.gaussians(camera)
+    assert 0 < len(gaussians) < len(field.means)
     field._visible = lambda camera: torch.arange(len(field.means))
     torch.testing.assert_close(
-        render_gaussians(seen, camera).rgb, render_gaussians(field.gaussians(camera), camera).rgb, rtol=0, atol=2e-6
+        render_gaussians(gaussians, camera).rgb,
+        render_gaussians(field.gaussians(camera), camera).rgb,
+        rtol=0,
+        atol=2e-6,
     )
 
 
@@ -85,12 +90,12 @@ def test_gradients_of_colours_are_the_basis_and_zero_where_colours_are_cut():
         field.shN.copy_(0.05 * torch.randn(field.shN.shape, generator=torch.Generator().manual_seed(3)))
         field.sh0[::2, :, 1] = -5.0  # green far below 0
     field.degree.fill_(2)
-    seen = field.gaussians(camera)
-    upstream = torch.randn(seen.colors.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    (seen.colors * upstream).sum().backward()
-    rows = seen.source_index
+    gaussians = field.gaussians(camera)
+    upstream = torch.randn(gaussians.colors.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    (gaussians.colors * upstream).sum().backward()
+    rows = gaussians.source_index
     directions = torch.nn.functional.normalize(field.means.detach()[rows] - camera.center, dim=1)
-    expected = basis(directions, 2)[:, :, None] * (upstream * (seen.colors > 0))[:, None]
+    expected = basis(directions, 2)[:, :, None] * (upstream * (gaussians.colors > 0))[:, None]
     torch.testing.assert_close(field.sh0.grad[rows], expected[:, :1])
     torch.testing.assert_close(field.shN.grad[rows][:, :8], expected[:, 1:])
     assert not field.shN.grad[:, 8:].any()  # of degree 3, not yet active
@@ -98,7 +103,7 @@ def test_gradients_of_colours_are_the_basis_and_zero_where_colours_are_cut():
 
 
 def test_colours_fall_with_the_distance_to_the_lamp():
-    """To the power of each Gaussian's exponent, and no further than at half and twice its own distance."""
+    """Attenuation to the power of each Gaussian's exponent, and no further than at half and twice its own distance."""
     plain = make()
     field = AttenuatedGaussians(plain.settings, plain.element_count)
     zero = torch.zeros_like(field.exponents)
@@ -111,22 +116,22 @@ def test_colours_fall_with_the_distance_to_the_lamp():
         with torch.no_grad():
             field.exponents.copy_(torch.linspace(-1.0, 3.0, len(distances))[:, None])
             field.distances.copy_(distances / ratio)
-        seen = field.gaussians(camera)
-        torch.testing.assert_close(seen.colors, before.colors * bound ** -field.exponents[rows])
-        upstream = torch.linspace(0.5, 2.0, seen.colors.numel()).reshape(seen.colors.shape)
+        gaussians = field.gaussians(camera)
+        torch.testing.assert_close(gaussians.colors, before.colors * bound ** -field.exponents[rows])
+        upstream = torch.linspace(0.5, 2.0, gaussians.colors.numel()).reshape(gaussians.colors.shape)
         field.zero_grad()
-        (seen.colors * upstream).sum().backward()
-        expected = -math.log(bound) * (seen.colors * upstream).sum(dim=1, keepdim=True)
+        (gaussians.colors * upstream).sum().backward()
+        expected = -math.log(bound) * (gaussians.colors * upstream).sum(dim=1, keepdim=True)
         torch.testing.assert_close(field.exponents.grad[rows], expected)
 
 
 def test_gradients_of_logarithms_and_logits():
     field, camera = make().double(), camera_at(0, 0, 0)
-    seen = field.gaussians(camera)
-    (seen.scales.sum() + 3.0 * seen.opacities.sum()).backward()
-    rows = seen.source_index
-    torch.testing.assert_close(field.scales.grad[rows], seen.scales)
-    torch.testing.assert_close(field.opacities.grad[rows], 3.0 * seen.opacities * (1.0 - seen.opacities))
+    gaussians = field.gaussians(camera)
+    (gaussians.scales.sum() + 3.0 * gaussians.opacities.sum()).backward()
+    rows = gaussians.source_index
+    torch.testing.assert_close(field.scales.grad[rows], gaussians.scales)
+    torch.testing.assert_close(field.opacities.grad[rows], 3.0 * gaussians.opacities * (1.0 - gaussians.opacities))
 
 
 def test_parameter_groups_are_named_as_in_gsplat():
@@ -155,11 +160,13 @@ def test_their_normals_are_those_that_are_drawn():
     with torch.no_grad():
         field.opacities.fill_(5.0)
     camera = camera_at(0.0, 0.0, 0.0)
-    seen = field.gaussians(camera.to(dtype=torch.float32))
-    index = int(seen.means[:, :2].norm(dim=1).argmin())
-    normal = field.normals()[seen.source_index[index]].detach()
-    kept = {k: getattr(seen, k)[index : index + 1] for k in ("means", "quats_wxyz", "scales", "opacities", "colors")}
-    output = render_gaussians(replace(seen, **kept), camera, ("normals",))
+    gaussians = field.gaussians(camera.to(dtype=torch.float32))
+    index = int(gaussians.means[:, :2].norm(dim=1).argmin())
+    normal = field.normals()[gaussians.source_index[index]].detach()
+    kept = {
+        k: getattr(gaussians, k)[index : index + 1] for k in ("means", "quats_wxyz", "scales", "opacities", "colors")
+    }
+    output = render_gaussians(replace(gaussians, **kept), camera, ("normals",))
     row, column = divmod(int(output.alpha.argmax()), output.alpha.shape[1])
     drawn = output["normals"][row, column] / output.alpha[row, column]
     torch.testing.assert_close(drawn, normal if normal[2] < 0 else -normal, rtol=1e-4, atol=1e-5)
@@ -262,8 +269,8 @@ def made(count, degree, share=0.7):
     generator = torch.Generator().manual_seed(0)
     sh0, shN = (torch.randn(count, terms, 3, generator=generator) for terms in (1, (degree + 1) ** 2 - 1))
     rows = (torch.rand(count, generator=generator) < share).nonzero().squeeze(1)
-    sight, given = (3.0 * torch.randn(len(rows), 3, generator=generator) for _ in range(2))
-    return sh0, shN, rows, sight, given
+    sight, of_colors = (3.0 * torch.randn(len(rows), 3, generator=generator) for _ in range(2))
+    return sh0, shN, rows, sight, of_colors
 
 
 def by_torch(sh0, shN, rows, sight, degree):
@@ -271,35 +278,35 @@ def by_torch(sh0, shN, rows, sight, degree):
     return colors(coefficients, torch.nn.functional.normalize(sight, dim=1), degree)
 
 
-def with_gradients(function, sh0, shN, rows, sight, degree, given):
+def with_gradients(function, sh0, shN, rows, sight, degree, of_colors):
     leaves = [tensor.clone().requires_grad_() for tensor in (sh0, shN, sight)]
     result = function(leaves[0], leaves[1], rows, leaves[2], degree)
-    gradients = torch.autograd.grad(result, leaves, given, allow_unused=True, materialize_grads=True)
+    gradients = torch.autograd.grad(result, leaves, of_colors, allow_unused=True, materialize_grads=True)
     return result.detach(), *gradients
 
 
 @pytest.mark.parametrize(("most", "degree"), [(0, 0), (1, 1), (2, 2), (3, 0), (3, 1), (3, 2), (3, 3)])
 @pytest.mark.parametrize(("count", "share"), [(0, 1.0), (1, 1.0), (16, 1.0), (9, 0.0), (700, 0.7)])
 def test_kernel_against_torch_in_float64(count, share, most, degree):
-    sh0, shN, rows, sight, given = made(count, most, share)
-    found = with_gradients(kernel.colors, sh0, shN, rows, sight, degree, given)
-    expected = with_gradients(by_torch, sh0.double(), shN.double(), rows, sight.double(), degree, given.double())
+    sh0, shN, rows, sight, of_colors = made(count, most, share)
+    gradients = with_gradients(kernel.colors, sh0, shN, rows, sight, degree, of_colors)
+    expected = with_gradients(by_torch, sh0.double(), shN.double(), rows, sight.double(), degree, of_colors.double())
     clamped = (expected[0] == 0.0).sum()
     assert count < 700 or 0 < clamped < expected[0].numel()
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(gradients, expected, strict=True):
         torch.testing.assert_close(one, other.float(), rtol=1e-5, atol=2e-5)
     unseen = torch.ones(count, dtype=torch.bool).index_fill_(0, rows, False)
-    assert not found[1][unseen].any() and not found[2][unseen].any()
-    assert not found[2][:, (degree + 1) ** 2 - 1 :].any()
+    assert not gradients[1][unseen].any() and not gradients[2][unseen].any()
+    assert not gradients[2][:, (degree + 1) ** 2 - 1 :].any()
 
 
 def test_colours_of_zero_have_gradients():
-    """As those of the first step, of points that are black."""
+    """Colours as at the first step, of points that are black."""
     sh0 = torch.full((1, 1, 3), -0.5) / Y0
     rows, sight = torch.tensor([0]), torch.tensor([[0.3, -0.2, 1.0]])
-    found = with_gradients(kernel.colors, sh0, torch.zeros(1, 15, 3), rows, sight, 3, torch.ones(1, 3))
-    assert torch.equal(found[0], torch.zeros(1, 3))
-    torch.testing.assert_close(found[1], torch.full((1, 1, 3), Y0))
+    gradients = with_gradients(kernel.colors, sh0, torch.zeros(1, 15, 3), rows, sight, 3, torch.ones(1, 3))
+    assert torch.equal(gradients[0], torch.zeros(1, 3))
+    torch.testing.assert_close(gradients[1], torch.full((1, 1, 3), Y0))
 
 
 def test_kernel_gives_the_same_bits_on_any_number_of_threads():

@@ -88,19 +88,19 @@ def derived(field, camera):
 
 
 def assert_as_defined(field, camera=CAMERA):
-    """Its Gaussians and gradients are those of the definition in float64; return the Gaussians."""
+    """Check that Gaussians and gradients are those of the definition in float64; return the Gaussians."""
     wide = copy.deepcopy(field).cpu().double()
-    (drawn, found), (expected, expected_found) = derived(field, camera), derived(wide, camera)
+    (drawn, gradients), (expected, expected_found) = derived(field, camera), derived(wide, camera)
     assert torch.equal(drawn.source_index, expected.source_index)
     assert torch.equal(drawn.visible_sources, expected.visible_sources)
     for output in OUTPUTS:
-        actual, wanted = getattr(drawn, output), getattr(expected, output)
+        actual, expected_values = getattr(drawn, output), getattr(expected, output)
         # Of a direction's octaves, 512 times 1e-7 is left.
-        torch.testing.assert_close(actual.double(), wanted, rtol=3e-5, atol=3e-5)
-    assert found.keys() == expected_found.keys()
-    for key, wanted in expected_found.items():
-        scale = wanted.abs().max().clamp_min(1e-6)
-        torch.testing.assert_close(found[key].double() / scale, wanted / scale, rtol=0, atol=1e-4)
+        torch.testing.assert_close(actual.double(), expected_values, rtol=3e-5, atol=3e-5)
+    assert gradients.keys() == expected_found.keys()
+    for key, expected_values in expected_found.items():
+        scale = expected_values.abs().max().clamp_min(1e-6)
+        torch.testing.assert_close(gradients[key].double() / scale, expected_values / scale, rtol=0, atol=1e-4)
     return drawn
 
 
@@ -147,14 +147,14 @@ def test_any_sizes(children, features, units, frequencies, yaw, appearance, made
 
 @pytest.mark.parametrize("name", ["coliags", "scaffold", "with incidence"])
 def test_derivatives_with_respect_to_the_pose(name, made):
-    """They reach the viewing directions, distances and cosines, and gamma of them."""
-    found = []
+    """Derivatives reach the viewing directions, distances and cosines, and gamma of them."""
+    gradients = []
     for field in (made(name), make(name).double()):
         pose = CAMERA.camera_to_world.to(field.anchors.dtype, copy=True).requires_grad_()
         derived(field, replace(CAMERA, camera_to_world=pose))
-        found.append(pose.grad.double())
-    assert found[1].abs().max() > 0
-    torch.testing.assert_close(found[0], found[1], rtol=2e-3, atol=2e-4 * float(found[1].abs().max()))
+        gradients.append(pose.grad.double())
+    assert gradients[1].abs().max() > 0
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=2e-3, atol=2e-4 * float(gradients[1].abs().max()))
 
 
 def test_any_number_of_threads_gives_the_same_bits():
@@ -162,13 +162,13 @@ def test_any_number_of_threads_gives_the_same_bits():
     for count in (1, 2, 3, 5):
         torch.set_num_threads(count)
         results.append(derived(make("coliags"), CAMERA))
-    for drawn, found in results[1:]:
+    for drawn, gradients in results[1:]:
         assert all(torch.equal(getattr(drawn, name), getattr(results[0][0], name)) for name in OUTPUTS)
-        assert all(torch.equal(found[name], results[0][1][name]) for name in found)
+        assert all(torch.equal(gradients[name], results[0][1][name]) for name in gradients)
 
 
 def test_the_law_is_bounded_close_to_the_lamp_and_beside_it():
-    """Where distance, cosine or incidence are at their bounds, neither the law nor its derivatives depend on them."""
+    """Neither the law nor its derivatives depend on a distance, cosine or incidence at its bound."""
     fields = [make("with incidence"), make("with incidence").double()]
     results = []
     for field in fields:
@@ -182,17 +182,17 @@ def test_the_law_is_bounded_close_to_the_lamp_and_beside_it():
         lit = head.apply_light(colors, positions, normals, CAMERA.to("cpu", positions.dtype), None)
         (lit * torch.rand(lit.shape, generator=generator).to(lit)).sum().backward()
         results.append((lit, colors.grad, head.exponents.grad, head.lamp_offset.grad))
-    for name, actual, wanted in zip(("lit", "colors", "exponents", "offset"), *results, strict=True):
-        atol = 2e-5 * float(wanted.detach().abs().max())
-        assert torch.isclose(actual.double(), wanted, rtol=1e-4, atol=atol).all(), name
+    for name, actual, expected_values in zip(("lit", "colors", "exponents", "offset"), *results, strict=True):
+        atol = 2e-5 * float(expected_values.detach().abs().max())
+        assert torch.isclose(actual.double(), expected_values, rtol=1e-4, atol=atol).all(), name
 
 
 def test_nothing_visible_is_nothing_drawn(made):
     field = made("coliags")
     behind = replace(CAMERA, camera_to_world=camera_at(0.0, 0.0, 1e4).camera_to_world)
-    drawn, found = derived(field, behind)
+    drawn, gradients = derived(field, behind)
     assert len(drawn) == len(drawn.visible_sources) == 0
-    assert not any(gradient.any() for gradient in found.values())
+    assert not any(gradient.any() for gradient in gradients.values())
 
 
 def test_what_is_not_a_number_is_not_hidden(made):
@@ -219,17 +219,17 @@ def test_visible_anchors_are_those_whose_sphere_is_in_the_frustum(made):
         radii = reach + DRAWN_SIGMAS * wide.scalings[:, 3:].amax(dim=1).exp()
         near = spheres_in_frustum(wide.anchors, radii - 1e-3, camera)
         far = spheres_in_frustum(wide.anchors, radii + 1e-3, camera)
-        seen = torch.zeros_like(near)
-        seen[field.gaussians(camera).visible_sources.cpu()] = True
+        visible = torch.zeros_like(near)
+        visible[field.gaussians(camera).visible_sources.cpu()] = True
         assert near.any() and not far.all()
-        assert (near <= seen).all() and (seen <= far).all()
+        assert (near <= visible).all() and (visible <= far).all()
 
 
 def test_a_head_with_a_forward_of_its_own_says_what_decodes(made):
     """Kernels, which decode by networks, would skip it without notice."""
 
-    def halved(head, seen):
-        opacities, covariances = PlainGeometryHead.forward(head, seen)
+    def halved(head, visible):
+        opacities, covariances = PlainGeometryHead.forward(head, visible)
         return opacities / 2, covariances
 
     with pytest.raises(TypeError, match="Halved overrides forward"):

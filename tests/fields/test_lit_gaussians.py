@@ -44,7 +44,7 @@ def varied(**options):
 
 
 def trained(**options):
-    """As varied, at a step at which the network counts, with weights that matter."""
+    """Field as varied, at a step at which the network counts, with weights that matter."""
     field = varied(**options)
     with torch.no_grad():
         for layer in field.diffuse_network.layers:
@@ -53,12 +53,14 @@ def trained(**options):
     return field
 
 
-def expected_colors(field, seen, camera, lamp_at, spread):
+def expected_colors(field, gaussians, camera, lamp_at, spread):
     """The published colour of every Gaussian seen, in a loop, without the network."""
     colors = []
-    axes = field.normals().detach().double()[seen.source_index].numpy()
+    axes = field.normals().detach().double()[gaussians.source_index].numpy()
     intensity, falloff, exponent = field.lamp_parameters.tolist()
-    for mean, axis, row in zip(seen.means.detach().double().numpy(), axes, seen.source_index.tolist(), strict=True):
+    for mean, axis, row in zip(
+        gaussians.means.detach().double().numpy(), axes, gaussians.source_index.tolist(), strict=True
+    ):
         view, lamp = camera.center.numpy() - mean, lamp_at - mean
         normal = axis if axis @ view >= 0 else -axis
         distance = np.linalg.norm(lamp) / field.extent.item()
@@ -74,10 +76,10 @@ def expected_colors(field, seen, camera, lamp_at, spread):
 
 def test_colours_are_the_closed_form_under_the_camera_s_lamp_and_another():
     field, camera = varied(), camera_at(0.5, -1.0, 4.0, yaw=0.2)
-    seen = field.gaussians(camera)
-    assert len(seen) > 300
-    expected = expected_colors(field, seen, camera, camera.center.numpy(), lambda directions: 1.0)
-    torch.testing.assert_close(seen.colors, expected, rtol=2e-4, atol=1e-5)
+    gaussians = field.gaussians(camera)
+    assert len(gaussians) > 300
+    expected = expected_colors(field, gaussians, camera, camera.center.numpy(), lambda directions: 1.0)
+    torch.testing.assert_close(gaussians.colors, expected, rtol=2e-4, atol=1e-5)
     lit = field.with_lamp(Lamp(offset=(3.0, -2.0, 1.0), turn=(20.0, -10.0), power=6.0, intensity=1.5)).gaussians(camera)
     pose = camera.camera_to_world.numpy()
     position = pose[:3, 3] + pose[:3, :3] @ [3.0, -2.0, 1.0]
@@ -87,7 +89,7 @@ def test_colours_are_the_closed_form_under_the_camera_s_lamp_and_another():
     axis = pose[:3, :3] @ about_y @ turned_up
     expected = expected_colors(field, lit, camera, position, lambda out: 1.5 * max(out @ axis, 0.0) ** 6.0)
     torch.testing.assert_close(lit.colors, expected, rtol=2e-4, atol=1e-5)
-    assert not torch.allclose(lit.colors, seen.colors, atol=0.05)
+    assert not torch.allclose(lit.colors, gaussians.colors, atol=0.05)
 
 
 def test_another_lamp_leaves_the_field_itself_alone():
@@ -98,20 +100,20 @@ def test_another_lamp_leaves_the_field_itself_alone():
 
 
 def test_a_lamp_that_shines_away_lights_nothing():
-    seen = varied().with_lamp(Lamp(turn=(0.0, 180.0), power=1.0)).gaussians(camera_at(0, 0, 0))
-    torch.testing.assert_close(seen.colors, torch.full_like(seen.colors, 1e-6 ** (1 / GAMMA)))
+    gaussians = varied().with_lamp(Lamp(turn=(0.0, 180.0), power=1.0)).gaussians(camera_at(0, 0, 0))
+    torch.testing.assert_close(gaussians.colors, torch.full_like(gaussians.colors, 1e-6 ** (1 / GAMMA)))
 
 
 def test_flat_faint_discs_with_mixed_linear_colours_at_the_points():
     scene = colored_wall()
     field = make(scene, pink_share=0.25)
-    seen = field.gaussians(camera_at(0, 0, -50))
-    torch.testing.assert_close(seen.opacities, torch.full((len(seen),), 0.1))
-    assert torch.equal(seen.scales[:, 2], torch.full((len(seen),), THICKNESS))
+    gaussians = field.gaussians(camera_at(0, 0, -50))
+    torch.testing.assert_close(gaussians.opacities, torch.full((len(gaussians),), 0.1))
+    assert torch.equal(gaussians.scales[:, 2], torch.full((len(gaussians),), THICKNESS))
     assert field.scales.shape[1] == 2
-    stored = scene.points.colors[seen.source_index] / 255.0
+    stored = scene.points.colors[gaussians.source_index] / 255.0
     mixed = 0.75 * stored + 0.25 * torch.tensor(PINK)
-    torch.testing.assert_close(seen.features["albedo"], mixed.pow(GAMMA))
+    torch.testing.assert_close(gaussians.features["albedo"], mixed.pow(GAMMA))
     assert field.extent.item() == pytest.approx(scene.extent)
 
 
@@ -223,9 +225,9 @@ def test_gradients_are_those_of_finite_differences():
     camera = camera_at(0.5, -1.0, 4.0)
 
     def value():
-        seen = field.gaussians(camera)
-        weights = torch.linspace(0.5, 1.5, len(seen), dtype=torch.float64)[:, None]
-        return (weights * seen.colors).sum()
+        gaussians = field.gaussians(camera)
+        weights = torch.linspace(0.5, 1.5, len(gaussians), dtype=torch.float64)[:, None]
+        return (weights * gaussians.colors).sum()
 
     value().backward()
     row = field.gaussians(camera).source_index[40]
@@ -248,11 +250,11 @@ def test_names_and_the_gradient_of_the_pose():
     rows = ["means", "scales", "quats", "opacities", "albedos", "roughness", "f0"]
     assert list(field.parameter_groups()) == [*rows, "lamp", "diffuse_network"]
     pose = camera.camera_to_world.float().requires_grad_()
-    seen = field.gaussians(replace(camera, camera_to_world=pose))
-    seen.colors.sum().backward()
+    gaussians = field.gaussians(replace(camera, camera_to_world=pose))
+    gaussians.colors.sum().backward()
     assert pose.grad[:3, 3].abs().min() > 0
-    assert seen.features.keys() == field.feature_channels == {"albedo", "diffuse_factor", "f0", "roughness"}
-    output = render_gaussians(seen, camera, tuple(field.feature_channels))
+    assert gaussians.features.keys() == field.feature_channels == {"albedo", "diffuse_factor", "f0", "roughness"}
+    output = render_gaussians(gaussians, camera, tuple(field.feature_channels))
     assert 0.1 < (output["roughness"][12, 16] / output.alpha[12, 16]).item() < 0.6
 
 
@@ -261,12 +263,12 @@ def test_gaussians_too_faint_to_be_drawn_are_left_out(monkeypatch):
     with torch.no_grad():
         field.opacities[::3] = math.log(0.999 / 254)  # just below 1/255
         field.opacities[1::3] = 2.0
-    seen = field.gaussians(camera)
-    assert not (seen.source_index % 3 == 0).any()
+    gaussians = field.gaussians(camera)
+    assert not (gaussians.source_index % 3 == 0).any()
     monkeypatch.setattr(lit_gaussians, "MIN_OPACITY", 0.0)
     everything = field.gaussians(camera)
-    assert len(seen) < len(everything)
-    images = [render_gaussians(each, camera).rgb for each in (seen, everything)]
+    assert len(gaussians) < len(everything)
+    images = [render_gaussians(each, camera).rgb for each in (gaussians, everything)]
     torch.testing.assert_close(*images, rtol=0, atol=2e-6)
 
 

@@ -50,7 +50,7 @@ def test_published_layers_and_parameters():
 
 @pytest.mark.parametrize("light", [True, False])
 def test_the_network_is_that_of_a_plain_forward_pass(light):
-    """As it is usually written: everything concatenated, one layer after the other."""
+    """Network as it is usually written: everything concatenated, one layer after the other."""
     settings = ReimNerfFieldSettings(**SMALL, light=light)
     network = RadianceMLP(settings, generator()).double()
     with torch.no_grad():
@@ -109,7 +109,7 @@ def test_bfloat16_is_of_rendering_alone():
 
 
 def moved(scene, factor, shift):
-    """The same scene in other units and elsewhere."""
+    """A scene in other units and elsewhere."""
 
     def placed(frame):
         pose = frame.camera.camera_to_world.clone()

@@ -49,28 +49,28 @@ def penalties(name, output, frame):
 @pytest.mark.parametrize("name", WEIGHTED)
 def test_pixels_are_weighted_by_their_confidence(name, case):
     output, frame, rendered = case
-    known = frame.mask & frame.depth.isfinite()
-    weights = frame.depth_confidence.double() * known
+    has_depth = frame.mask & frame.depth.isfinite()
+    weights = frame.depth_confidence.double() * has_depth
 
     def compared(frame, expected):
         term = make(name)(output, frame)
         gradients = [torch.autograd.grad(each, rendered, retain_graph=True)[0] for each in (term, expected)]
-        assert not gradients[0][~known].any()
+        assert not gradients[0][~has_depth].any()
         return term.item(), expected.item(), *gradients
 
     expected = (weights * penalties(name, output, frame)).sum() / weights.sum()
-    term, value, found, wanted = compared(frame, expected)
+    term, value, values, expected = compared(frame, expected)
     assert term == pytest.approx(value, rel=1e-12)
-    torch.testing.assert_close(found, wanted)
+    torch.testing.assert_close(values, expected)
     # Without confidence nothing changes, to the bit.
-    expected = masked_mean(penalties(name, output, frame), known)
-    plain, value, found, wanted = compared(frame.with_maps(depth_confidence=None), expected)
-    assert plain == value and torch.equal(found, wanted)
+    expected = masked_mean(penalties(name, output, frame), has_depth)
+    plain, value, values, expected = compared(frame.with_maps(depth_confidence=None), expected)
+    assert plain == value and torch.equal(values, expected)
     certain = frame.with_maps(depth_confidence=torch.ones(HEIGHT, WIDTH))
     assert make(name)(output, certain).item() == pytest.approx(plain, rel=1e-12)
     nothing = frame.with_maps(depth_confidence=torch.zeros(HEIGHT, WIDTH))
-    term, _, found, _ = compared(nothing, 0.0 * rendered.sum())
-    assert term == 0.0 and not found.any()
+    term, _, values, _ = compared(nothing, 0.0 * rendered.sum())
+    assert term == 0.0 and not values.any()
 
 
 # The robust relative loss
@@ -79,15 +79,15 @@ def test_pixels_are_weighted_by_their_confidence(name, case):
 @pytest.mark.parametrize("floor", [0.0, 0.1, 0.6])
 def test_it_is_hubers_loss_of_the_relative_error(case, floor):
     output, frame, rendered = case
-    known = frame.mask & frame.depth.isfinite()
-    depth = torch.where(known, frame.depth, 1.0)
+    has_depth = frame.mask & frame.depth.isfinite()
+    depth = torch.where(has_depth, frame.depth, 1.0)
     relative = (output["depth_accumulated"] - depth) / depth
     penalty = huber_loss(relative, torch.zeros_like(relative), reduction="none", delta=0.05) / 0.05
-    expected = (penalty * frame.depth_confidence.double().clamp_min(floor))[known].mean()
+    expected = (penalty * frame.depth_confidence.double().clamp_min(floor))[has_depth].mean()
     term = make("estimated-depth", **({} if floor == 0.1 else {"floor": floor}))(output, frame)
     assert term.item() == pytest.approx(expected.item(), rel=1e-12)
-    (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
-    torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], wanted)
+    (expected,) = torch.autograd.grad(expected, rendered, retain_graph=True)
+    torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], expected)
     plain, sure = (frame.with_maps(depth_confidence=each) for each in (None, torch.ones(HEIGHT, WIDTH)))
     certain = make("estimated-depth")(output, sure).item()
     assert make("estimated-depth")(output, plain).item() == pytest.approx(certain, rel=1e-12)
@@ -120,10 +120,10 @@ def test_pixel_batches_of_several_frames(case):
     pixels = torch.stack(torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), -1).reshape(-1, 2)
     depth = output["depth_accumulated"].detach().reshape(-1, 1).repeat(2, 1)
     rgb, alpha = torch.zeros(len(depth), 1, 3), torch.ones(len(depth), 1)
-    seen = RenderOutput(rgb, alpha, None, {"depth_accumulated": depth})
+    batch_output = RenderOutput(rgb, alpha, None, {"depth_accumulated": depth})
     target = concatenate_targets([frame.target_at(pixels), frame.target_at(pixels)])
     loss = make("estimated-depth").loss
-    batch = loss(step(seen, target)).item()
+    batch = loss(step(batch_output, target)).item()
     assert batch == pytest.approx(make("estimated-depth")(output, frame).item(), rel=1e-12)
 
 
@@ -141,11 +141,11 @@ def test_it_is_the_distance_between_points_on_the_ray():
     true, drawn = 20 + 5 * torch.rand(2, 5, 6, dtype=torch.float64)
     lengths = camera.rays().norm(dim=-1)
     frame = make_frame(torch.zeros(5, 6, 3, dtype=torch.uint8), true)
-    found = make_distance()(seen_along(drawn, lengths), frame)
+    values = make_distance()(seen_along(drawn, lengths), frame)
     apart = (camera.unproject(drawn) - camera.unproject(true)).norm(dim=-1)
-    torch.testing.assert_close(found, apart.mean())
+    torch.testing.assert_close(values, apart.mean())
     coarse = make_distance(depth="depth_accumulated_coarse")
-    assert coarse(seen_along(drawn, lengths, "depth_accumulated_coarse"), frame) == found
+    assert coarse(seen_along(drawn, lengths, "depth_accumulated_coarse"), frame) == values
     assert coarse.loss.wants == {"depth_accumulated_coarse", "ray_lengths"} and coarse.loss.needs == {"depth"}
 
 
@@ -153,8 +153,8 @@ def test_in_the_fields_unit_it_is_divided_by_it():
     frame = make_frame(torch.zeros(1, 2, 3, dtype=torch.uint8), torch.tensor([[10.0, 20.0]]))
     loss = make_distance(unit="field").loss
     model = SimpleNamespace(field=SimpleNamespace(length_unit=torch.tensor(50.0)))
-    seen = seen_along(torch.tensor([[12.0, 20.0]]), torch.tensor([[1.5, 1.0]]))
-    assert loss(step(seen, frame.target, model)).item() == pytest.approx(1.5 / 50)
+    output = seen_along(torch.tensor([[12.0, 20.0]]), torch.tensor([[1.5, 1.0]]))
+    assert loss(step(output, frame.target, model)).item() == pytest.approx(1.5 / 50)
 
 
 def test_a_share_of_each_image_counts_and_is_always_the_same():
@@ -163,8 +163,8 @@ def test_a_share_of_each_image_counts_and_is_always_the_same():
     counted = []
     for frame in scene.train:
         depth = frame.depth.clone().requires_grad_()
-        seen = seen_along(depth + 1.0, torch.ones_like(depth))
-        term = loss(step(seen, frame.target))
+        output = seen_along(depth + 1.0, torch.ones_like(depth))
+        term = loss(step(output, frame.target))
         assert term.item() == pytest.approx(1.0, abs=1e-4)
         (gradient,) = torch.autograd.grad(term, depth)
         counted.append(gradient != 0)
@@ -174,12 +174,12 @@ def test_a_share_of_each_image_counts_and_is_always_the_same():
     pixels = torch.randint(200, (5000, 2))
     parts = [frame.target_at(pixels) for frame in scene.train]
     depth = torch.cat([part.depth for part in parts]).requires_grad_()
-    seen = concatenate_pixels([seen_along(depth + 1.0, torch.ones_like(depth))])
-    term = loss(step(seen, concatenate_targets(parts), number=2))
+    output = concatenate_pixels([seen_along(depth + 1.0, torch.ones_like(depth))])
+    term = loss(step(output, concatenate_targets(parts), number=2))
     (gradient,) = torch.autograd.grad(term, depth)
     expected = torch.cat([inside[pixels[:, 1], pixels[:, 0]] for inside in counted])
     assert torch.equal(gradient[:, 0] != 0, expected)
-    other = make_distance(share=0.03, seed=1).loss(step(seen, concatenate_targets(parts), number=2))
+    other = make_distance(share=0.03, seed=1).loss(step(output, concatenate_targets(parts), number=2))
     (gradient,) = torch.autograd.grad(other, depth)
     assert not torch.equal(gradient[:, 0] != 0, expected)
 
@@ -239,10 +239,10 @@ def test_relative_differences_need_no_unit(at_points, rendered, points):
     kept = torch.arange(len(depth)) != 3
     for huber in (None, 0.05):
         options = {"relative": True, "huber": huber}
-        found = [at_points(unit * rendered, pixels, unit * depth, **options).item() for unit in (1.0, 1e-3, 50.0)]
+        values = [at_points(unit * rendered, pixels, unit * depth, **options).item() for unit in (1.0, 1e-3, 50.0)]
         pairs = zip(pixels[kept], depth[kept], strict=True)
         each = [at_points(rendered / z, [pixel.tolist()], [1.0], huber=huber).item() for pixel, z in pairs]
-        assert found == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
+        assert values == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
 
 
 def test_a_point_on_a_pixel_centre_is_that_pixel(at_points, rendered):

@@ -40,9 +40,9 @@ def test_normals_of_a_plane_are_exact(normal):
     camera = off_centre()
     depth = -5.0 / (camera.rays() @ normal)  # n . z r = -5: the plane is seen from its front
     assert (depth > 0).all()
-    found = depth_normals(depth, dataclasses.replace(camera, camera_to_world=rigid(3)[0]))
-    torch.testing.assert_close(found[1:-1, 1:-1], normal.expand(15, 21, 3))
-    border = found.clone()
+    gradients = depth_normals(depth, dataclasses.replace(camera, camera_to_world=rigid(3)[0]))
+    torch.testing.assert_close(gradients[1:-1, 1:-1], normal.expand(15, 21, 3))
+    border = gradients.clone()
     border[1:-1, 1:-1] = 0
     assert not border.any()
 
@@ -65,20 +65,20 @@ def test_unknown_depths_reach_their_neighbours_only():
     spoiled, known = depth.clone(), torch.ones(17, 23, dtype=torch.bool)
     spoiled[8, 10], known[8, 10] = torch.nan, False
     spoiled.requires_grad_()
-    found, whole = depth_normals(spoiled, camera, known), depth_normals(depth, camera)
+    gradients, whole = depth_normals(spoiled, camera, known), depth_normals(depth, camera)
     beside = torch.zeros_like(known)
     beside[[7, 9, 8, 8], [10, 10, 9, 11]] = True
-    assert not found[beside].any()
-    torch.testing.assert_close(found[~beside], whole[~beside])
-    found[..., 0].sum().backward()
+    assert not gradients[beside].any()
+    torch.testing.assert_close(gradients[~beside], whole[~beside])
+    gradients[..., 0].sum().backward()
     assert spoiled.grad.isfinite().all() and spoiled.grad[8, 10] == 0 and spoiled.grad.any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 5), (5, 2), (3, 3)])
 def test_maps_too_small_for_differences_have_no_normals(size):
-    found = depth_normals(torch.ones(size), Camera(5.0, 5.0, 1.0, 1.0, size[1], size[0], torch.eye(4)))
-    assert found.shape == (*size, 3)
-    assert found.any() == (size == (3, 3))
+    gradients = depth_normals(torch.ones(size), Camera(5.0, 5.0, 1.0, 1.0, size[1], size[0], torch.eye(4)))
+    assert gradients.shape == (*size, 3)
+    assert gradients.any() == (size == (3, 3))
 
 
 def test_gradients_of_the_normals_of_depth():

@@ -112,11 +112,11 @@ def test_inner_mse_is_unavailable_where_every_pixel_is_near_a_step():
 def test_steps_and_margin_against_scipy(seed, step, reach):
     generator = torch.Generator().manual_seed(seed)
     depth = 20 + 5 * torch.rand(11, 13, generator=generator, dtype=torch.float64)
-    known = torch.rand(11, 13, generator=generator) < 0.8
-    far = maximum_filter(np.where(known, depth, -np.inf), 3, mode="constant", cval=-np.inf)
-    close = minimum_filter(np.where(known, depth, np.inf), 3, mode="constant", cval=np.inf)
+    has_depth = torch.rand(11, 13, generator=generator) < 0.8
+    far = maximum_filter(np.where(has_depth, depth, -np.inf), 3, mode="constant", cval=-np.inf)
+    close = minimum_filter(np.where(has_depth, depth, np.inf), 3, mode="constant", cval=np.inf)
     expected = far - close > step * close
-    steps = depth_steps(torch.where(known, depth, torch.nan), known, step)
+    steps = depth_steps(torch.where(has_depth, depth, torch.nan), has_depth, step)
     np.testing.assert_array_equal(steps.numpy(), expected)
     grown = maximum_filter(expected.astype(np.uint8), 2 * reach + 1, mode="constant")
     np.testing.assert_array_equal(dilated(steps, reach).numpy(), grown > 0)
@@ -143,21 +143,21 @@ def output():
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 0.9, 1.0])
 def test_it_is_a_quantile_of_the_relative_errors(quantile):
     generator = torch.Generator().manual_seed(0)
-    rendered, known = 10 + 20 * torch.rand(2, 101, generator=generator)
+    rendered, has_depth = 10 + 20 * torch.rand(2, 101, generator=generator)
     grey, valid = torch.zeros(1, 1, 3), torch.ones(1, 1, dtype=torch.bool)
     found = make("sparse_depth", quantile=quantile)(
-        Comparison(grey, grey, valid, point_depth=rendered, true_point_depth=known)
+        Comparison(grey, grey, valid, point_depth=rendered, true_point_depth=has_depth)
     )
-    expected = np.quantile(np.abs(rendered.numpy() - known.numpy()) / known.numpy(), quantile)
+    expected = np.quantile(np.abs(rendered.numpy() - has_depth.numpy()) / has_depth.numpy(), quantile)
     assert found == pytest.approx(100 * expected, rel=1e-5)
 
 
 def test_a_protocol_interpolates_at_usable_points(frame, output):
     pixels = torch.tensor([[1.25, 2.5], [4.0, 3.0], [7.5, 5.5], [0.5, 0.5], [3.5, 0.5]])
-    known = torch.tensor([20.75 / 1.1, 23.5 / 0.8, 27.0, 20.0, 0.0])  # errors of 10 %, 20 %, 0; ignored; no surface
+    has_depth = torch.tensor([20.75 / 1.1, 23.5 / 0.8, 27.0, 20.0, 0.0])  # errors of 10 %, 20 %, 0; ignored; no surface
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[0, 0] = False
-    at = replace(frame.with_maps(mask=mask), sparse_depth=SparseDepth(pixels, known))
+    at = replace(frame.with_maps(mask=mask), sparse_depth=SparseDepth(pixels, has_depth))
     comparison = registry.protocols.get("paper")().compare(output, at)
     torch.testing.assert_close(comparison.point_depth, torch.tensor([20.75, 23.5, 27.0]))
     scores = Scorer("paper").score(comparison)

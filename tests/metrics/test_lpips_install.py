@@ -183,8 +183,8 @@ def test_nothing_is_copied_if_one_file_is_another(server, cache, made, tmp_path,
         (tmp_path / each).write_bytes(data)
     with pytest.raises(InputError) as caught:
         install(["alex"], None, tmp_path)
-    told = (str(tmp_path / name), sha256(tmp_path / name), sha256(made / name))
-    assert all(part in str(caught.value) for part in told)
+    text = (str(tmp_path / name), sha256(tmp_path / name), sha256(made / name))
+    assert all(part in str(caught.value) for part in text)
     assert not cache.exists()
 
 
@@ -238,9 +238,9 @@ def test_a_newcomer_s_way(server, cache, capsys):
 
     line = doctor()
     assert line.startswith("-  ") and "run `coliags weights lpips`" in line
-    for told in (where, f"{where}Everything was there already.\n"):
+    for text in (where, f"{where}Everything was there already.\n"):
         assert run("weights", "lpips", "--net", "squeeze") == 0
-        assert capsys.readouterr().out == told
+        assert capsys.readouterr().out == text
     assert len(server.requests) == 2
     line = doctor()
     assert line.startswith("ok ") and line.endswith(f"{cache / SQUEEZE[0]} and {cache / SQUEEZE[1]}")

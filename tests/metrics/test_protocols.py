@@ -142,7 +142,7 @@ def test_authors_code_rounds_images_to_eight_bits(scene):
 
 
 def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(scene):
-    """Of 12 rows the upper 3 are empty, one of their pixels without truth: 1/0 is infinite and its cast 0."""
+    """The upper 3 of 12 rows are empty, one of their pixels without truth: 1/0 is infinite and its cast 0."""
     _, frame = scene
     inverse = torch.full((HEIGHT, WIDTH), 1 / 20.0)
     inverse[:3] = 0.0

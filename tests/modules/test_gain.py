@@ -119,9 +119,9 @@ def test_known_gains_are_found(tmp_path):
     trainer = Trainer(method, replace(scene, train=train), "wall", RunFolder(tmp_path / "run"), 0, torch.device("cpu"))
     for _ in range(400):
         trainer.take_step()
-    found = trainer.model.view_modules["exposure"].gains().detach()[:, 0]
+    learned = trainer.model.view_modules["exposure"].gains().detach()[:, 0]
     expected = gains / math.exp(gains.log().mean().item())
-    assert (found / expected - 1).abs().max() < 0.01
+    assert (learned / expected - 1).abs().max() < 0.01
 
 
 def rendering(level):
@@ -191,8 +191,8 @@ def fitted_response(answer, noise, kind, gap, seed):
 @pytest.mark.parametrize("kind", ["opposite", "own"])
 def test_the_response_is_found_whatever_the_errors_of_gain_and_brightness(answer, gap, kind):
     for noise in (0.0, 0.01, 0.03):
-        found = np.mean([fitted_response(answer, noise, kind, gap, seed) for seed in range(12)])
-        assert found == pytest.approx(answer, abs=0.03 if noise else 1e-5), noise
+        learned = np.mean([fitted_response(answer, noise, kind, gap, seed) for seed in range(12)])
+        assert learned == pytest.approx(answer, abs=0.03 if noise else 1e-5), noise
 
 
 def test_depth_that_tells_nothing_of_the_brightness_gives_no_response():
@@ -257,9 +257,9 @@ def test_it_is_numpys_interpolation_of_its_points():
         module.log_slope.copy_(torch.tensor([0.3, -1.0, -3.0, 1.0, -0.5]))
     colors, values = module.learned["colors"], module.learned["values"]
     assert (colors[0], values[0], colors[-1]) == pytest.approx((0.4, 0.4, 1.5))
-    asked = torch.linspace(0.0, 1.5, 301)
-    expected = np.interp(asked, [0.0, *colors], [0.0, *values])
-    np.testing.assert_allclose(module.curve(asked).detach(), expected, atol=1e-6)
+    calls = torch.linspace(0.0, 1.5, 301)
+    expected = np.interp(calls, [0.0, *colors], [0.0, *values])
+    np.testing.assert_allclose(module.curve(calls).detach(), expected, atol=1e-6)
     assert module.curve(torch.tensor(2.5)).item() == pytest.approx(values[-1] + np.exp(-0.5), abs=1e-6)  # goes on
 
 
@@ -271,11 +271,11 @@ def test_the_curve_of_a_device_is_that_of_the_cpu():
     results = []
     for device in ("cpu", "cuda"):
         with PretendedCuda():
-            seen = colors.clone().to(device).requires_grad_()
+            rendered = colors.clone().to(device).requires_grad_()
             there = copy.deepcopy(module).to(device)
-            values = there.curve(seen)
+            values = there.curve(rendered)
             (values * weights.to(device)).sum().backward()
-            results.append([values.detach().cpu(), seen.grad.cpu(), there.log_slope.grad.cpu()])
+            results.append([values.detach().cpu(), rendered.grad.cpu(), there.log_slope.grad.cpu()])
     for of_cpu, of_device in zip(*results, strict=True):
         torch.testing.assert_close(of_device, of_cpu, atol=2e-6, rtol=2e-6)
 
@@ -314,20 +314,20 @@ def test_a_known_shoulder_is_found():
     generator = torch.Generator().manual_seed(0)
     colors = torch.rand(400, 1, generator=generator) * 0.9
     gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.5])
-    seen = torch.from_numpy(encode(((colors * gains).numpy()) ** 2.2, 2.2)).float()
+    rendered = torch.from_numpy(encode(((colors * gains).numpy()) ** 2.2, 2.2)).float()
     module = make_response()
     log_colors, log_gains = (torch.zeros(shape, requires_grad=True) for shape in (colors.shape, gains.shape))
     with torch.no_grad():
-        log_colors.copy_(seen[:, 2:3].clamp_min(1e-3).log())
+        log_colors.copy_(rendered[:, 2:3].clamp_min(1e-3).log())
     adam = torch.optim.Adam([log_colors, log_gains, module.log_slope], lr=0.02)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, 800)
     for _ in range(800):
         adam.zero_grad()
         drawn = log_colors.exp() * (log_gains - log_gains[2]).exp()
-        (module.curve(drawn) - seen).abs().mean().backward()
+        (module.curve(drawn) - rendered).abs().mean().backward()
         adam.step()
         schedule.step()
-    asked = torch.linspace(0.1, 1.3, 25)
-    expected = encode(asked.numpy() ** 2.2, 2.2)
-    np.testing.assert_allclose(module.curve(asked).detach(), expected, atol=0.005)
+    calls = torch.linspace(0.1, 1.3, 25)
+    expected = encode(calls.numpy() ** 2.2, 2.2)
+    np.testing.assert_allclose(module.curve(calls).detach(), expected, atol=0.005)
     np.testing.assert_allclose((log_gains - log_gains[2]).exp().detach(), gains, rtol=0.005)

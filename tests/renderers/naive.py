@@ -10,7 +10,7 @@ INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 
 
 class View:
-    """What one camera sees, composited front to back; float64 and differentiable throughout."""
+    """View of one camera, composited front to back; float64 and differentiable throughout."""
 
     def __init__(self, gaussians, camera):
         means, self.quats, self.scales, self.opacities, self.colors = (
@@ -87,7 +87,7 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, eps2d=0
 def splat_surfels(
     gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, surfel_filter=0.70710678, far=100.0, shifts=None
 ):
-    """The same of surfels: every ray meets every disc by solving three equations.
+    """Naive rendering of surfels: every ray meets every disc by solving three equations.
 
     ``shifts`` moves the projected centres that the intersections, not the low-pass filter, depend on. [N, 2] The
     additional map ``farthest`` is the largest depth composited at a pixel.
@@ -123,5 +123,5 @@ def splat_surfels(
 
 
 def extent(opacity: float, variance: float) -> float:
-    """Where the alpha of an isotropic Gaussian falls to 1/255, pixels from its centre."""
+    """Distance at which the alpha of an isotropic Gaussian falls to 1/255, pixels from its centre."""
     return math.sqrt(2 * math.log(255 * opacity) * variance)

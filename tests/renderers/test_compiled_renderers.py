@@ -80,7 +80,7 @@ SCENES = [
 
 
 def few(pixels):
-    """What may lie on a cut-off out of so many pixels: half a percent, or two."""
+    """Number of pixels that may lie on a cut-off out of so many pixels: half a percent, or two."""
     return max(2, pixels // 200)
 
 

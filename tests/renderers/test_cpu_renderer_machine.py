@@ -197,9 +197,9 @@ logging.basicConfig(level=logging.INFO)
 numba.core.caching.CacheImpl._locator_classes = numba.core.caching.CacheImpl._locator_classes[:1]
 from coliags_plugin.renderers.numba_kernels import pipeline
 """
-    done = run_python(code, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("nowhere to keep them") == 1
+    process = run_python(code, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
+    assert process.returncode == 0, process.stderr
+    assert process.stderr.count("nowhere to keep them") == 1
 
 
 def with_another_release(expression):
@@ -211,9 +211,9 @@ sys.modules["coliags_plugin.core.numba_kernels.internals"] = None  # its imports
 from tests.renderers.test_cpu_renderer_machine import *
 print({expression})
 """
-    done = run_python(code)
-    assert done.stderr.count("none of the tested releases") == 1, done.stderr
-    return done.stdout.strip()
+    process = run_python(code)
+    assert process.stderr.count("none of the tested releases") == 1, process.stderr
+    return process.stdout.strip()
 
 
 def test_kernels_compile_with_other_releases_of_numba():
@@ -235,7 +235,7 @@ def view():
 
 
 def gradient(gaussians, camera):
-    """Of the means, by a graph of its own."""
+    """Gradient of the means, by a graph of its own."""
     gaussians = cast(gaussians, grad=True)
     output = cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",))
     (output.rgb.sum() + output["depth_accumulated"].sum()).backward()
@@ -303,5 +303,5 @@ stop.set()
 other.join()
 print(statuses)
 """
-    done = run_python(code)
-    assert done.stdout.strip() == str([0] * 12), done.stdout + done.stderr
+    process = run_python(code)
+    assert process.stdout.strip() == str([0] * 12), process.stdout + process.stderr

@@ -279,7 +279,7 @@ def test_gradcheck_of_everything_in_the_gaussians_and_the_pose(made):
         output = render_gaussians(replaced, posed, wants, TorchRendererSettings(background=BACKGROUND))
         assert output["depth_median"].any() and (made is smooth_scene or output.alpha.min() > 0.3)
         # A number for each output instead of one for each pixel: seconds less.
-        return tuple((output[name] * given).sum() for name, given in cotangents.items())
+        return tuple((output[name] * cotangent).sum() for name, cotangent in cotangents.items())
 
     pose, quat = rigid(5)
     gaussians = moved(gaussians, pose, quat)
@@ -311,7 +311,7 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act(primitive):
     def loss(*values):
         replaced = dataclasses.replace(gaussians, **dict(zip(names, values, strict=True)))
         output = render_gaussians(replaced, camera, wants)
-        return sum((output[name] * given).sum() for name, given in cotangents.items())
+        return sum((output[name] * cotangent).sum() for name, cotangent in cotangents.items())
 
     assert torch.autograd.gradcheck(loss, [getattr(gaussians, k).clone().requires_grad_() for k in names])
 
@@ -536,11 +536,11 @@ def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):
 @pytest.mark.parametrize(("primitive", "name"), ALL_SCENES)
 def test_cuda_gives_the_numbers_of_the_cpu(primitive, name):
     gaussians, camera = (scene_of_gaussians if primitive is solid else scene)(name)
-    kept = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    clear = torch.ones(camera.height, camera.width, dtype=torch.bool)
     of_float32 = (1e-4, 1e-4)
     if primitive is as_surfels:
-        kept, of_float32 = naive(gaussians, camera)[0]["farthest"] <= GRAZING, [10 * bound for bound in SCENES[name]]
-    cotangents = without(~kept, cotangents_of(gaussians, camera))
+        clear, of_float32 = naive(gaussians, camera)[0]["farthest"] <= GRAZING, [10 * bound for bound in SCENES[name]]
+    cotangents = without(~clear, cotangents_of(gaussians, camera))
     for dtype, bounds in ((torch.float64, (1e-9, 1e-8)), (torch.float32, of_float32)):
         results = [
             with_gradients(ours(), cast(gaussians, dtype, device), camera.to(device, dtype),
@@ -550,7 +550,7 @@ def test_cuda_gives_the_numbers_of_the_cpu(primitive, name):
         (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results
         for key in on_cpu:
             assert on_cuda[key].device.type == "cuda"
-            assert relative(on_cuda[key].cpu()[kept], on_cpu[key].double()[kept]) <= bounds[0], (dtype, key)
+            assert relative(on_cuda[key].cpu()[clear], on_cpu[key].double()[clear]) <= bounds[0], (dtype, key)
         for key, gradient in cpu_gradients.items():
             if gradient.any():
                 assert relative(cuda_gradients[key].cpu(), gradient.double()) <= bounds[1], (dtype, key)

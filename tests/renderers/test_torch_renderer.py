@@ -80,7 +80,7 @@ def random_gaussians(n, seed=0, depth=(1.0, 9.0), scale=(0.02, 0.3), opacity=(0.
 
 
 def moved(gaussians, transform, quat):
-    """The same Gaussians in a world moved by a rigid transform."""
+    """Gaussians in a world moved by a rigid transform."""
     w, v = quat[0], quat[1:]
     q = gaussians.quats_wxyz
     product = torch.cat(
@@ -176,7 +176,7 @@ def test_one_gaussian_on_the_axis(opacity):
     ],
 )
 def test_compositing_of_gaussians_one_behind_the_other(opacities, name, value):
-    """So wide that their alpha is their opacity at any pixel, to 1e-8."""
+    """Gaussians so wide that their alpha is their opacity at any pixel, to 1e-8."""
     means = torch.tensor([[0, 0, 2.0 + i] for i in range(len(opacities))])
     output = render_gaussians(make(means, 1e3, opacities), pinhole(), OUTPUTS)
     torch.testing.assert_close(output[name][3, 4].item(), float(value), rtol=1e-7, atol=0)

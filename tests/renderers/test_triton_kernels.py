@@ -112,18 +112,18 @@ def of_decoding():
 
 @pytest.mark.parametrize("target", [*NVIDIA, *AMD])
 def test_every_kernel_compiles_without_a_device(target, tmp_path, monkeypatch):
-    """They compile for several programs on a multiprocessor, and hardly spill registers, which NVIDIA's tell of alone.
+    """Several programs fit a multiprocessor, and hardly spill registers, which NVIDIA's compiler tells of alone.
 
     They are compiled in an interpreter of their own, in which kernels are not those of triton's interpreter.
     """
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setenv("TRITON_CACHE_DIR", str(CACHE))
     command = [sys.executable, "-m", "tests.renderers.test_triton_kernels", json.dumps(target), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    found = json.loads(done.stdout)
-    assert found
-    for name, usage in found.items():
+    process = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert process.returncode == 0, process.stderr[-2000:]
+    usages_by_kernel = json.loads(process.stdout)
+    assert usages_by_kernel
+    for name, usage in usages_by_kernel.items():
         assert usage["shared"] <= SHARED, (name, usage)
         if target in NVIDIA:
             assert usage["reg"] > 0 and usage["stack"] <= SPILLED and not usage["local"], f"{name} spills: {usage}"
@@ -138,16 +138,16 @@ def _usages(target, folder):
     cuobjdump = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
     usages = {}
     for name, kernel, types, constants, options in (*of_renderer(), *of_decoding()):
-        known = {key: value for key, value in constants.items() if key in kernel.arg_names}
-        signature = {key: "constexpr" if key in known else types.get(key, "*fp32") for key in kernel.arg_names}
-        source = ASTSource(fn=kernel, signature=signature, constexprs=known)
-        made = triton.compile(source, target=GPUTarget(*target), options=options)
-        usages[name] = {"shared": made.metadata.shared}
+        fixed = {key: value for key, value in constants.items() if key in kernel.arg_names}
+        signature = {key: "constexpr" if key in fixed else types.get(key, "*fp32") for key in kernel.arg_names}
+        source = ASTSource(fn=kernel, signature=signature, constexprs=fixed)
+        compiled = triton.compile(source, target=GPUTarget(*target), options=options)
+        usages[name] = {"shared": compiled.metadata.shared}
         if target[0] == "cuda":
             cubin = Path(folder, f"{name}.cubin")
-            cubin.write_bytes(made.asm["cubin"])
-            told = subprocess.run([cuobjdump, "-res-usage", cubin], capture_output=True, text=True, check=True).stdout
-            usages[name] |= {key.lower(): int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\d+)", told)}
+            cubin.write_bytes(compiled.asm["cubin"])
+            text = subprocess.run([cuobjdump, "-res-usage", cubin], capture_output=True, text=True, check=True).stdout
+            usages[name] |= {key.lower(): int(value) for key, value in re.findall(r"(REG|STACK|LOCAL):(\d+)", text)}
     return usages
 
 

@@ -126,9 +126,9 @@ def test_depth_and_distance_of_a_ball_from_coarse_to_fine(spacing):
     coarse = (output["ray_lengths"] * output["depth_accumulated_coarse"] - distance)[hit]
     fine = (output["ray_lengths"] * output["depth_accumulated"] - distance)[hit]
     assert (coarse > 0).all() and (coarse < step).all()
-    found = coarse < 0.5 * step
-    assert 20 < found.sum() < len(found) - 20
-    assert (fine > 0).all() and (fine < 0.5 * step).all() and (fine < 1.01 * step / 64)[found].all()
+    outputs = coarse < 0.5 * step
+    assert 20 < outputs.sum() < len(outputs) - 20
+    assert (fine > 0).all() and (fine < 0.5 * step).all() and (fine < 1.01 * step / 64)[outputs].all()
     assert (output.alpha[hit] == 1).all() and (output.alpha[outside] == 0).all()
     first, second = field.asked
     assert first.shape[1] == 48 and second.shape[1] == 48 + 64
@@ -273,13 +273,13 @@ def test_refined_places_are_numpys_inverse_of_the_cumulative_weights(seed, sampl
     random = np.random.default_rng(seed)
     places = np.sort(random.uniform(1.0, 9.0, (2, samples)), axis=1)
     weights = random.uniform(0.0, most, (2, samples)) ** 8  # rays without weight are refined evenly
-    found = refined_places(torch.from_numpy(places), torch.from_numpy(weights), more, None).numpy()
+    outputs = refined_places(torch.from_numpy(places), torch.from_numpy(weights), more, None).numpy()
     for row in range(2):
         edges = (places[row, 1:] + places[row, :-1]) / 2
         mass = weights[row, 1:-1] + WEIGHT_FLOOR
         cumulative = np.concatenate([[0.0], np.cumsum(mass) / mass.sum()])
         expected = np.interp((np.arange(more) + 0.5) / more, cumulative, edges)
-        np.testing.assert_allclose(found[row], np.sort([*places[row], *expected]), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(outputs[row], np.sort([*places[row], *expected]), rtol=0, atol=1e-9)
 
 
 def test_an_opaque_end_absorbs_what_is_left_where_there_is_density():

@@ -25,7 +25,7 @@ def stepped_optimizers(field, lr):
 
 
 def after_backward(strategy, step, field, rows, output):
-    """What a strategy does after ``backward`` of a step with this output."""
+    """Changes by a strategy after ``backward`` of a step with this output."""
     return strategy.after_backward(TrainingStep(output, None, rows.model, step, strategy.schedule), rows)
 
 

@@ -36,8 +36,8 @@ def make_judged(field, drawn=0.0, gradient=0.0, seen=0.0, **options):
 
 def make_output(slots, gradients, visible=None, radii=None):
     """Half transparent children of these slots, whose anchors are visible unless others are given."""
-    seen = torch.unique(torch.as_tensor(slots, dtype=torch.long) // CHILDREN) if visible is None else visible
-    return drawn_output(slots, gradients, radii, seen, 0.5)
+    parents = torch.unique(torch.as_tensor(slots, dtype=torch.long) // CHILDREN) if visible is None else visible
+    return drawn_output(slots, gradients, radii, parents, 0.5)
 
 
 def test_counts_only_inside_the_window_and_what_is_drawn():
@@ -58,9 +58,9 @@ def test_counts_only_inside_the_window_and_what_is_drawn():
 def test_statistics_keep_their_share_of_the_run(steps, first, last):
     field, rows = make()
     strategy = make_strategy(steps=steps)
-    for step, seen in ((first, 0), (first + 1, 1), (last - 1, 2), (last, 2), (last + last // 3, 2)):
+    for step, count in ((first, 0), (first + 1, 1), (last - 1, 2), (last, 2), (last + last // 3, 2)):
         after_backward(strategy, step, field, rows, make_output([0], [1.0]))
-        assert (strategy.seen.sum() if len(strategy.seen) else 0) == seen
+        assert (strategy.seen.sum() if len(strategy.seen) else 0) == count
 
 
 @pytest.mark.parametrize(
@@ -94,13 +94,13 @@ def grow_once(gradient, **options):
     strategy = make_judged(field, min_opacity=0.0, **options)
     strategy.drawn[34] = 41.0  # one more than 100 * 0.8 * 0.5
     strategy.gradient_sum[34] = 41.0 * gradient
-    done = after_backward(strategy, 100, field, rows, make_output([0], [0.0]))
-    return field, rows, before, done
+    changes = after_backward(strategy, 100, field, rows, make_output([0], [0.0]))
+    return field, rows, before, changes
 
 
 def test_a_birth_stands_where_its_candidate_stood_and_looks_like_its_parent():
-    field, _, before, done = grow_once(1.0, levels=1)
-    assert done == {"grown": 1, "pruned": 0}
+    field, _, before, changes = grow_once(1.0, levels=1)
+    assert changes == {"grown": 1, "pruned": 0}
     assert len(field.anchors) == before + 1
     torch.testing.assert_close(field.anchors[-1], field.child_positions()[3, 4])
     assert torch.equal(field.features[-1], field.features[3])
@@ -215,8 +215,8 @@ def test_faint_anchors_go_and_the_rest_keeps_its_moments():
     strategy.opacity_sum[[2, 7]] = 81.0 * 0.004
     strategy.seen[9] = 10.0  # too rarely seen to judge
     strategy.opacity_sum[9] = 0.0
-    done = after_backward(strategy, 100, field, rows, make_output([], [], visible=torch.zeros(0, dtype=torch.long)))
-    assert done == {"grown": 0, "pruned": 2}
+    changes = after_backward(strategy, 100, field, rows, make_output([], [], visible=torch.zeros(0, dtype=torch.long)))
+    assert changes == {"grown": 0, "pruned": 2}
     kept = [i for i in range(len(before)) if i not in (2, 7)]
     assert torch.equal(field.features.detach(), before[kept])
     assert torch.equal(rows.adam["features"].state[field.features]["exp_avg"], moments[kept])

@@ -396,7 +396,7 @@ def lowest_bit(builder, flags):
 
 @operation(types.int64, INTEGER)
 def bit_count(builder, flags):
-    """How many bits are set in an integer."""
+    """Number of bits set in an integer."""
     return builder.ctpop(flags)
 
 
@@ -504,7 +504,7 @@ def gather_fours(builder, table, index, places):
 
 
 def _gathered(builder: ir.IRBuilder, address: ir.Value, places: ir.Value) -> list[ir.Value]:
-    """What lies at sixteen places behind an address, counted in what it is of."""
+    """Values at sixteen places behind an address, counted in its elements."""
     whole = builder.fptosi(places, _INTS)
     steps = [builder.extract_element(whole, ir.Constant(_INT, row)) for row in range(WIDTH)]
     return [_read(builder, builder.gep(address, [step])) for step in steps]
@@ -548,7 +548,7 @@ prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 @operation(AS_LONG, TABLE, INDEX, LENGTH)
 def load_all(builder, table, index, like):
-    """As many vectors, one behind the other from ``table[index]`` on, as a tuple is long."""
+    """Successive vectors from ``table[index]`` on, as many as a tuple is long."""
     return [_read(builder, address) for address in _successive(builder, _at(builder, table, index), like)]
 
 

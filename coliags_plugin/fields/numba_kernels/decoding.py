@@ -214,12 +214,24 @@ def _draw_tile(n, first, rows, widths, anchors, opacities, covariances, colors, 
 
 @kernel
 def decode_backward(
-    counters, widths, anchors, geometry, appearance, transposed, hidden, opacities, starts, drawn, given, found, sums
+    counters,
+    widths,
+    anchors,
+    geometry,
+    appearance,
+    transposed,
+    hidden,
+    opacities,
+    starts,
+    drawn,
+    of_drawn,
+    of_anchors,
+    sums,
 ):
     """Derivatives of :func:`decode_opacities` and :func:`draw`.
 
-    ``given`` are those with respect to what was drawn. ``transposed`` are the weights of networks with outputs as rows, and
-    inputs and units as columns. Written are what is ``found`` for the rows, and in ``sums`` the derivatives with respect to the
+    ``of_drawn`` are those with respect to what was drawn. ``transposed`` are the weights of networks with outputs as rows, and
+    inputs and units as columns. Written are ``of_anchors``, and in ``sums`` the derivatives with respect to the
     networks, for each slab one behind the other.
     """
     units, geometry_units = _units(widths)
@@ -234,7 +246,9 @@ def decode_backward(
             first = TILE * tile
             rows = min(TILE, len(anchors.visible) - first)
             start = first * units
-            _outputs_backward(starts[tile], first, rows, widths, anchors, opacities, drawn, given, outputs, found)
+            _outputs_backward(
+                starts[tile], first, rows, widths, anchors, opacities, drawn, of_drawn, outputs, of_anchors
+            )
             _last_layers_backward(rows, widths, transposed, hidden, start, outputs, of_hidden, total)
             for i in range(0, rows * units, vec.WIDTH):
                 active = vec.greater(vec.load(hidden, start + i), 0.0)
@@ -253,19 +267,19 @@ def decode_backward(
 
             columns = len(transposed.of_features) // units
             a, b = (of_hidden, 0, units, 1), (transposed.of_features, 0, columns)
-            multiply((rows, columns, units), a, b, (found.features, first * columns, columns))
-            if len(found.geometry):
+            multiply((rows, columns, units), a, b, (of_anchors.features, first * columns, columns))
+            if len(of_anchors.geometry):
                 b = (transposed.of_geometry, 0, geometry_columns)
-                c = (found.geometry, first * geometry_columns, geometry_columns)
+                c = (of_anchors.geometry, first * geometry_columns, geometry_columns)
                 multiply((rows, geometry_columns, geometry_units), a, b, c)
-            if len(found.appearance):
+            if len(of_anchors.appearance):
                 a, b = (of_hidden, geometry_units, units, 1), (transposed.of_appearance, 0, appearance_columns)
-                c = (found.appearance, first * appearance_columns, appearance_columns)
+                c = (of_anchors.appearance, first * appearance_columns, appearance_columns)
                 multiply((rows, appearance_columns, widths.color_units), a, b, c)
 
 
 @part
-def _outputs_backward(n, first, rows, widths, anchors, opacities, drawn, given, outputs, found):
+def _outputs_backward(n, first, rows, widths, anchors, opacities, drawn, of_drawn, outputs, of_anchors):
     """Derivatives with respect to the outputs of the networks, and to the rows of offsets and scalings, of a tile."""
     of_opacities, of_covariances, of_colors = outputs
     of_opacities[:] = 0.0
@@ -273,44 +287,44 @@ def _outputs_backward(n, first, rows, widths, anchors, opacities, drawn, given, 
     of_colors[:] = 0.0
     for row in range(rows):
         m = anchors.visible[first + row]
-        _clear(first + row, widths, anchors, found)
+        _clear(first + row, widths, anchors, of_anchors)
         for k in range(widths.children):
             source = m * widths.children + k
             opacity = opacities[(first + row) * widths.opacities + k]
             if not opacity > 0.0:
                 for i in range(3):
-                    found.offsets[3 * source + i] = 0.0
+                    of_anchors.offsets[3 * source + i] = 0.0
                 continue
-            of_opacities[row * widths.opacities + k] = given.opacities[n] * (ONE - opacity * opacity)
+            of_opacities[row * widths.opacities + k] = of_drawn.opacities[n] * (ONE - opacity * opacity)
             logit, color = row * widths.covariances + 3 * k, row * widths.colors + 3 * k
             for i in range(3):
-                of_offset = given.means[3 * n + i] * anchors.sizes[6 * m + i]
-                found.offsets[3 * source + i] = of_offset
-                found.scalings[6 * m + i] += of_offset * anchors.offsets[3 * source + i]
+                of_offset = of_drawn.means[3 * n + i] * anchors.sizes[6 * m + i]
+                of_anchors.offsets[3 * source + i] = of_offset
+                of_anchors.scalings[6 * m + i] += of_offset * anchors.offsets[3 * source + i]
                 # With respect to the logarithm of the scale.
-                of_log = given.scales[3 * n + i] * drawn.scales[3 * n + i]
-                found.scalings[6 * m + 3 + i] += of_log
+                of_log = of_drawn.scales[3 * n + i] * drawn.scales[3 * n + i]
+                of_anchors.scalings[6 * m + 3 + i] += of_log
                 share = drawn.scales[3 * n + i] / max(anchors.sizes[6 * m + 3 + i], SHORTEST)
                 of_covariances[logit + i] = of_log * (ONE - share)
                 value = drawn.colors[3 * n + i]
-                of_colors[color + i] = given.colors[3 * n + i] * value * (ONE - value)
+                of_colors[color + i] = of_drawn.colors[3 * n + i] * value * (ONE - value)
             quat = row * widths.covariances + widths.logits + 4 * k
             along = np.float32(0.0)
             for i in range(4):
-                along += drawn.quats[4 * n + i] * given.quats[4 * n + i]
+                along += drawn.quats[4 * n + i] * of_drawn.quats[4 * n + i]
             for i in range(4):
-                across = given.quats[4 * n + i] - drawn.quats[4 * n + i] * along
+                across = of_drawn.quats[4 * n + i] - drawn.quats[4 * n + i] * along
                 of_covariances[quat + i] = across * drawn.inverse_lengths[n]
             n += 1
 
 
 @part
-def _clear(v, widths, anchors, found):
+def _clear(v, widths, anchors, of_anchors):
     """Set to 0 what is found for the anchors since the visible one before, and behind the last visible one."""
     begin = anchors.visible[v - 1] + 1 if v else 0
     end = anchors.visible[v] + 1 if v + 1 < len(anchors.visible) else len(anchors.sizes) // 6
-    found.scalings[6 * begin : 6 * end] = 0.0
-    found.offsets[3 * widths.children * begin : 3 * widths.children * end] = 0.0
+    of_anchors.scalings[6 * begin : 6 * end] = 0.0
+    of_anchors.offsets[3 * widths.children * begin : 3 * widths.children * end] = 0.0
 
 
 @part
@@ -382,16 +396,16 @@ def _networks_in(table, widths, geometry_columns, appearance_columns):
 def _embed(table, inputs, first, rows):
     """Write the embedded inputs of a tile."""
     columns = len(inputs.quadrants)
-    count, given = len(inputs.octaves) // columns, inputs.given
+    count, plain = len(inputs.octaves) // columns, inputs.given
     for row in range(rows):
-        at = (first + row) * given
+        at = (first + row) * plain
         for column in range(0, columns, vec.WIDTH):
             phase = vec.splat(0.0)
             for d in range(count):
-                value = vec.broadcast(inputs.values, at + given - count + d)
+                value = vec.broadcast(inputs.values, at + plain - count + d)
                 phase = vec.fma(value, vec.load(inputs.octaves, d * columns + column), phase)
             vec.store(table, row * columns + column, _sine(phase, vec.load(inputs.quadrants, column)))
-        for column in range(given):
+        for column in range(plain):
             table[row * columns + column] = inputs.values[at + column]
 
 

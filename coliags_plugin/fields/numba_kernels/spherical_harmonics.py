@@ -61,12 +61,12 @@ class _Colors(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, of_color: Tensor) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         results = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in saved[:3]]
         sh0, shN, sight, rows = tables(*saved)
         with workers() as run:
-            run(_backward, ctx.terms, sh0, shN, rows, sight, *tables(given, *results))
+            run(_backward, ctx.terms, sh0, shN, rows, sight, *tables(of_color, *results))
         return *results, None, None
 
 
@@ -97,14 +97,18 @@ def _backward(counters, terms, sh0, shN, rows, sight, of_colors, of_sh0, of_shN,
             direction, norm = _load(terms, sh0, shN, rows, sight, group, scratch, places)
             unclamped = _sums(terms, scratch)
             _read_columns(of_colors, places, 3, scratch, _VECTORS)
-            given = vec.load_all(scratch, _VECTORS, _THREE)
-            given = (_passed(unclamped[0], given[0]), _passed(unclamped[1], given[1]), _passed(unclamped[2], given[2]))
+            of_color = vec.load_all(scratch, _VECTORS, _THREE)
+            of_color = (
+                _passed(unclamped[0], of_color[0]),
+                _passed(unclamped[1], of_color[1]),
+                _passed(unclamped[2], of_color[2]),
+            )
             vec.store_all(scratch, _OF_BASIS, vec.repeat(0.0, _SIXTEEN))
             for term in range(terms):
                 value, at = vec.load(scratch, _BASIS + WIDTH * term), _COEFFICIENTS + 3 * WIDTH * term
                 coefficients = vec.load_all(scratch, at, _THREE)
-                vec.store(scratch, _OF_BASIS + WIDTH * term, vec.dot(given, coefficients, 0.0))
-                vec.store_all(scratch, at, vec.mul((value, value, value), given))
+                vec.store(scratch, _OF_BASIS + WIDTH * term, vec.dot(of_color, coefficients, 0.0))
+                vec.store_all(scratch, at, vec.mul((value, value, value), of_color))
             of_direction = _basis_backward(direction, vec.load_all(scratch, _OF_BASIS + WIDTH, FACTORS))
             along = vec.neg(vec.dot(direction, of_direction, 0.0))
             across = vec.fma(direction, (along, along, along), of_direction)
@@ -182,9 +186,9 @@ def _sums(terms, scratch):
 
 
 @inline
-def _passed(unclamped, given):
+def _passed(unclamped, of_color):
     """The derivative that a colour clamped to at least 0 passes on."""
-    return vec.select(vec.at_least(unclamped, 0.0), given, 0.0)
+    return vec.select(vec.at_least(unclamped, 0.0), of_color, 0.0)
 
 
 @inline

@@ -80,8 +80,8 @@ class _Decode(torch.autograd.Function):
             **OPTIONS,
         )
         starts = counts.cumsum(1)
-        seen, count = starts[:, -1].tolist()
-        sources, visible_sources = (starts.new_empty(length) for length in (count, seen))
+        visible_count, count = starts[:, -1].tolist()
+        sources, visible_sources = (starts.new_empty(length) for length in (count, visible_count))
         means, quats, inverse_lengths, scales, values, colors = (
             new(count, *width) for width in ((3,), (4,), (), (3,), (), (3,))
         )
@@ -100,7 +100,7 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         offsets, scalings, features, of_geometry, of_appearance, table, visible, *of_drawn = ctx.saved_tensors
         opacities, starts, quats, *_ = of_drawn
         opacity, covariance, color = ctx.networks
@@ -109,29 +109,29 @@ class _Decode(torch.autograd.Function):
         of_offsets, of_scalings = torch.empty_like(offsets), torch.empty_like(scalings)
         of_outputs = quats.new_empty(len(quats), OUTPUTS.value)
         decoding.draw_backward[(tiles,)](
-            *(offsets, scalings, *of_drawn, *(values.contiguous() for values in given[:5])),
+            *(offsets, scalings, *of_drawn, *(values.contiguous() for values in gradients[:5])),
             *(of_offsets, of_scalings, of_outputs, anchors, tiles),
             CHILDREN=children,
             SLOTS=block_of(children),
             **OPTIONS,
         )
         of_features = torch.zeros_like(features)
-        wanted = ctx.needs_input_grad[6:8]
+        needs_inputs = ctx.needs_input_grad[6:8]
         of_inputs = [
             torch.zeros_like(inputs) if want else None
-            for inputs, want in zip((of_geometry, of_appearance), wanted, strict=True)
+            for inputs, want in zip((of_geometry, of_appearance), needs_inputs, strict=True)
         ]
         programs = min(SLABS, tiles)
         sums = table.new_zeros(programs, len(table))
         decoding.networks_backward[(programs,)](
             *(features, of_geometry, of_appearance, table, visible, opacities, starts, of_outputs),
-            *(of_features, *(sums if found is None else found for found in of_inputs), sums, anchors, tiles),
+            *(of_features, *(sums if of_input is None else of_input for of_input in of_inputs), sums, anchors, tiles),
             OPACITY=opacity,
             COVARIANCE=covariance,
             COLOR=color,
             LENGTH=len(table),
-            WITH_GEOMETRY=wanted[0],
-            WITH_APPEARANCE=wanted[1],
+            WITH_GEOMETRY=needs_inputs[0],
+            WITH_APPEARANCE=needs_inputs[1],
             SLOTS=block_of(children),
             INPUTS=block_of(max(of_geometry.shape[1], of_appearance.shape[1])),
             **BACKWARD_OPTIONS,

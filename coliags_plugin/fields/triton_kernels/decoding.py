@@ -19,7 +19,7 @@ SHORTEST = tl.constexpr(1e-12)
 def _in_frustum(
     positions, offsets, scalings, rows, inside, slots, is_child, pose, fx, fy, cx, cy, width, height, near_plane, sigmas
 ):
-    """Whether an anchor's children may overlap the image, as ``spheres_in_frustum`` finds of their sphere. [R]"""
+    """True if an anchor's children may overlap the image, as ``spheres_in_frustum`` finds of their sphere. [R]"""
     farthest = tl.zeros(slots.shape, tl.float32)
     largest = tl.full(rows.shape, float("-inf"), tl.float32)
     for axis in tl.static_range(3):
@@ -41,7 +41,7 @@ def _in_frustum(
 
 @triton.jit
 def _passes_side(x, z, radius, focal_length, border):
-    """Whether spheres reach across the plane through an image border, so far from the principal point. [R]"""
+    """True if spheres reach across the plane through an image border, so far from the principal point. [R]"""
     return focal_length * x + border * z + radius * tl.sqrt(focal_length * focal_length + border * border) > 0.0
 
 
@@ -74,16 +74,16 @@ def decode_opacities(
     """
     tile = tl.program_id(0)
     rows, inside, child, slots, is_child = _tile(tile, anchors, NETWORK.children, SLOTS)
-    seen = _in_frustum(
+    shown = _in_frustum(
         positions, offsets, scalings, rows, inside, slots, is_child,
         pose, fx, fy, cx, cy, width, height, near_plane, sigmas,
     )  # fmt: skip
-    tl.store(visible + rows, seen, inside)
-    count = tl.sum(seen.to(tl.int32))
+    tl.store(visible + rows, shown, inside)
+    count = tl.sum(shown.to(tl.int32))
     values = tl.zeros(slots.shape, tl.float32)
     if count > 0:
-        (logits,) = outputs(table, features, inputs, rows, seen, child, NETWORK)
-        values = tl.where(seen[:, None] & is_child, tanh(logits), 0.0)
+        (logits,) = outputs(table, features, inputs, rows, shown, child, NETWORK)
+        values = tl.where(shown[:, None] & is_child, tanh(logits), 0.0)
     tl.store(opacities + slots, values, is_child)
     tl.store(counts + 1 + tile, count)
     tl.store(counts + tiles + 2 + tile, tl.sum((values > 0.0).to(tl.int32)))
@@ -101,9 +101,9 @@ def draw(
     """
     tile = tl.program_id(0)
     rows, inside, child, slots, is_child = _tile(tile, anchors, COLOR.children, SLOTS)
-    seen = tl.load(visible + rows, inside, 0) != 0
-    place = tl.load(starts + tile) + tl.cumsum(seen.to(tl.int32)) - 1
-    tl.store(visible_sources + place, rows.to(tl.int64), seen)
+    shown = tl.load(visible + rows, inside, 0) != 0
+    place = tl.load(starts + tile) + tl.cumsum(shown.to(tl.int32)) - 1
+    tl.store(visible_sources + place, rows.to(tl.int64), shown)
     first, end = tl.load(starts + tiles + 1 + tile), tl.load(starts + tiles + 2 + tile)
     if first < end:
         values = tl.load(opacities + slots, is_child, 0.0)
@@ -111,24 +111,24 @@ def draw(
         number = _numbers(first, drawn)
         tl.store(sources + number, slots.to(tl.int64), drawn)
         tl.store(drawn_opacities + number, values, drawn)
-        found = outputs(table, features, of_geometry, rows, seen, child, COVARIANCE)
+        decoded = outputs(table, features, of_geometry, rows, shown, child, COVARIANCE)
         squares = tl.zeros(slots.shape, tl.float32)
         for axis in tl.static_range(4):
-            squares += found[3 + axis] * found[3 + axis]
+            squares += decoded[3 + axis] * decoded[3 + axis]
         inverse = 1.0 / tl.maximum(tl.sqrt(squares), SHORTEST)
         tl.store(inverse_lengths + number, inverse, drawn)
         for axis in tl.static_range(4):
-            tl.store(quats + 4 * number + axis, found[3 + axis] * inverse, drawn)
+            tl.store(quats + 4 * number + axis, decoded[3 + axis] * inverse, drawn)
         for axis in tl.static_range(3):
             shift = tl.load(offsets + 3 * slots + axis, is_child, 0.0)
             shift *= tl.exp(tl.load(scalings + 6 * rows + axis, inside, 0.0))[:, None]
             position = tl.load(positions + 3 * rows + axis, inside, 0.0)
             tl.store(means + 3 * number + axis, position[:, None] + shift, drawn)
             size = tl.exp(tl.load(scalings + 6 * rows + 3 + axis, inside, 0.0))
-            tl.store(scales + 3 * number + axis, size[:, None] * tl.sigmoid(found[axis]), drawn)
-        found = outputs(table, features, of_appearance, rows, seen, child, COLOR)
+            tl.store(scales + 3 * number + axis, size[:, None] * tl.sigmoid(decoded[axis]), drawn)
+        decoded = outputs(table, features, of_appearance, rows, shown, child, COLOR)
         for axis in tl.static_range(3):
-            tl.store(colors + 3 * number + axis, tl.sigmoid(found[axis]), drawn)
+            tl.store(colors + 3 * number + axis, tl.sigmoid(decoded[axis]), drawn)
 
 
 @triton.jit
@@ -185,27 +185,27 @@ def networks_backward(
     of_table = sums + tl.program_id(0) * LENGTH
     for tile in range(tl.program_id(0), tiles, tl.num_programs(0)):
         rows, inside, child, slots, is_child = _tile(tile, anchors, COLOR.children, SLOTS)
-        seen = tl.load(visible + rows, inside, 0) != 0
-        if tl.max(seen.to(tl.int32)) > 0:
+        shown = tl.load(visible + rows, inside, 0) != 0
+        if tl.max(shown.to(tl.int32)) > 0:
             drawn = tl.load(opacities + slots, is_child, 0.0) > 0.0
             number = _numbers(tl.load(starts + tiles + 1 + tile), drawn)
             column = tl.arange(0, INPUTS)
             zeros = tl.zeros([ROWS, INPUTS], tl.float32)
             of_inputs = outputs_backward(
-                table, features, of_geometry, rows, seen, child, number, drawn, of_outputs, of_table, of_features,
+                table, features, of_geometry, rows, shown, child, number, drawn, of_outputs, of_table, of_features,
                 zeros, OPACITY, WITH_GEOMETRY,
             )  # fmt: skip
             of_inputs = outputs_backward(
-                table, features, of_geometry, rows, seen, child, number, drawn, of_outputs + 1, of_table, of_features,
+                table, features, of_geometry, rows, shown, child, number, drawn, of_outputs + 1, of_table, of_features,
                 of_inputs, COVARIANCE, WITH_GEOMETRY,
             )  # fmt: skip
             if WITH_GEOMETRY:
-                here = seen[:, None] & (column < COVARIANCE.given)[None, :]
+                here = shown[:, None] & (column < COVARIANCE.given)[None, :]
                 tl.store(of_geometry_inputs + rows[:, None] * COVARIANCE.given + column[None, :], of_inputs, here)
             of_inputs = outputs_backward(
-                table, features, of_appearance, rows, seen, child, number, drawn, of_outputs + 8, of_table, of_features,
-                zeros, COLOR, WITH_APPEARANCE,
+                table, features, of_appearance, rows, shown, child, number, drawn, of_outputs + 8, of_table,
+                of_features, zeros, COLOR, WITH_APPEARANCE,
             )  # fmt: skip
             if WITH_APPEARANCE:
-                here = seen[:, None] & (column < COLOR.given)[None, :]
+                here = shown[:, None] & (column < COLOR.given)[None, :]
                 tl.store(of_appearance_inputs + rows[:, None] * COLOR.given + column[None, :], of_inputs, here)

@@ -32,7 +32,7 @@ class Network(NamedTuple):
     outputs: int  # of each child
     children: int
     features: int
-    given: int
+    plain_inputs: int
     embedded: int  # how many of the given inputs, the last ones
     columns: int  # in all
 
@@ -65,28 +65,28 @@ def tanh(x):
 def _sources(column, NETWORK: tl.constexpr):
     """The given input of a column, factor and right angles of its phase, and whether it is a sine of that. [C] each"""
     EMBEDDED: tl.constexpr = max(NETWORK.embedded, 1)
-    own = column - NETWORK.features
-    wave = own - NETWORK.given
+    is_source = column - NETWORK.features
+    wave = is_source - NETWORK.given
     place = tl.maximum(wave, 0)
-    source = tl.where(wave < 0, own, NETWORK.given - NETWORK.embedded + place % EMBEDDED)
+    source = tl.where(wave < 0, is_source, NETWORK.given - NETWORK.embedded + place % EMBEDDED)
     return source, (1 << (place // (2 * EMBEDDED))).to(tl.float32), place // EMBEDDED % 2, wave >= 0
 
 
 @triton.jit
-def _given(inputs, rows, seen, column, source, NETWORK: tl.constexpr):
+def _given(inputs, rows, visible, column, source, NETWORK: tl.constexpr):
     """The given inputs of columns, 0 of features. [R, C]"""
     here = (column >= NETWORK.features) & (column < NETWORK.columns)
-    return tl.load(inputs + rows[:, None] * NETWORK.given + source[None, :], seen[:, None] & here[None, :], 0.0)
+    return tl.load(inputs + rows[:, None] * NETWORK.given + source[None, :], visible[:, None] & here[None, :], 0.0)
 
 
 @triton.jit
-def _seen_by(features, inputs, rows, seen, column, NETWORK: tl.constexpr):
+def _seen_by(features, inputs, rows, visible, column, NETWORK: tl.constexpr):
     """Inputs of the first layer. [R, C]"""
     source, octave, quadrant, is_wave = _sources(column, NETWORK)
-    here = seen[:, None] & (column < NETWORK.features)[None, :]
+    here = visible[:, None] & (column < NETWORK.features)[None, :]
     of_anchors = tl.load(features + rows[:, None] * NETWORK.features + column[None, :], here, 0.0)
-    given = _given(inputs, rows, seen, column, source, NETWORK)
-    values = tl.where(is_wave[None, :], sine(given * octave[None, :], quadrant[None, :]), given)
+    plain_inputs = _given(inputs, rows, visible, column, source, NETWORK)
+    values = tl.where(is_wave[None, :], sine(plain_inputs * octave[None, :], quadrant[None, :]), plain_inputs)
     return tl.where((column < NETWORK.features)[None, :], of_anchors, values)
 
 
@@ -114,42 +114,42 @@ def _last_biases(child, output, NETWORK: tl.constexpr):
 
 
 @triton.jit
-def _hidden(table, features, inputs, rows, seen, unit, NETWORK: tl.constexpr):
+def _hidden(table, features, inputs, rows, visible, unit, NETWORK: tl.constexpr):
     """Hidden units, behind ReLU. [R, U]"""
     bias = tl.load(table + NETWORK.start + NETWORK.units * NETWORK.columns + unit, unit < NETWORK.units, 0.0)
     sums = tl.zeros([ROWS, UNITS], tl.float32) + bias[None, :]
     for first in range(0, NETWORK.columns, COLUMNS):
         column = first + tl.arange(0, COLUMNS)
         place, here = _first_weights(unit, column, NETWORK)
-        values = _seen_by(features, inputs, rows, seen, column, NETWORK)
+        values = _seen_by(features, inputs, rows, visible, column, NETWORK)
         weights = tl.trans(tl.load(table + place, here, 0.0))
         sums = tl.dot(values, weights, sums, input_precision=PRECISION)
     return tl.where(sums < 0.0, 0.0, sums)
 
 
 @triton.jit
-def outputs(table, features, inputs, rows, seen, child, NETWORK: tl.constexpr):
+def outputs(table, features, inputs, rows, visible, child, NETWORK: tl.constexpr):
     """The outputs of the children, one block [R, K] each."""
     COUNT: tl.constexpr = NETWORK.outputs  # before triton 3.9, the field itself is no constexpr
-    found = ()
+    results = ()
     for output in tl.static_range(COUNT):
         bias = tl.load(table + _last_biases(child, output, NETWORK), child < NETWORK.children, 0.0)
-        found += (tl.zeros([ROWS, child.shape[0]], tl.float32) + bias[None, :],)
+        results += (tl.zeros([ROWS, child.shape[0]], tl.float32) + bias[None, :],)
     for first in range(0, NETWORK.units, UNITS):
         unit = first + tl.arange(0, UNITS)
-        hidden = _hidden(table, features, inputs, rows, seen, unit, NETWORK)
+        hidden = _hidden(table, features, inputs, rows, visible, unit, NETWORK)
         sums = ()
         for output in tl.static_range(COUNT):
             place, here = _last_weights(child, unit, output, NETWORK)
             weights = tl.trans(tl.load(table + place, here, 0.0))
-            sums += (tl.dot(hidden, weights, found[output], input_precision=PRECISION),)
-        found = sums
-    return found
+            sums += (tl.dot(hidden, weights, results[output], input_precision=PRECISION),)
+        results = sums
+    return results
 
 
 @triton.jit
 def outputs_backward(
-    table, features, inputs, rows, seen, child, number, drawn, of_outputs, of_table, of_features, of_inputs,
+    table, features, inputs, rows, visible, child, number, drawn, of_outputs, of_table, of_features, of_inputs,
     NETWORK: tl.constexpr, WITH_INPUTS: tl.constexpr,
 ):  # fmt: skip
     """Derivative of :func:`outputs`: added to the table's and the features'; returned, added up, of the inputs. [R, I]
@@ -160,7 +160,7 @@ def outputs_backward(
     tl.debug_barrier()
     for first_unit in range(0, NETWORK.units, UNITS):
         unit = first_unit + tl.arange(0, UNITS)
-        hidden = _hidden(table, features, inputs, rows, seen, unit, NETWORK)
+        hidden = _hidden(table, features, inputs, rows, visible, unit, NETWORK)
         of_hidden = tl.zeros([ROWS, UNITS], tl.float32)
         for output in range(NETWORK.outputs):
             of_output = tl.load(of_outputs + OUTPUTS * number + output, drawn, 0.0)
@@ -178,20 +178,20 @@ def outputs_backward(
         for block in range(0, NETWORK.columns, COLUMNS):
             column = block + tl.arange(0, COLUMNS)
             first, is_first = _first_weights(unit, column, NETWORK)
-            values = _seen_by(features, inputs, rows, seen, column, NETWORK)
+            values = _seen_by(features, inputs, rows, visible, column, NETWORK)
             of_first = tl.dot(tl.trans(of_hidden), values, input_precision=PRECISION)
             tl.atomic_add(of_table + first, of_first, is_first, sem="relaxed")
             of_values = tl.dot(of_hidden, tl.load(table + first, is_first, 0.0), input_precision=PRECISION)
-            is_feature = seen[:, None] & (column < NETWORK.features)[None, :]
+            is_feature = visible[:, None] & (column < NETWORK.features)[None, :]
             place = of_features + rows[:, None] * NETWORK.features + column[None, :]
             tl.atomic_add(place, of_values, is_feature, sem="relaxed")
             if WITH_INPUTS:
                 source, octave, quadrant, is_wave = _sources(column, NETWORK)
-                phase = _given(inputs, rows, seen, column, source, NETWORK) * octave[None, :]
+                phase = _given(inputs, rows, visible, column, source, NETWORK) * octave[None, :]
                 slope = octave[None, :] * sine(phase, quadrant[None, :] + 1)
                 of_values *= tl.where(is_wave[None, :], slope, 1.0)
                 # The columns that an input is in, added up by a product.
-                own = tl.arange(0, of_inputs.shape[1])[None, :] == source[:, None]
-                own &= (column < NETWORK.columns)[:, None]
-                of_inputs = tl.dot(of_values, own.to(tl.float32), of_inputs, input_precision=PRECISION)
+                is_source = tl.arange(0, of_inputs.shape[1])[None, :] == source[:, None]
+                is_source &= (column < NETWORK.columns)[:, None]
+                of_inputs = tl.dot(of_values, is_source.to(tl.float32), of_inputs, input_precision=PRECISION)
     return of_inputs

@@ -88,10 +88,10 @@ class _CompositeImages(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, *given: Tensor | None) -> tuple[Tensor | None, ...]:
-        if all(gradient is None for gradient in given):
+    def backward(ctx: FunctionCtx, *of_images: Tensor | None) -> tuple[Tensor | None, ...]:
+        if all(gradient is None for gradient in of_images):
             return None, None, None
-        of_means2d, sums = ctx.pipeline.composite_backward(layout.Images(*map(_array, given)))
+        of_means2d, sums = ctx.pipeline.composite_backward(layout.Images(*map(_array, of_images)))
         return torch.from_numpy(of_means2d), torch.from_numpy(sums), None
 
 
@@ -106,10 +106,10 @@ class _CompositeFeatures(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: FunctionCtx, of_images: Tensor) -> tuple[Tensor | None, ...]:
         (features,) = ctx.saved_tensors
         of_means2d, sums, of_features = ctx.pipeline.composite_features_backward(
-            np.asarray(features.detach().contiguous()), np.asarray(given.contiguous())
+            np.asarray(features.detach().contiguous()), np.asarray(of_images.contiguous())
         )
         return torch.from_numpy(of_means2d), torch.from_numpy(sums), torch.from_numpy(of_features), None
 

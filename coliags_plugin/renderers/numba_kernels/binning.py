@@ -125,8 +125,8 @@ def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
     x, y = vec.sub(vec.add(left, half_x), shift_x), vec.sub(vec.add(top, half_y), shift_y)
     x, y, half_x, half_y = vec.mul(scale, (x, y, half_x, half_y))
     slopes = vec.broadcast_all(records, row + layout.OUTLINE_SLOPES, (0,) * 6)
-    seen = may_show(slopes, vec.sqrt(reach), vec.broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
-    return vec.select(seen, reach, vec.add(reach, 1.0))
+    is_seen = may_show(slopes, vec.sqrt(reach), vec.broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
+    return vec.select(is_seen, reach, vec.add(reach, 1.0))
 
 
 @inline

@@ -35,11 +35,11 @@ class Arena:
 
     def take(self, name: str, size: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
         """Take a flat array, which shares its memory with earlier ones of this name."""
-        wanted = size * np.dtype(dtype).itemsize
+        length = size * np.dtype(dtype).itemsize
         buffer = self._bytes.get(name)
-        if buffer is None or len(buffer) < wanted:
-            buffer = self._bytes[name] = aligned(int(wanted * _GROWTH))
-        return buffer[:wanted].view(dtype)
+        if buffer is None or len(buffer) < length:
+            buffer = self._bytes[name] = aligned(int(length * _GROWTH))
+        return buffer[:length].view(dtype)
 
 
 class ArenaPool:
@@ -70,20 +70,20 @@ class Results:
 
     def take(self, *shape: int) -> npt.NDArray[np.float32]:
         """Take a float32 array with undefined content."""
-        wanted = 4 * math.prod(shape)
+        length = 4 * math.prod(shape)
         buffer = None
         for _ in range(len(self._free)):
             try:
                 candidate = self._free.popleft()
             except IndexError:
                 break
-            if wanted <= len(candidate) <= 2 * wanted:
+            if length <= len(candidate) <= 2 * length:
                 buffer = candidate
                 break
             self._free.append(candidate)
         if buffer is None:
-            buffer = aligned(int(wanted * _GROWTH))
+            buffer = aligned(int(length * _GROWTH))
         # Views of views refer to the first array that does not refer to another: this one, because of the memoryview.
-        array = np.frombuffer(memoryview(buffer)[:wanted], np.float32)
+        array = np.frombuffer(memoryview(buffer)[:length], np.float32)
         weakref.finalize(array, self._free.append, buffer).atexit = False
         return array.reshape(shape)

@@ -135,7 +135,7 @@ def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, 
 
 @inline
 def shortest_axes(scale):
-    """Whether the second, and whether the third axis is the shortest; where neither is, the first. Ties go forwards."""
+    """Masks of where the second, and where the third axis is the shortest; where neither is, the first. Ties go forwards."""
     return vec.less(scale[1], scale[0]), vec.less(scale[2], vec.smaller(scale[0], scale[1]))
 
 
@@ -213,13 +213,15 @@ def may_show(slopes, rim, largest_q, x, y, half_x, half_y):
     q = (vec.fma(q_x, x, vec.fma(q_y, y, 1.0)), q_x, q_y, magnitude)
     end = (vec.sub(largest_q, q[0]), vec.neg(q_x), vec.neg(q_y), vec.add(largest_q, magnitude))
     edge = vec.mul(rim, q)
-    found = vec.both(_reaches_zero(q, half_x, half_y), _reaches_zero(end, half_x, half_y))
+    may_reach = vec.both(_reaches_zero(q, half_x, half_y), _reaches_zero(end, half_x, half_y))
     for side in (u, v):
         size = vec.add(edge[3], side[3])
         over = (vec.sub(edge[0], side[0]), vec.sub(edge[1], side[1]), vec.sub(edge[2], side[2]), size)
         under = (vec.add(edge[0], side[0]), vec.add(edge[1], side[1]), vec.add(edge[2], side[2]), size)
-        found = vec.both(found, vec.both(_reaches_zero(over, half_x, half_y), _reaches_zero(under, half_x, half_y)))
-    return found
+        may_reach = vec.both(
+            may_reach, vec.both(_reaches_zero(over, half_x, half_y), _reaches_zero(under, half_x, half_y))
+        )
+    return may_reach
 
 
 @inline
@@ -229,7 +231,7 @@ def _size(a):
 
 @inline
 def _reaches_zero(function, half_x, half_y):
-    """Whether a linear function is at least 0 anywhere in a box: value in the middle, slopes, and size of its terms."""
+    """True if a linear function is at least 0 anywhere in a box: value in the middle, slopes, and size of its terms."""
     value, slope_x, slope_y, magnitude = function
     most = vec.add(value, vec.fma(_size(slope_x), half_x, vec.mul(_size(slope_y), half_y)))
     return vec.at_least(vec.fma(magnitude, _ROUNDING, most), 0.0)

@@ -40,7 +40,7 @@ class TooManyPairsError(Exception):
 
 
 class Primitive(NamedTuple):
-    """What differs between 3D Gaussians and surfels: kernels, columns of the tables, and outputs.
+    """Kernels, columns of the tables, and outputs of 3D Gaussians or of surfels.
 
     Attributes:
         project, sweep_forward, sweep_backward, gather, project_backward: The kernels, in their order.
@@ -69,16 +69,16 @@ class Primitive(NamedTuple):
     feature_images: tuple[str, ...]
 
 
-def _gaussian_outputs(wanted: Collection[str]) -> layout.Outputs:
+def _gaussian_outputs(images: Collection[str]) -> layout.Outputs:
     """The channels up to the last one wanted, and the median."""
-    channels = 8 if "normals" in wanted else 5 if "inverse_depth" in wanted else 4 if "depth" in wanted else 3
-    return layout.Outputs(layout.count(channels), median=layout.count("median" in wanted))
+    channels = 8 if "normals" in images else 5 if "inverse_depth" in images else 4 if "depth" in images else 3
+    return layout.Outputs(layout.count(channels), median=layout.count("median" in images))
 
 
-def _surfel_outputs(wanted: Collection[str]) -> layout.Outputs:
+def _surfel_outputs(images: Collection[str]) -> layout.Outputs:
     """Colour, normals where wanted, and the measures wanted."""
-    measures = {name: layout.count(name in wanted) for name in ("depth", "inverse_depth", "median", "distortion")}
-    return layout.Outputs(layout.count(3), layout.count(3 * ("normals" in wanted)), **measures)
+    measures = {name: layout.count(name in images) for name in ("depth", "inverse_depth", "median", "distortion")}
+    return layout.Outputs(layout.count(3), layout.count(3 * ("normals" in images)), **measures)
 
 
 GAUSSIANS = Primitive(
@@ -250,11 +250,11 @@ class Pipeline:
         with workers() as run:
             for first in range(0, features.shape[1], width):
                 sweep = first // width
-                given = self._feature_images()
-                self._part_into(of_features[..., first : first + width], given)
+                of_images = self._feature_images()
+                self._part_into(of_features[..., first : first + width], of_images)
                 layer = self._features_layer(features, sweep)
                 composited = self._feature_composited[sweep * size : (sweep + 1) * size]
-                self._sweep_backward(run, layer, composited, given, part, of_part)
+                self._sweep_backward(run, layer, composited, of_images, part, of_part)
                 rows = part.reshape(filled, layout.ROW)
                 total[:, :first_sum] += rows[:, :first_sum]
                 of_means2d += of_part
@@ -285,16 +285,16 @@ class Pipeline:
         Returns those with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
         filled, outputs = self._filled, self._outputs
-        given = self._arena.take("given_means2d", 2 * filled)
-        given[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
-        given[2 * self._count :] = 0.0
+        padded = self._arena.take("padded_means2d", 2 * filled)
+        padded[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
+        padded[2 * self._count :] = 0.0
         if gaussian_sums is None:
             gaussian_sums = np.zeros(self._sums_size(outputs, filled), np.float32)
         of_pose = self._arena.take("of_pose", layout.ROW * -(-self._count // layout.PARCEL))
         results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self._primitive.scales, 1, 3)))
         flat = layout.Parameters(*(result.reshape(-1) for result in results))
         channels = len(outputs.channels) + len(outputs.normals)
-        tables = (channels, self._projections, gaussian_sums, given, flat, of_pose)
+        tables = (channels, self._projections, gaussian_sums, padded, flat, of_pose)
         with workers() as run:
             run(self._primitive.project_backward, self._count, gaussians, self._tail, self._view, *tables)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
@@ -337,12 +337,12 @@ class Pipeline:
 
     def _part_into(self, channels: Array, images: layout.Images) -> None:
         """Split at most as many channels into images; the inverse of :meth:`_joined`. [H, W, C]"""
-        size, taken = (self._grid.height, self._grid.width, -1), 0
+        size, first = (self._grid.height, self._grid.width, -1), 0
         for name in self._primitive.feature_images:
             image = getattr(images, name).reshape(size)
-            part = channels[..., taken : taken + image.shape[2]]
+            part = channels[..., first : first + image.shape[2]]
             image[..., : part.shape[2]] = part
-            taken += image.shape[2]
+            first += image.shape[2]
 
     # --- bins ---------------------------------------------------------------------------------------------------------
 

@@ -144,7 +144,7 @@ def store_extents(group, shown, columns, rows, projections):
 
 @inline
 def are_usable(mean, squared_norm, scale, opacity, color):
-    """Whether all numbers are finite, scales are not negative, and the quaternion has a direction."""
+    """True if all numbers are finite, scales are not negative, and the quaternion has a direction."""
     # 0 times infinity or NaN is NaN.
     none = (0.0, 0.0, 0.0)
     finite = vec.dot(mean, none, vec.dot(scale, none, vec.dot(color, none, vec.mul(opacity, 0.0))))
@@ -251,8 +251,8 @@ def _project_surfels(first, last, source, surfels, view, _normals, projections, 
         size_x, size_y = vec.mul(0.5, vec.sub(right_edge, 0.5)), vec.mul(0.5, vec.sub(bottom_edge, 0.5))
         middle = vec.mul(pixel_scale, (vec.sub(vec.add(size_x, 0.5), mean_x), vec.sub(vec.add(size_y, 0.5), mean_y)))
         size_x, size_y = vec.mul(pixel_scale, (size_x, size_y))
-        seen = may_show(slopes, vec.sqrt(level), largest_q, middle[0], middle[1], size_x, size_y)
-        absent = vec.select(vec.either(seen, vec.at_most(in_circle, level)), 0.0, vec.select(crosses, 1.0, 0.0))
+        is_seen = may_show(slopes, vec.sqrt(level), largest_q, middle[0], middle[1], size_x, size_y)
+        absent = vec.select(vec.either(is_seen, vec.at_most(in_circle, level)), 0.0, vec.select(crosses, 1.0, 0.0))
         columns = vec.select(vec.greater(absent, 0.0), (0.0, -1.0), columns)
         more, more_tiles = store_extents(group, shown, columns, rows, projections)
         drawn, tiles = drawn + more, tiles + more_tiles

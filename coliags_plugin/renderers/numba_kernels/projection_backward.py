@@ -306,9 +306,13 @@ def _project_surfels_backward(
         if channels > 3:
             # In camera axes, turned by its sign.
             further = layout.ROW * layout.GROUP * len(drawn) + row  # the last sum is behind the rows of sixteen
-            given = (sums[channel + 3], sums[channel + 4], vec.load(surfel_sums, further))
-            given = vec.mul(vec.select(vec.greater(at.height, 0.0), -1.0, 1.0), given)
-            of_normal = vec.fma(given[0], right, vec.fma(given[1], down, vec.mul(vec.widen(given[2]), forward)))
+            of_camera_normal = (sums[channel + 3], sums[channel + 4], vec.load(surfel_sums, further))
+            of_camera_normal = vec.mul(vec.select(vec.greater(at.height, 0.0), -1.0, 1.0), of_camera_normal)
+            of_normal = vec.fma(
+                of_camera_normal[0],
+                right,
+                vec.fma(of_camera_normal[1], down, vec.mul(vec.widen(of_camera_normal[2]), forward)),
+            )
 
         of_right = _turned(of_right, right, at, of_x, of_first, of_second, of_normal, shown)
         of_down = _turned(of_down, down, at, of_y, of_first, of_second, of_normal, shown)

@@ -122,8 +122,8 @@ def _prepare_gaussians(at, source, outputs, view, composited, state):
     alpha, sums = vec.load(composited, source), vec.load_all(composited, source + 16, outputs.channels)
     depth = vec.load(composited, source + 64) if len(outputs.channels) > 3 else vec.splat(0.0)
     of_alpha = _prepare_alpha(at, alpha, depth, view, state)
-    given = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
-    vec.store(state, at + _BEHIND, vec.dot(given, sums, vec.mul(of_alpha, alpha)))
+    of_channels = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
+    vec.store(state, at + _BEHIND, vec.dot(of_channels, sums, vec.mul(of_alpha, alpha)))
 
 
 @inline
@@ -149,14 +149,14 @@ def _sweep_gaussian(row, blocks, alive, rows, outputs, view, state, target, furt
         alpha = vec.smaller(free_alpha, vec.broadcast(view, layout.VIEW_ALPHA_MAX))
         alpha = vec.select(vec.at_least(log2_alpha, vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)), alpha, 0.0)
         drawn, _, _, weight = _blend(at, alpha, view, state)
-        given = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
+        of_channels = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
         colors = vec.broadcast_all(rows, row + layout.CHANNELS, outputs.channels)
-        shown = vec.mul(weight, vec.dot(colors, given, vec.load(state, at + tiles.ALPHA)))
+        shown = vec.mul(weight, vec.dot(colors, of_channels, vec.load(state, at + tiles.ALPHA)))
         v = _of_log_alpha(at, shown, alpha, free_alpha, drawn, view, state)
         v_e, v_f = vec.mul(v, e), vec.mul(v, f)
         sum_v, sum_e, sum_f = vec.add(sum_v, v), vec.add(sum_e, v_e), vec.add(sum_f, v_f)
         sum_ee, sum_ef, sum_ff = vec.fma(v_e, e, sum_ee), vec.fma(v_e, f, sum_ef), vec.fma(v_f, f, sum_ff)
-        sums = vec.fma(weight, given, sums)
+        sums = vec.fma(weight, of_channels, sums)
         if not vec.bits(drawn):
             alive &= ~(1 << block)
     vec.store(entry_sums, target, vec.lane_sums((sum_v, sum_e, sum_f, sum_ee, sum_ef, sum_ff) + sums))
@@ -192,10 +192,10 @@ def _prepare_surfels(at, source, outputs, view, composited, state):
     source += 16 * (1 + len(outputs.channels))
     normals = vec.load_all(composited, source, outputs.normals)
     source += 16 * len(outputs.normals)
-    given = vec.load_all(state, at + tiles.CHANNELS, outputs.channels) + vec.load_all(
+    of_channels = vec.load_all(state, at + tiles.CHANNELS, outputs.channels) + vec.load_all(
         state, at + tiles.NORMALS, outputs.normals
     )
-    behind = vec.dot(given, colors + normals, 0.0)
+    behind = vec.dot(of_channels, colors + normals, 0.0)
     depth = vec.load(composited, source) if len(outputs.depth) > 0 else vec.splat(0.0)
     of_alpha = _prepare_alpha(at, alpha, depth, view, state)
     if len(outputs.depth) > 0:
@@ -235,14 +235,14 @@ def _sweep_surfel(row, blocks, alive, rows, outputs, view, state, target, furthe
         log2_alpha = vec.sub(vec.broadcast(rows, row + layout.SURFEL_LOG2_OPACITY), squared)
         free_alpha = vec.exp2(log2_alpha)
         alpha = vec.smaller(free_alpha, vec.broadcast(view, layout.VIEW_ALPHA_MAX))
-        kept = vec.both(hit, vec.at_least(log2_alpha, vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)))
-        alpha = vec.select(kept, alpha, 0.0)
+        counts = vec.both(hit, vec.at_least(log2_alpha, vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)))
+        alpha = vec.select(counts, alpha, 0.0)
         drawn, transmittance, behind, weight = _blend(at, alpha, view, state)
-        given = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
-        given = given + vec.load_all(state, at + tiles.NORMALS, outputs.normals)
+        of_channels = vec.load_all(state, at + tiles.CHANNELS, outputs.channels)
+        of_channels = of_channels + vec.load_all(state, at + tiles.NORMALS, outputs.normals)
         colors = vec.broadcast_all(rows, row + layout.SURFEL_CHANNELS, outputs.channels)
         colors = colors + vec.broadcast_all(rows, row + layout.SURFEL_CHANNELS + 3, outputs.normals)
-        shown = vec.dot(colors, given, vec.load(state, at + tiles.ALPHA))
+        shown = vec.dot(colors, of_channels, vec.load(state, at + tiles.ALPHA))
         # Derivative with respect to ln(z), of the weighted sums over the weight, and of the median.
         of_log_z, of_median = zero, zero
         z = vec.mul(vec.broadcast(rows, row + layout.SURFEL_DEPTH), inverse_q)
@@ -270,7 +270,7 @@ def _sweep_surfel(row, blocks, alive, rows, outputs, view, state, target, furthe
         sum_ee, sum_ef, sum_ff = vec.fma(v_e, e, sum_ee), vec.fma(v_e, f, sum_ef), vec.fma(v_f, f, sum_ff)
         sum_c, sum_ce, sum_cf = vec.add(sum_c, c), vec.fma(c, e, sum_ce), vec.fma(c, f, sum_cf)
         sum_dx, sum_dy = vec.fma(by_filter, d_x, sum_dx), vec.fma(by_filter, d_y, sum_dy)
-        sums = vec.fma(weight, given, sums)
+        sums = vec.fma(weight, of_channels, sums)
         if not vec.bits(drawn):
             alive &= ~(1 << block)
     vec.store_lane_sums(

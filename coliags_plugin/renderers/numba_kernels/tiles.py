@@ -87,7 +87,7 @@ def fetch_gaussians(first, last, alive, corner_x, corner_y, projections, view, c
 
 @part
 def fetch_surfels(first, last, alive, corner_x, corner_y, projections, view, cells, rows, blocks):
-    """As :func:`fetch_gaussians`."""
+    """Fetch the rows of surfels: as :func:`fetch_gaussians`."""
     records, remainders = projections.records, projections.remainders
     scale, near = vec.number(view, layout.VIEW_PIXEL_SCALE), vec.number(view, layout.VIEW_NEAR)
     middle_x, middle_y = np.float32(corner_x + layout.TILE // 2), np.float32(corner_y + layout.TILE // 2)

@@ -35,11 +35,11 @@ def find_pairs(
     upper, lower = tl.load(boxes + 4 * row + 2, here, 0), tl.load(boxes + 4 * row + 3, here, -1)
     across = last - first + 1
     area = across * (lower - upper + 1)
-    found = tl.zeros([BLOCK], tl.int32)
+    pair_count = tl.zeros([BLOCK], tl.int32)
     begin = tl.zeros([BLOCK], tl.int64)
     if EMIT:
-        found_before = tl.load(counts + row, here, 0)
-        begin = tl.load(ends + place, here, 0) - found_before
+        counted = tl.load(counts + row, here, 0)
+        begin = tl.load(ends + place, here, 0) - counted
     column, tile_row = first, upper
     step = 0
     most = tl.max(area)
@@ -52,13 +52,13 @@ def find_pairs(
         hit = (step < area) & ((nearest <= rim) | (out_x * out_x + out_y * out_y <= squared_radius))
         if EMIT:
             # Counted by the same numbers, but maybe not rounded alike: never write more pairs than were counted.
-            hit = hit & (found < found_before)
-            tl.store(gaussian + begin + found, row.to(tl.int32), hit)
-            tl.store(tiles + begin + found, tile_row * columns + column, hit)
-        found += hit.to(tl.int32)
+            hit = hit & (pair_count < counted)
+            tl.store(gaussian + begin + pair_count, row.to(tl.int32), hit)
+            tl.store(tiles + begin + pair_count, tile_row * columns + column, hit)
+        pair_count += hit.to(tl.int32)
         ends_row = column == last
         tile_row += ends_row.to(tl.int32)
         column = tl.where(ends_row, first, column + 1)
         step += 1
     if not EMIT:
-        tl.store(counts + row, found, here)
+        tl.store(counts + row, pair_count, here)

@@ -48,8 +48,8 @@ def forward(
         rows = table + index * stride
         _, _, _, _, _, _, _, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)
-        wanted = here[:, None] & (channel < channels)[None, :]
-        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        is_channel = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], is_channel, 0.0)
         sums += tl.dot(tl.trans(features), weights, input_precision="ieee")
         if WITH_MEDIANS:
             crossing = crosses_half(behind, weights, before, RANKS)
@@ -86,10 +86,10 @@ def backward(
         rows, of_rows = table + index * stride, of_table + index * stride
         u_xx, u_yx, u_yy, dx, dy, along, across, alphas = _at_pixels(rows, here, x, y, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)
-        wanted = here[:, None] & (channel < channels)[None, :]
-        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        is_channel = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], is_channel, 0.0)
         of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")
-        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, wanted, sem="relaxed")
+        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, is_channel, sem="relaxed")
         gained = tl.dot(features, of_sums, input_precision="ieee") * weights
         of_logs = of_log_alphas(gained, hidden, alphas, weights, alpha_max)
         hidden -= tl.sum(gained, axis=0)

@@ -165,7 +165,7 @@ def store_pose_sums(of_pose, right, down, forward, center):
 
 @triton.jit
 def in_camera(mean, axes, near_plane, here):
-    """Whether beyond the near plane; offset from the camera in world axes and in its own, (0, 0, 1) where not."""
+    """Mask of what is beyond the near plane; offset from the camera in world and in its axes, (0, 0, 1) where not."""
     right, down, forward, center = axes
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     offset = plus(mean, times(-1.0, center))

@@ -46,11 +46,11 @@ def place_surfels(
     gaussians: Gaussians, camera: Camera, with_normals: bool, cuts: CutSettings, grid: TileGrid
 ) -> Placed:
     """Project surfels and bin them: :class:`~coliags_plugin.renderers.stages.Stages`."""
-    given = _given(gaussians, camera)
-    centers = _Centers.apply(given[0], given[4], camera)  # type: ignore[no-untyped-call]
+    inputs = _given(gaussians, camera)
+    centers = _Centers.apply(inputs[0], inputs[4], camera)  # type: ignore[no-untyped-call]
     means2d = centers.clone()
     shapes, log_opacities, normals, depths, radii, outlines, boxes = _Surfels.apply(  # type: ignore[no-untyped-call]
-        means2d, *given, camera, cuts, grid
+        means2d, *inputs, camera, cuts, grid
     )
     pairs = _pairs(depths, outlines, boxes, grid)
     return Placed(means2d, (means2d, shapes, centers, log_opacities[:, None]), depths, normals, radii, pairs)
@@ -117,8 +117,8 @@ class _Gaussians(torch.autograd.Function):
         *tables, whitenings, boxes = ctx.saved_tensors
         gaussians = Tables(*tables)
         of_gaussians = Tables(*[*map(torch.empty_like, tables[:4]), _pose_sums(gaussians.means)])
-        given = (of_means2d, of_whitenings, of_depths, of_log_opacities, of_normals)
-        of_projected = Projected(*_contiguous(*given, otherwise=gaussians.means))
+        gradients = (of_means2d, of_whitenings, of_depths, of_log_opacities, of_normals)
+        of_projected = Projected(*_contiguous(*gradients, otherwise=gaussians.means))
         projection.backward[_programs(len(gaussians.means))](
             *(gaussians, whitenings, boxes, of_projected, of_gaussians, ctx.view, ctx.slope_limits),
             WITH_NORMALS=ctx.with_normals,
@@ -188,8 +188,8 @@ class _Surfels(torch.autograd.Function):
         of_surfels = Tables(*[*map(torch.empty_like, tables[:4]), _pose_sums(surfels.means, torch.float64)])
         of_means2d = surfels.means.new_empty(len(surfels.means), 2)
         # Centres and depths have gradients of their own.
-        given = (None, of_shapes, None, of_log_opacities, of_normals)
-        of_projected = Projected(*_contiguous(*given, otherwise=surfels.means))
+        gradients = (None, of_shapes, None, of_log_opacities, of_normals)
+        of_projected = Projected(*_contiguous(*gradients, otherwise=surfels.means))
         surfel_projection.backward[_programs(len(of_means2d))](
             surfels, boxes, of_projected, of_means2d, of_surfels, ctx.view, **_OPTIONS
         )
@@ -241,14 +241,14 @@ def _pairs(
     counts = torch.empty(count, dtype=torch.int32, device=device)
     order = depths.argsort(stable=True)
     options = {"SIZE": grid.size, **_OPTIONS}
-    launch, given = find_pairs[_programs(count)], (outlines, boxes, order, counts)
+    launch, tables = find_pairs[_programs(count)], (outlines, boxes, order, counts)
     unused = (counts, counts, counts)
-    launch(*given, *unused, count, grid.columns, EMIT=False, **options)
+    launch(*tables, *unused, count, grid.columns, EMIT=False, **options)
     ends = counts[order].cumsum(0)
     total = int(ends[-1]) if count else 0
     gaussian = torch.zeros(total, dtype=torch.int32, device=device)
     tiles = torch.full_like(gaussian, grid.columns * grid.rows)
-    launch(*given, ends, gaussian, tiles, count, grid.columns, EMIT=True, **options)
+    launch(*tables, ends, gaussian, tiles, count, grid.columns, EMIT=True, **options)
     tile, place = torch.sort(tiles, stable=True)
     of_tiles = torch.arange(grid.columns * grid.rows + 1, dtype=tile.dtype, device=device)
     return TilePairs(gaussian=gaussian[place], tile=tile, starts=torch.searchsorted(tile, of_tiles))

@@ -55,7 +55,7 @@ def _project(gaussians, axes, row, here, view, slope_limits):
 
 @triton.jit
 def _shortest(columns, scale, offset):
-    """Whether the second or third axis is the shortest; that axis in the world, and its sign towards the camera."""
+    """Masks of where the second or third axis is the shortest; the shortest in the world, its sign to the camera."""
     second, third = scale[1] < scale[0], scale[2] < tl.minimum(scale[0], scale[1])
     axis = chosen(third, columns[2], chosen(second, columns[1], columns[0]))
     return second, third, axis, tl.where(dot(axis, offset) > 0.0, -1.0, 1.0)

@@ -73,8 +73,8 @@ def forward(
         _, _, _, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
         alphas, _, _, _ = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)
-        wanted = here[:, None] & (channel < channels)[None, :]
-        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        is_channel = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], is_channel, 0.0)
         sums += tl.dot(tl.trans(features), weights, input_precision="ieee")
         if WITH_DEPTHS:
             inverse = 1.0 / depths
@@ -143,10 +143,10 @@ def backward(
         dx, dy, inverse_w, u, v, depths, hit = _hits(rows, here, x, y, near_plane)
         alphas, from_x, from_y, on_disc = _alphas(rows, here, x, y, u, v, hit, sharpness, alpha_min, alpha_max)
         behind, weights = blend(alphas, before, transmittance_min)
-        wanted = here[:, None] & (channel < channels)[None, :]
-        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], wanted, 0.0)
+        is_channel = here[:, None] & (channel < channels)[None, :]
+        features = tl.load(rows[:, None] + OWN_COLUMNS + channel[None, :], is_channel, 0.0)
         of_features = tl.dot(weights, tl.trans(of_sums), input_precision="ieee")
-        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, wanted, sem="relaxed")
+        tl.atomic_add(of_rows[:, None] + OWN_COLUMNS + channel[None, :], of_features, is_channel, sem="relaxed")
         gained = tl.dot(features, of_sums, input_precision="ieee")
         of_offset = tl.zeros_like(weights)
         if WITH_DEPTHS:

@@ -39,7 +39,7 @@ def blend(alphas, before, transmittance_min):
 
 @triton.jit
 def crosses_half(behind, weights, before, RANKS: tl.constexpr):
-    """Whether a pair brings the transmittance to one half or less. [R, P]"""
+    """Mask of the pairs that bring the transmittance to one half or less. [R, P]"""
     open_ranks = tl.sum((behind > 0.5).to(tl.int32), axis=0)
     at = tl.arange(0, RANKS)[:, None] == open_ranks[None, :]
     return at & (before > 0.5)[None, :] & (weights > 0.0)
