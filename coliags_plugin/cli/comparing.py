@@ -111,9 +111,9 @@ class ResultsShowCommand:
         blocks: list[Block] = []
         summaries = []
         for result in find_results([self.path]):
-            told = facts(result)
-            blocks += [result.table(), FactList([Fact(name, text) for name, text in told.items()])]
-            summaries.append({**means_summary(result), "facts": told})
+            texts = facts(result)
+            blocks += [result.table(), FactList([Fact(name, text) for name, text in texts.items()])]
+            summaries.append({**means_summary(result), "facts": texts})
         print_summary(terminal_text(blocks), {"results": summaries}, as_json=self.json)
 
 

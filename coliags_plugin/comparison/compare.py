@@ -114,10 +114,12 @@ def run_cells(
     def ended(cell: ComparisonCell, how: str) -> None:
         log.info("[%d/%d] %s: %s", next(numbers), len(cells), cell.title, how)
 
+    def count_done() -> int:
+        return sum(comparison.done(cell) is not None for cell in cells)
+
     def facts(running: Sequence[Job]) -> str:
-        done, failed = sum(comparison.done(cell) is not None for cell in cells), len(comparison.failures)
-        waiting = len(cells) - len(running) - done - failed
-        counts = {"waiting": waiting, "running": len(running), "done": done, "failed": failed}
+        counts = {"running": len(running), "done": count_done(), "failed": len(comparison.failures)}
+        counts = {"waiting": len(cells) - sum(counts.values()), **counts}
         return ", ".join(f"{count} {phase}" for phase, count in counts.items() if count)
 
     jobs = [CellJob(same, comparison, executor, options.device, ended) for same in missing.values()]
@@ -126,9 +128,8 @@ def run_cells(
     try:
         queue.run("compare", facts)
     except KeyboardInterrupt as error:
-        done = sum(comparison.done(cell) is not None for cell in cells)
         raise InterruptedRunError(
-            f"stopped with {done} of {len(cells)} cells done; the same command goes on where it stopped"
+            f"stopped with {count_done()} of {len(cells)} cells done; the same command goes on where it stopped"
         ) from error
 
 

@@ -138,11 +138,11 @@ def _check_same_phantom(source: SceneSource) -> None:
         raise InputError(
             f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
         ) from error
-    wanted = source.phantom_record or {}
-    differing = [key for key in {**wanted, **settings} if settings.get(key, ...) != wanted.get(key, ...)]
+    expected = source.phantom_record or {}
+    differing = [key for key in {**expected, **settings} if settings.get(key, ...) != expected.get(key, ...)]
     if differing:
         differences = ", ".join(
-            f"{key} {settings.get(key, 'missing')!r} instead of {wanted.get(key, 'none')!r}" for key in differing
+            f"{key} {settings.get(key, 'missing')!r} instead of {expected.get(key, 'none')!r}" for key in differing
         )
         raise InputError(
             f"{source.path} is another phantom than the benchmark's: {differences}",

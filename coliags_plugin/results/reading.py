@@ -73,10 +73,10 @@ def find_results(paths: Sequence[Path]) -> list[Result]:
     evaluation leaves, are not looked into, nor are JSON files of other content.
     """
     by_key: dict[str, tuple[Path, Result]] = {}
-    for path in dict.fromkeys(file.resolve() for given in paths for file in _files(given)):
+    for path in dict.fromkeys(file.resolve() for place in paths for file in _files(place)):
         result = read_result(path)
-        other, known = by_key.setdefault(result.key, (path, result))
-        if known.metrics_sha256 != result.metrics_sha256:
+        other, earlier = by_key.setdefault(result.key, (path, result))
+        if earlier.metrics_sha256 != result.metrics_sha256:
             raise InputError(
                 f"{other} and {path} are results of the same run, and their values differ",
                 "each run once",
@@ -91,8 +91,8 @@ def _files(path: Path) -> list[Path]:
         return [path]
     try:
         files = sorted(path.rglob("*.json"))
-        seen = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
-        matches = [file for file in seen if file.is_file() and _MARK in file.read_bytes()]
+        visible = [file for file in files if not any(part.startswith(".") for part in file.relative_to(path).parts)]
+        matches = [file for file in visible if file.is_file() and _MARK in file.read_bytes()]
     except OSError as error:
         raise InputError(f"{error.filename or path} cannot be read: {error.strerror}", "a readable folder") from error
     if not matches:
@@ -112,7 +112,7 @@ VALUE_COLUMNS = (
 def means_summary(result: Result) -> dict[str, Any]:
     """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
     main = result.sets[result.main_set]
-    seen = {f"{name}{SEEN_SUFFIX}" for name in result.metrics}
+    over_seen_pixels = {f"{name}{SEEN_SUFFIX}" for name in result.metrics}
     reasons: dict[str, str] = {}
     for part in reversed(result.sets.values()):
         reasons |= part.reasons
@@ -123,7 +123,7 @@ def means_summary(result: Result) -> dict[str, Any]:
         "step": result.steps,
         "untrained_views": result.provenance.get("untrained_views", {}),
         **{name: result.provenance[name] for name in ("held_out_used", "learned") if name in result.provenance},
-        **{name: main.mean(name) for name in result.metrics if name not in seen},
+        **{name: main.mean(name) for name in result.metrics if name not in over_seen_pixels},
         "reasons": reasons,
         "directions": {name: metric.direction for name, metric in result.metrics.items()},
         "units": {name: metric.unit for name, metric in result.metrics.items()},

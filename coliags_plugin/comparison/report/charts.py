@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def profile_section(study: Study) -> Section:
         f"{_SMALLEST_SHARE:.1%} of the pixels are left out. The light of a scope falls with both."
     )
     charts = {test_set.title: _profile_charts(test_set) for test_set in study.test_sets}
-    figures = [Figures(own, title, study.methods) for title, own in charts.items() if own]
+    figures = [Figures(group, title, study.methods) for title, group in charts.items() if group]
     return Section("Error against distance and angle", [explanation, *figures] if figures else [], screen_only=True)
 
 
@@ -56,16 +57,14 @@ def _profile_charts(test_set: TestSet) -> list[Chart]:
             method: [profile for scene in shared for _, profile in by_scene[scene]]
             for method, by_scene in by_method.items()
         }
-        for title, y_label in (("PSNR", "PSNR [dB]"), ("Depth error", f"RMS depth error [{unit}]")):
+        quantities = {"PSNR": ("PSNR [dB]", math.inf), "Depth error": (f"RMS depth error [{unit}]", _LOG_DEPTH_FROM)}
+        for title, (y_label, log_from) in quantities.items():
             lines = [
                 _profile_line(method, study.methods.index(method), pooled, of_depth=title != "PSNR")
                 for method, pooled in profiles.items()
                 if len({profile.edges for profile in pooled}) == 1
             ]
-            log = title != "PSNR" and _spans(lines, _LOG_DEPTH_FROM)
-            charts.append(
-                Chart(lines, x_label, _log_label(y_label, log), f"{title} against {name}", log_y=log, markers=True)
-            )
+            charts.append(_chart(lines, x_label, y_label, f"{title} against {name}", log_from, markers=True))
     return [chart for chart in charts if chart.has_points]
 
 
@@ -122,8 +121,8 @@ def _training_charts(logs: Sequence[_Log]) -> list[Chart]:
                 for method, style, columns in logs
                 if x in columns and y in columns
             ]
-            log = y == "loss" and _spans(lines, _LOG_LOSS_FROM)
-            charts.append(Chart(lines, x_label, _log_label(y_label, log), title, log_y=log, group=group))
+            log_from = _LOG_LOSS_FROM if y == "loss" else math.inf
+            charts.append(_chart(lines, x_label, y_label, title, log_from, group=group))
     return charts
 
 
@@ -157,11 +156,8 @@ def _frame_chart(test_set: TestSet, scene: str) -> Chart:
     return Chart(lines, "frame", "PSNR [dB]", test_set.title, x_names=names, markers=True)
 
 
-def _log_label(label: str, log: bool) -> str:
-    return f"{label}, log scale" if log else label
-
-
-def _spans(lines: Sequence[Series], ratio: float) -> bool:
-    """Tell whether all values are positive, and the largest is so many times the smallest."""
+def _chart(lines: Sequence[Series], x_label: str, y_label: str, title: str, log_from: float, **options: Any) -> Chart:
+    """A chart whose y axis is logarithmic if all values are positive and span a ratio of ``log_from`` or more."""
     values = [value for line in lines for value in line.y if math.isfinite(value)]
-    return bool(values) and min(values) > 0.0 and max(values) / min(values) >= ratio
+    log = bool(values) and min(values) > 0.0 and max(values) / min(values) >= log_from
+    return Chart(lines, x_label, f"{y_label}, log scale" if log else y_label, title, log_y=log, **options)

@@ -154,9 +154,9 @@ def _metric_cells(
         method: {scene: seeds for scene, seeds in by_scene.items() if scene in scenes}
         for method, by_scene in test_set.values(column.key).items()
     }
-    found = spreads(values).values()
-    over = [each.over_scenes if each.scenes > 1 else each.over_seeds for each in found]
-    cells = ranked_cells([each.mean for each in found], column.unit, column.direction, over)
+    means = spreads(values).values()
+    over = [each.over_scenes if each.scenes > 1 else each.over_seeds for each in means]
+    cells = ranked_cells([each.mean for each in means], column.unit, column.direction, over)
     return [
         replace(cell, stars=stars.get(method, ""), note=_footnote(test_set, column, method, values, scenes))
         for method, cell in zip(test_set.study.methods, cells, strict=True)
@@ -366,9 +366,9 @@ def choose_reference(study: Study, chosen: str | None) -> str:
     if preferred is not None:
         return preferred
     column = metric_columns(study.test_sets[0])[0]
-    found = spreads(study.test_sets[0].values(column.key))
+    by_method = spreads(study.test_sets[0].values(column.key))
     sign = 1.0 if column.direction == "higher" else -1.0
-    means = {method: -np.inf if each.mean is None else sign * each.mean for method, each in found.items()}
+    means = {method: -np.inf if each.mean is None else sign * each.mean for method, each in by_method.items()}
     return max(study.methods, key=means.__getitem__)
 
 

@@ -155,12 +155,11 @@ def _metrics(study: Study, options: ReportOptions, reference: str) -> Section:
 
 
 def _scenes(study: Study, options: ReportOptions) -> Section:
-    sets = study.test_sets if len(study.scenes) > 1 else []
-    columns = [metric_columns(test_set, options.columns) for test_set in sets]
-    tables = {
-        scene: [means_table(one, its, scene) for one, its in zip(sets, columns, strict=True) if scene in one.scenes]
-        for scene in study.scenes
-    }
+    tables: dict[str, list[Block]] = {scene: [] for scene in study.scenes}
+    for test_set in study.test_sets if len(tables) > 1 else ():
+        columns = metric_columns(test_set, options.columns)
+        for scene in test_set.scenes:
+            tables[scene].append(means_table(test_set, columns, scene))
     return Section("Every scene", [Folded(scene, blocks) for scene, blocks in tables.items() if blocks])
 
 

@@ -44,10 +44,11 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
         if len(same) > 1:
             raise InputError(f"{same[0].run or same[0].file} is given twice", "each result once")
     if not runs:
-        where, example = ", ".join(map(str, paths)), missing[0] if missing else None
-        reason = f"; {example.method} on {example.scene}: {example.reason or 'not finished'}" if example else ""
-        seen = f"none of the {len(missing)} cells of {where} has a result" if missing else f"{where} holds no results"
-        raise InputError(seen + reason, "at least one finished cell", "Wait, or run `coliags compare` again")
+        problem = f"{', '.join(map(str, paths))} holds no results"
+        if missing:
+            problem += f" of {len(missing)} cells; {missing[0].method} on {missing[0].scene}: "
+            problem += missing[0].reason or "not finished"
+        raise InputError(problem, "at least one finished cell", "Wait, or run `coliags compare` again")
     runs = disambiguate_labels(runs)
     family = dict.fromkeys([*(run.method for run in runs), *(cell.method for plan in plans for cell in plan.cells)])
     decisions = {plan.decided for plan in plans}
@@ -170,11 +171,11 @@ def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
     for method, covered in places.items():
         others = {place for other, theirs in places.items() if other != method for place in theirs}
         if others and not covered & others:
-            left, right = (
+            names = (
                 ", ".join(sorted(f"{scene} by split '{split}'" for scene, split in each)) for each in (covered, others)
             )
             raise InputError(
-                f"no scene and split in common: {method} has {left}, the other methods have {right}",
+                "no scene and split in common: {} has {}, the other methods have {}".format(method, *names),
                 "methods on the same scenes and splits",
                 "Write one report for each scene, or train on the same split",
             )
@@ -191,12 +192,12 @@ def _refuse_other_data(first: StudyRun, other: StudyRun) -> None:
         for result in results
     ]
     for name in {**frames[0], **frames[1]}:
-        left, right = (each.get(name, ()) for each in frames)
-        if left != right:
-            differing = ", ".join(sorted({*left} ^ {*right})[:2]) or "their order"
+        first_frames, other_frames = (each.get(name, ()) for each in frames)
+        if first_frames != other_frames:
+            differing = ", ".join(sorted({*first_frames} ^ {*other_frames})[:2]) or "their order"
             raise InputError(
-                f"{both} have different frames ({name} has {len(left)} and {len(right)} frames, which differ in "
-                f"{differing})",
+                f"{both} have different frames ({name} has {len(first_frames)} and {len(other_frames)} frames, which "
+                f"differ in {differing})",
                 "the same training and held-out frames for every run",
                 "Train and evaluate both on the same data and split",
             )

@@ -162,8 +162,8 @@ def _read(run: StudyRun, kind: str, frame: _Frame, like: Rgb | None = None) -> A
 
 
 def _depth_error(depth: Map, truth: Map) -> Map:
-    error, known = depth_error(depth, truth)
-    return np.where(known, error, np.nan).astype(np.float32)
+    error, is_known = depth_error(depth, truth)
+    return np.where(is_known, error, np.nan).astype(np.float32)
 
 
 def _reduction(width: int) -> int:

@@ -110,84 +110,63 @@ def scenes_without(method, scene):
     return [r for r in results if (r.method, r.scene.name) != (method, scene)]
 
 
+NO_DEPTH = "the frame has no true depth"
 FLAT = [result_of(m, s, depth=d) for m in ("coliags", "3dgs") for s, d in (("p", 0.5), ("q", 0.5), ("flat", None))]
 SEEDS = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
 RULED = {"coliags": (0.1, 0.1, 0.1, 2.0), "3dgs": (0.2, 0.2, 0.3, 0.2)}
 
 
-@pytest.mark.parametrize(
-    ("results", "table", "metric", "cells"),
-    [
-        (TWO, "summary-test", "psnr", {"coliags": ("32.13", "", 1, ""), "3dgs": ("30.00", "", 2, "")}),
-        (TWO, "summary-test", "ssim", {"coliags": ("0.9000", "", 1, ""), "3dgs": ("0.9000", "", 1, "")}),
-        (TWO, "summary-test", "depth_mse", {"coliags": ("0.250", "", 1, ""), "3dgs": ("1.000", "", 2, "")}),
-        (TWO, "summary-test", "lpips", dict.fromkeys(("coliags", "3dgs"), ("", "", None, f"LPIPS: {NO_LPIPS}"))),
-        (SEEDS, "summary-test", "psnr", {"coliags": ("31.00", "1.00", None, "")}),
-        ([*SEEDS, result_of("coliags", "q")], "scene-cecum-test", "psnr", {"coliags": ("31.00", "1.00", None, "")}),
-        (
-            [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})],
-            "summary-test",
-            "ssim",
-            {"coliags": ("0.7500", "", None, "SSIM: mean over 4 of 5 frames; no reason was recorded")},
-        ),
-        (
-            [result_of("a", "p"), result_of("b", "p"), result_of("b", "q"), result_of("c", "q")],
-            "summary-test",
-            "psnr",
-            dict.fromkeys("abc", ("", "", None, "PSNR: no scene that all methods have")),
-        ),
-        (  # a scene without depth counts for PSNR, and for no depth metric
-            FLAT,
-            "summary-test",
-            "depth_mse",
-            dict.fromkeys(
-                ("coliags", "3dgs"),
-                ("0.250", "0.000", 1, "Depth MSE: not available for flat; the frame has no true depth"),
-            ),
-        ),
-        (
-            FLAT,
-            "scene-flat-test",
-            "depth_mse",
-            dict.fromkeys(("coliags", "3dgs"), ("", "", None, "Depth MSE: the frame has no true depth")),
-        ),
-    ],
-)
+SOME_FRAMES = [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})]
+APART = [result_of("a", "p"), result_of("b", "p"), result_of("b", "q"), result_of("c", "q")]
+#: Results, table, metric, and cells as mean, spread, rank and footnote; cells of all methods where only one is given.
+MEANS = [
+    (TWO, "summary-test", "psnr", ("32.13", "", 1, ""), ("30.00", "", 2, "")),
+    (TWO, "summary-test", "ssim", ("0.9000", "", 1, "")),
+    (TWO, "summary-test", "depth_mse", ("0.250", "", 1, ""), ("1.000", "", 2, "")),
+    (TWO, "summary-test", "lpips", ("", "", None, f"LPIPS: {NO_LPIPS}")),
+    (SEEDS, "summary-test", "psnr", ("31.00", "1.00", None, "")),
+    ([*SEEDS, result_of("coliags", "q")], "scene-cecum-test", "psnr", ("31.00", "1.00", None, "")),
+    (
+        SOME_FRAMES,
+        "summary-test",
+        "ssim",
+        ("0.7500", "", None, "SSIM: mean over 4 of 5 frames; no reason was recorded"),
+    ),
+    (APART, "summary-test", "psnr", ("", "", None, "PSNR: no scene that all methods have")),
+    # A scene without depth counts for PSNR, and for no depth metric.
+    (FLAT, "summary-test", "depth_mse", ("0.250", "0.000", 1, f"Depth MSE: not available for flat; {NO_DEPTH}")),
+    (FLAT, "scene-flat-test", "depth_mse", ("", "", None, f"Depth MSE: {NO_DEPTH}")),
+]
+
+
+@pytest.mark.parametrize(("results", "table", "metric", "cells"), [(*row[:3], row[3:]) for row in MEANS])
 def test_means_of_metrics(study_of, results, table, metric, cells):
-    cells_shown = entries(tables(of(study_of, results))[table], metric)
-    assert {method: (c.text, c.spread, c.rank, c.note) for method, c in cells_shown.items()} == cells
+    shown = [(c.text, c.spread, c.rank, c.note) for c in entries(tables(of(study_of, results))[table], metric).values()]
+    assert shown == (list(cells) if len(cells) > 1 else [*cells] * len(shown))
+
+
+DEPTHS = "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
+BY_FEW = [result_of(m, f"s{i}", depth=depth) for m, depths in RULED.items() for i, depth in enumerate(depths)]
 
 
 @pytest.mark.parametrize(
-    ("results", "notes"),
+    ("results", "note"),
     [
-        (TWO, [f"Not shown, without values: LPIPS: {NO_LPIPS}"]),
+        (TWO, f"Not shown, without values: LPIPS: {NO_LPIPS}"),
+        ([measured("sparse_depth_median", "%", 3.0, NO_TRUTH)], f"Not shown, without values: {DEPTHS}estimated"),
+        (SEEDS, "± standard deviation over seeds"),
+        (BY_FEW, "± standard deviation over scenes"),
+        (scenes_without("3dgs", "scene-5"), "Means over 7 of 8 scenes, without scene-5"),
+        (FLAT, f"{DEPTHS}means over 2 of 3 scenes, without flat"),
         (
-            [measured("sparse_depth_median", "%", 3.0, NO_TRUTH)],
-            ["Not shown, without values: Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: estimated"],
-        ),
-        (SEEDS, ["± standard deviation over seeds"]),
-        (scenes_without("3dgs", "scene-5"), ["Means over 7 of 8 scenes, without scene-5, which not every method has"]),
-        (
-            FLAT,
-            [
-                "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
-                "means over 2 of 3 scenes, without flat, which not every method has"
-            ],
-        ),
-        (
-            [result_of(m, f"s{i}", depth=depth) for m, depths in RULED.items() for i, depth in enumerate(depths)],
-            [
-                "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags "
-                "(0.0100)",
-                "± standard deviation over scenes",
-            ],
+            BY_FEW,
+            "Depth MSE: few scenes rule the mean, which is more than twice the median over scenes, of coliags (0.01",
         ),
     ],
 )
-def test_notes_below_the_means(study_of, results, notes):
+def test_notes_below_the_means(study_of, results, note):
     lines = tables(of(study_of, results))["summary-test"].notes
-    assert all(any(line.startswith(note) for line in lines) for note in notes), lines
+    assert any(line.startswith(note) for line in lines), lines
 
 
 def test_the_summary_of_many_scenes_is_the_mean_over_those_that_all_have(study_of):
@@ -224,9 +203,7 @@ def test_reference(study_of):
 @pytest.mark.parametrize(
     ("scenes", "rivals", "text"),
     [
-        (5, 2, "No test is run: 5 scenes cannot tell methods apart. The unit is the scene, not the frame, and of "
-               "5 differences the two-sided Wilcoxon test cannot give less than p = .0625; tests are run from 6 scenes "
-               "on (p = .0312)."),
+        (5, 2, "cannot give less than p = .0625; tests are run from 6 scenes on (p = .0312)."),
         (1, 1, "No test is run: 1 scene cannot tell"),
         (6, 1, "no p below .0312, or .0312 after Holm's adjustment for 1 rival: every"),
         (6, 2, "no p below .0312, or .0625 after Holm's adjustment for 2 rivals: every"),
@@ -294,74 +271,42 @@ def transparent(share):
     return result.model_copy(update={"sets": sets})
 
 
-OURS = result_of("coliags", software={"code": "c1"})
+OURS, THEIRS = (result_of(method, software={"code": "c1"}) for method in ("coliags", "3dgs"))
+#: A rival of other code, steps and data; and one scene trained and evaluated by other code, and one resumed with it.
+OTHER = result_of("3dgs", steps=80, software={"code": "c2"}, data={"calibration": "x"})
+CODES = [
+    coded("p", "c1", code="c1"),
+    coded("q", "c2", code="c1"),
+    coded("r", "c2", code="c1", code_changes=[{"at_step": 3, "code": "c2"}]),
+]
 HELD_OUT = {"depth": ["0004", "0012"], "points": None}
+MOVED = changed(OURS, untrained_views={"poses": "poses are moved"})
+#: Results, and a part of each caution on them.
+CAUTIONS = {
+    "code, steps and data": ([OURS, OTHER], "code: c1: coliags; c2: 3dgs.", "steps of training: 40: coliags; 80: 3dgs.",
+                             "different data, see Provenance: calibration."),
+    "nothing": ([OURS, THEIRS],),
+    "codes of one method": (CODES, "code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
+                                   "c1, then c2, evaluated by c2: coliags (1 of 3)."),
+    "held-out frames used": ([changed(each, held_out_used=HELD_OUT) for each in (OURS, THEIRS)],
+                             "cecum, split every-8th: its depth comes from images of 2 held-out frames too",
+                             "cecum, split every-8th: its points may come from images of held-out frames"),
+    "seeds": ([*(result_of("coliags", seed=seed) for seed in range(2)), result_of("3dgs")],
+              "different seeds on cecum (coliags: 0, 1; 3dgs: 0); a mean"),
+    "sizes": ([result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))],
+              "image size: 16 x 12 px: a (1 of 2), b (1 of 2); 32 x 24 px: a (1 of 2), b (1 of 2)."),
+    "untrained views": ([MOVED, THEIRS], "coliags, poses: poses are moved."),
+    "untrained views of all methods": ([MOVED],),
+    "transparent pixels": ([transparent(0.1234)], *(f"cecum, set {name}: 12.3 % of the pixels" for name in FRAMES)),
+    "few transparent pixels": ([transparent(0.01)],),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("results", "texts"),
-    [
-        (
-            [OURS, result_of("3dgs", steps=80, software={"code": "c2", "git": "def5678"}, data={"calibration": "x"})],
-            [
-                "The results differ in code: c1: coliags; c2: 3dgs.",
-                "The results differ in steps of training: 40: coliags; 80: 3dgs.",
-                "Runs of one scene record different data, see Provenance: calibration.",
-            ],
-        ),
-        ([OURS, result_of("3dgs", software={"code": "c1", "git": "def5678"})], []),
-        (  # trained and evaluated by other code, or resumed
-            [
-                coded("p", "c1", code="c1"),
-                coded("q", "c2", code="c1"),
-                coded("r", "c2", code="c1", code_changes=[{"at_step": 3, "code": "c2"}]),
-            ],
-            [
-                "The results differ in code: c1: coliags (1 of 3); c1, evaluated by c2: coliags (1 of 3); "
-                "c1, then c2, evaluated by c2: coliags (1 of 3)."
-            ],
-        ),
-        (
-            [changed(result_of(method), held_out_used=HELD_OUT) for method in ("coliags", "3dgs")],
-            [
-                "cecum, split every-8th: its depth comes from images of 2 held-out frames too, whose scores are too "
-                "good for that.",
-                "cecum, split every-8th: its points may come from images of held-out frames, as it is not recorded "
-                "which it was made from.",
-            ],
-        ),
-        (
-            [*(result_of("coliags", seed=seed) for seed in range(2)), result_of("3dgs")],
-            [
-                "The methods were trained with different seeds on cecum (coliags: 0, 1; 3dgs: 0); a mean over more "
-                "seeds varies less."
-            ],
-        ),
-        (
-            [result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))],
-            [
-                "The results differ in image size: 16 x 12 px: a (1 of 2), b (1 of 2); "
-                "32 x 24 px: a (1 of 2), b (1 of 2)."
-            ],
-        ),
-        (
-            [changed(OURS, untrained_views={"poses": "poses are moved"}), result_of("3dgs", software={"code": "c1"})],
-            ["coliags, poses: poses are moved."],
-        ),
-        ([changed(OURS, untrained_views={"poses": "poses are moved"})], []),
-        (
-            [transparent(0.1234)],
-            [
-                f"coliags on cecum, set {name}: 12.3 % of the pixels have alpha below 0.5: their depth, hatched, means "
-                "little."
-                for name in FRAMES
-            ],
-        ),
-        ([transparent(0.01)], []),
-    ],
-)
-def test_cautions(study_of, results, texts):
-    assert of(study_of, results).cautions == texts
+@pytest.mark.parametrize("of_what", CAUTIONS)
+def test_cautions(study_of, of_what):
+    results, *parts = CAUTIONS[of_what]
+    cautions = of(study_of, results).cautions
+    assert len(cautions) == len(parts) and all(map(str.__contains__, cautions, parts)), cautions
 
 
 def test_cells_without_a_result(tmp_path, study_of):
