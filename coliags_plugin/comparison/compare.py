@@ -240,7 +240,7 @@ def _states(cells: Sequence[ComparisonCell], comparison: ComparisonFolder) -> Di
     rows: list[dict[str, Value]] = []
     keys: set[str] = set()
     for cell in cells:
-        key, step, changed = "" if cell.keys is None else cell.keys.result, 0, ""
+        key, step, changed = "" if cell.fingerprint is None else cell.planned.key, 0, ""
         if comparison.done(cell) is not None:
             state = "done"
         elif key in keys:

@@ -120,10 +120,10 @@ class ComparisonFolder:
             )
         scenes = {
             cell.scene.name: PlannedScene(
-                phantom=cell.scene.phantom_record, fingerprint=cell.keys.fingerprint, package_version=__version__
+                phantom=cell.scene.phantom_record, fingerprint=cell.fingerprint, package_version=__version__
             )
             for cell in cells
-            if cell.keys is not None
+            if cell.fingerprint is not None
         }
         plan = ComparisonPlan(
             steps=request.options.steps,
@@ -157,14 +157,14 @@ class ComparisonFolder:
 
     def done(self, cell: ComparisonCell) -> Result | None:
         """The result of a cell; under another name where another method is the same; None where it is not done."""
-        if cell.keys is None:
+        if cell.fingerprint is None:
             return None
-        result = self._by_path.get(self.path / cell.planned.result)
-        return result if result is not None and result.key == cell.keys.result else self._by_key.get(cell.keys.result)
+        result, key = self._by_path.get(self.path / cell.planned.result), cell.planned.key
+        return result if result is not None and result.key == key else self._by_key.get(key)
 
     def changes(self, cell: ComparisonCell) -> str:
         """Reasons why a cell's earlier result is out of date, for instance ``code, data``; empty without one."""
-        if cell.keys is None:
+        if cell.fingerprint is None:
             return ""
         place, _, _ = str(self.path / cell.planned.result).rpartition("-")  # without the key
         former = [each for path, each in self._by_path.items() if str(path).rpartition("-")[0] == place]
@@ -174,7 +174,7 @@ class ComparisonFolder:
         changed = {
             "code": all(each.software.get("code") != code_key() for each in former),
             "method": all(training_config(each.config) != training_config(cell.config.model_dump()) for each in former),
-            "data": all(each.scene.fingerprint != cell.keys.fingerprint for each in former),
+            "data": all(each.scene.fingerprint != cell.fingerprint for each in former),
         }
         return ", ".join(name for name, differs in changed.items() if differs) or "protocol, or how it was run"
 

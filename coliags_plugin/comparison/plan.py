@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 from coliags_plugin.comparison.named_files import Variant
@@ -24,15 +25,6 @@ RecordedFingerprint = Callable[[SceneSource], str | None]
 
 
 @dataclass(frozen=True)
-class CellKeys:
-    """Hashes that identify a cell's scene, run and result; see :mod:`coliags_plugin.results.hashing`."""
-
-    fingerprint: str
-    training: str
-    result: str
-
-
-@dataclass(frozen=True)
 class ComparisonCell:
     """One run of the comparison and its evaluation."""
 
@@ -43,7 +35,7 @@ class ComparisonCell:
     protocol: str
     overrides: tuple[str, ...]  # of the scene, the split, the variant and the comparison
     config: MethodConfig
-    keys: CellKeys | None  # None while the scene, a phantom, is not there
+    fingerprint: str | None  # of the scene's files; None while the scene, a phantom, is not there
 
     @property
     def steps(self) -> int:
@@ -55,20 +47,26 @@ class ComparisonCell:
         """Scene, method and seed, for messages."""
         return f"{self.scene_label} {self.variant.name} seed {self.seed}"
 
-    @property
+    @cached_property
     def planned(self) -> PlannedCell:
-        """Names, key and places (``SCENE/METHOD/sSEED-KEY``) of a cell whose scene is there."""
-        if self.keys is None:
+        """Names, key and places (``SCENE/METHOD/sSEED-KEY``) of a cell whose scene is there.
+
+        Keys are those of :mod:`coliags_plugin.results.hashing`.
+        """
+        if self.fingerprint is None:
             raise ValueError(f"{self.title}: the scene is not there, so that it has no key")
+        config, version = self.config.model_dump(), registry.protocols.get(self.protocol).version
+        run = training_key(config, self.fingerprint, self.seed, code_key())
+        result = result_key(config, self.fingerprint, self.seed, code_key(), self.protocol, version)
         place = f"{self.scene_label}/{self.variant.name.replace('/', '-')}/s{self.seed}"
         return PlannedCell(
             scene=self.scene_label,
             method=self.variant.name,
             seed=self.seed,
             protocol=self.protocol,
-            key=self.keys.result,
-            run=f"{RUNS}/{place}-{self.keys.training[:_SHORT]}",
-            result=f"{RESULTS}/{place}-{self.keys.result[:_SHORT]}.json",
+            key=result,
+            run=f"{RUNS}/{place}-{run[:_SHORT]}",
+            result=f"{RESULTS}/{place}-{result[:_SHORT]}.json",
         )
 
 
@@ -83,8 +81,7 @@ class Request:
 
 def make_cells(request: Request, recorded: RecordedFingerprint = lambda scene: None) -> list[ComparisonCell]:
     """All cells, those of one seed together, and within it those of one scene."""
-    options, seeds = request.options, range(request.options.seeds)
-    version = registry.protocols.get(options.protocol).version
+    options = request.options
     steps = () if options.steps is None else (f"schedule.steps={options.steps}",)
     fingerprints: dict[str, str | None] = {}  # each computed once for each way of reading a scene
     cells: list[ComparisonCell] = []
@@ -97,18 +94,15 @@ def make_cells(request: Request, recorded: RecordedFingerprint = lambda scene: N
             config = _config(scene, variant.method, overrides)
             usual, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
             label = scene.name if used in (None, usual) else f"{scene.name}-{used}"
-            reader, plain = config.datamanager, config.model_dump()
+            reader = config.datamanager
             way = f"{scene.name} {reader.name} {reader.settings.model_dump_json()}"
             if way not in fingerprints:
                 manager = data_manager(reader, scene.path)
                 fingerprints[way] = manager.fingerprint(scene.path) if scene.is_there else recorded(scene)
-            for seed in seeds:
-                keys = None
-                if (data := fingerprints[way]) is not None:
-                    training = training_key(plain, data, seed, code_key())
-                    result = result_key(plain, data, seed, code_key(), options.protocol, version)
-                    keys = CellKeys(data, training, result)
-                cells.append(ComparisonCell(variant, scene, label, seed, options.protocol, overrides, config, keys))
+            cells += [
+                ComparisonCell(variant, scene, label, seed, options.protocol, overrides, config, fingerprints[way])
+                for seed in range(options.seeds)
+            ]
     return sorted(cells, key=lambda cell: cell.seed)
 
 

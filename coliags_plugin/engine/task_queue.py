@@ -89,11 +89,11 @@ class JobQueue:
         executor: Where tasks run.
         retries: How often a task is tried again whose process died.
         total: Size of all jobs together, those that are done before and those found later included.
-        done: Size of those done before.
+        size_done: Size of those done before.
     """
 
-    def __init__(self, executor: Executor, retries: int, jobs: Sequence[Job], total: int, done: int = 0) -> None:
-        self._executor, self._retries, self._total, self._over = executor, retries, total, done
+    def __init__(self, executor: Executor, retries: int, jobs: Sequence[Job], total: int, size_done: int = 0) -> None:
+        self._executor, self._retries, self._total, self._over = executor, retries, total, size_done
         self._waiting, self._running = deque(jobs), dict[str, Job]()
         self._attempts: Counter[str] = Counter()
 

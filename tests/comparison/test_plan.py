@@ -29,52 +29,50 @@ def cells(wall, methods=("coliags",), **options):
     return make_cells(requested(wall, methods, **options))
 
 
-def keys(wall, **options):
+def planned(wall, **options):
     (cell,) = cells(wall, **options)
-    return cell.keys
+    return cell.planned
 
 
 def test_one_cell_for_each_method_split_and_seed_the_seeds_together(wall):
-    planned = cells(wall, ["coliags", "3dgs"], seeds=2, splits=["every-8th", "block"])
-    assert [(cell.seed, cell.scene_label, cell.variant.name) for cell in planned] == [
+    every = cells(wall, ["coliags", "3dgs"], seeds=2, splits=["every-8th", "block"])
+    assert [(cell.seed, cell.scene_label, cell.variant.name) for cell in every] == [
         (seed, label, method) for seed in (0, 1) for label in ("wall", "wall-block") for method in ("coliags", "3dgs")
     ]
-    assert {cell.config.datamanager.settings.split for cell in planned if cell.scene_label == "wall"} == {"every-8th"}
-    assert len({cell.keys.result for cell in planned}) == len(planned)
-    assert {cell.config.schedule.steps for cell in planned} == {5}
+    assert {cell.config.datamanager.settings.split for cell in every if cell.scene_label == "wall"} == {"every-8th"}
+    assert len({cell.planned.key for cell in every}) == len(every)
+    assert {cell.config.schedule.steps for cell in every} == {5}
     (cell,) = cells(wall, overrides=["datamanager.split=block"])
     assert cell.scene_label == "wall-block"
 
 
 def test_a_key_depends_on_what_changes_a_result_and_on_nothing_else(wall, tmp_path):
-    plain = keys(wall)
-    assert keys(wall) == plain
-    assert keys(wall, overrides=["schedule.log_every=1", "schedule.checkpoint_every=2"]) == plain
+    plain = planned(wall)
+    assert planned(wall, overrides=["schedule.log_every=1", "schedule.checkpoint_every=2"]) == plain
     others = [
-        keys(wall, steps=6),
-        keys(wall, methods=["scaffold-gs-depth"]),
-        keys(wall, overrides=["field.features=8"]),
-        keys(write_wall(tmp_path / "wall", frames=10)),
+        planned(wall, steps=6),
+        planned(wall, overrides=["field.features=8"]),
+        planned(write_wall(tmp_path / "wall", frames=10)),
     ]
-    assert len({each.training for each in [plain, *others]}) == 5
-    authors = keys(wall, protocol="authors-code")
-    assert authors.training == plain.training and authors.result != plain.result
+    assert len({each.run for each in [plain, *others]}) == len({each.key for each in [plain, *others]}) == 4
+    authors = planned(wall, protocol="authors-code")
+    assert authors.run == plain.run and authors.key != plain.key
 
 
 def test_a_method_under_another_name_has_the_same_key(wall):
     ours, same, other = cells(
         wall, ["coliags", Variant("whole", "ablations/depth-imve-imia"), Variant("no-lamp", "ablations/depth-imve")]
     )
-    assert ours.keys == same.keys and ours.keys != other.keys
-    assert ours.planned.run != same.planned.run
+    assert ours.planned.key == same.planned.key != other.planned.key and ours.planned.run != same.planned.run
     (cell,) = cells(wall, ["ablations/depth"])
-    assert cell.planned.run == f"runs/wall/ablations-depth/s0-{cell.keys.training[:8]}"
-    assert cell.planned.result == f"results/wall/ablations-depth/s0-{cell.keys.result[:8]}.json"
+    assert cell.planned.run.startswith("runs/wall/ablations-depth/s0-")
+    assert cell.planned.result == f"results/wall/ablations-depth/s0-{cell.planned.key[:8]}.json"
 
 
 def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
     manager = C3VDDataManager(C3VDDataManager.Settings())
-    assert keys(wall).fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance.fingerprint
+    (cell,) = cells(wall)
+    assert cell.fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance.fingerprint
 
 
 @pytest.mark.parametrize("layout", ["c3vd", "colmap"])
@@ -83,9 +81,9 @@ def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, 
     request = requested(tmp_path)
     request = replace(request, scenes=[SceneSource("planned", tmp_path / "planned", phantom=phantom)])
     (unknown,) = make_cells(request)
-    assert unknown.keys is None and unknown.config.schedule.steps == 5
+    assert unknown.fingerprint is None and unknown.config.schedule.steps == 5
     (recorded,) = make_cells(request, lambda scene: "abc")
-    assert recorded.keys is not None and recorded.keys.fingerprint == "abc"
+    assert recorded.fingerprint == "abc" and recorded.planned.key
 
 
 @pytest.mark.parametrize(
@@ -129,7 +127,7 @@ def test_a_decision_is_recorded_when_the_plan_is_first_written(wall, tmp_path):
     assert [cell.method for cell in folder.plan().cells] == ["coliags", "3dgs"]
     changed = make_cells(requested(wall, [Variant("coliags", "coliags", ("field.features=8",))]))
     folder.record(first, changed)
-    assert folder.plan().cells[0].key == changed[0].keys.result
+    assert folder.plan().cells[0].key == changed[0].planned.key
     (tmp_path / "late" / "results").mkdir(parents=True)
     late = ComparisonFolder(tmp_path / "late")
     for _ in range(2):  # results alone, and a plan

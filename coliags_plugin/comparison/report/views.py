@@ -198,26 +198,26 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     if not views:
         text = "No images: only results files are here, without the run folders."
         return Section(title, [Paragraph(text)], screen_only=True)
-    scales = _Scales.of(views)
+    error_ends, depth_limits = _scales(views)
     unit = study.length_unit
     bars = [
         ColorBar((0.0, end), unit, "error", "|depth error|", "error-scale")
         if of_depth
         else ColorBar((0.0, end), "levels of 255", "error", "|colour error|", "colour-error-scale")
-        for of_depth, end in scales.error_ends.items()
+        for of_depth, end in error_ends.items()
     ]
-    if scales.depth is not None:
-        bars.append(ColorBar(scales.depth, unit, "depth", "depth", "depth-scale"))
+    if depth_limits is not None:
+        bars.append(ColorBar(depth_limits, unit, "depth", "depth", "depth-scale"))
     values = {
         "bars": bars,
-        "hatch": None if scales.depth is None else EncodedImage.webp(hatch(14, 34)),
+        "hatch": None if depth_limits is None else EncodedImage.webp(hatch(14, 34)),
         "reference": reference,
         "orders": {name: metric_title(name) for name in _SORTED_BY if name in study.metrics},
         "scenes": [
             (
                 scene,
                 [
-                    (test_set.title, [_template_values(view, scales, reference) for view in same])
+                    (test_set.title, [_template_values(view, error_ends, depth_limits, reference) for view in same])
                     for test_set, same in grouped(in_scene, lambda view: view.frame.test_set).items()
                 ],
             )
@@ -237,28 +237,25 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     return Section(title, blocks, screen_only=True, name="views")
 
 
-@dataclass(frozen=True)
-class _Scales:
-    """Colour scales that all views share."""
+def _scales(views: Sequence[_View]) -> tuple[dict[bool, float], tuple[float, float] | None]:
+    """Ends of the scales of depth errors (True) and colour errors, and limits of depth, each where there is any.
 
-    error_ends: Mapping[bool, float]  # ends of the scales of depth errors (True) and colour errors, where there are any
-    depth: tuple[float, float] | None  # limits of depth; None where there is none
-
-    @classmethod
-    def of(cls, views: Sequence[_View]) -> _Scales:
-        """Scales of the errors and depths of all views; of expected depth where there is no true one."""
-        shown = [(view.of_depth, each) for view in views for each in view.renderings]
-        ends = {
-            kind: error_limit([each.error for of_depth, each in shown if of_depth is kind and each.error is not None])
-            for kind in (True, False)
-            if any(of_depth is kind for of_depth, _ in shown)
-        }
-        depths = [view.true_depth for view in views if view.true_depth is not None]
-        depths = depths or [each.expected for _, each in shown if each.expected is not None]
-        return cls(ends, common_limits(depths) if depths else None)
+    The limits are those of the true depths, or of the expected ones where there is no true depth.
+    """
+    renderings = [(view.of_depth, each) for view in views for each in view.renderings]
+    ends = {
+        kind: error_limit([each.error for of_depth, each in renderings if of_depth is kind and each.error is not None])
+        for kind in (True, False)
+        if any(of_depth is kind for of_depth, _ in renderings)
+    }
+    depths = [view.true_depth for view in views if view.true_depth is not None]
+    depths = depths or [each.expected for _, each in renderings if each.expected is not None]
+    return ends, common_limits(depths) if depths else None
 
 
-def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, Any]:
+def _template_values(
+    view: _View, error_ends: Mapping[bool, float], depth_limits: tuple[float, float] | None, reference: str
+) -> dict[str, Any]:
     """Values of a view for the template.
 
     The script sorts by ``data``: the position along the video, and for each metric a number that is larger the worse
@@ -269,8 +266,8 @@ def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, 
     truth = EncodedImage.jpeg(view.truth)
     tiles: list[_Tile] = [(truth, f"{where}, true image")]
     caption = []
-    if view.true_depth is not None and scales.depth is not None:
-        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
+    if view.true_depth is not None and depth_limits is not None:
+        tiles.append((EncodedImage.webp(colorize_depth(view.true_depth, depth_limits)), f"{where}, true depth"))
         caption = ["above: camera image", "below: true depth"]
     elif not view.in_row:
         tiles.append((None, "no true depth"))
@@ -282,10 +279,10 @@ def _template_values(view: _View, scales: _Scales, reference: str) -> dict[str, 
         if rendering.error is None:
             tiles.append((None, "no depth to compare"))
         else:
-            drawn = colorize_error(rendering.error, ~np.isnan(rendering.error), scales.error_ends[view.of_depth])
+            drawn = colorize_error(rendering.error, ~np.isnan(rendering.error), error_ends[view.of_depth])
             tiles.append((EncodedImage.webp(drawn), f"{where}, absolute {kind} error of {name}"))
-            if rendering.expected is not None and scales.depth is not None:
-                drawn = colorize_depth(rendering.expected, scales.depth, hatched=True)
+            if rendering.expected is not None and depth_limits is not None:
+                drawn = colorize_depth(rendering.expected, depth_limits, hatched=True)
                 tiles.append((EncodedImage.webp(drawn), f"{where}, expected depth of {name}"))
         cells.append((name, study.methods.index(name), tiles, _caption(frame, rendering.run)))
     runs = test_set.evaluated(reference, frame.scene)
