@@ -21,7 +21,7 @@ from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, scaled_depth
+from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, ScaledDepth
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit, read_unit
@@ -290,7 +290,9 @@ class ColmapDataManager(RecordedDataManager):
         model = read_model(self._model_folder(path))
         paths = _image_paths(path / user_path(settings.images_folder), model, settings.outside_files)
         masks = _masks(path, model)
-        depths, params = _depths(path / "depths", model)
+        atlas = read_atlas(path)
+        unit = settings.unit or model_unit(path, model.folder, atlas)
+        depths, forms, params = self._depths(path, model, unit)
         lenses = {
             number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
             for number, lens in model.cameras.items()
@@ -298,12 +300,9 @@ class ColmapDataManager(RecordedDataManager):
         rectification_of = rectifications(lenses, model.files[0], self.working_size, settings.focal_scale)
         names = reading.short_names([image.name for image in model.images])
         others = reading.unposed_images(paths, (*masks, *depths))
-        atlas = read_atlas(path)
-        unit = settings.unit or model_unit(path, model.folder, atlas)
         if atlas is None:  # else it says why images have no pose, or which other model has one
             reading.warn_of_unposed(model.files[1], others)
         seen_masks = find_seen_masks(path / "truth", len(paths), complete=not others)
-        forms = self._depth_formats(path, depths, params, model, unit)
         shots, used, misplaced = [], 0, 0
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
@@ -376,30 +375,40 @@ class ColmapDataManager(RecordedDataManager):
             )
         return models[0]
 
-    def _depth_formats(
-        self, path: Path, depths: Sequence[Path | None], params: Path | None, model: SparseModel, unit: Unit
-    ) -> list[DepthFormat | None]:
-        """Formats of the depth files: inverse depth with ``params``, else depth in the unit that is said."""
-        depth_unit = self.settings.depth_unit
-        if params is not None:
-            if depth_unit is not None:
-                raise InputError(
-                    f"the option depth_unit = {depth_unit:g}, but {params}, by which depths/ holds inverse depth",
-                    "one of the two",
-                    "Leave the option out, or move the file away",
-                )
-            return [*_inverse_depths(params, model, self.settings.scale)]
-        if depth_unit is None and unit == "unknown" and any(depths):
+    def _depths(
+        self, path: Path, model: SparseModel, unit: Unit
+    ) -> tuple[list[Path | None], Sequence[DepthFormat | None], Path | None]:
+        """Depth files of all images or of none, their formats, and the file of scales and offsets of inverse depth.
+
+        Without such a file, depth is in the unit that the options or the scene state.
+        """
+        folder, params, depth_unit = path / "depths", model.folder / _DEPTH_PARAMS, self.settings.depth_unit
+        is_inverse = params.is_file()
+        if not folder.is_dir():
+            if is_inverse:
+                log.warning("%s is not used, as there is no %s", params, folder)
+            return [None] * len(model.images), [None] * len(model.images), None
+        suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
+        depths = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
+        files = reading.for_all(depths, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
+        if is_inverse and depth_unit is not None:
+            raise InputError(
+                f"the option depth_unit = {depth_unit:g}, but {params}, by which depths/ holds inverse depth",
+                "one of the two",
+                "Leave the option out, or move the file away",
+            )
+        if is_inverse:
+            return files, _inverse_depths(params, model, self.settings.scale), params
+        if depth_unit is None and unit == "unknown":
             raise InputError(
                 f"{path} has depths/, but the model's unit of length and the value of a step of depth are not given",
                 f"the option depth_unit, scene lengths per step; or {_DEPTH_PARAMS} beside it, for inverse depth",
                 "For millimetres in a model in metres `datamanager.depth_unit=0.001`, or unit.txt with m, "
                 "which means the same; move depths/ away if it is relative",
             )
-        if depth_unit is None and any(depths):
+        if depth_unit is None:
             log.info("%s/depths is read at 1 mm a step; `datamanager.depth_unit=MM` changes that", path)
-        size = (depth_unit or 1.0) / FACTORS[unit]
-        return [None if depth is None else scaled_depth(depth, size) for depth in depths]
+        return files, [ScaledDepth((depth_unit or 1.0) / FACTORS[unit])] * len(files), None
 
     def _sparse_depth(
         self,
@@ -464,20 +473,6 @@ def _masks(scene: Path, model: SparseModel) -> list[Path | None]:
             "Rename them, or move the folder away",
         )
     return masks
-
-
-def _depths(folder: Path, model: SparseModel) -> tuple[list[Path | None], Path | None]:
-    """Depth files of all images, or of none, and the file that says that they hold inverse depth, if any."""
-    params = model.folder / _DEPTH_PARAMS
-    is_inverse = params.is_file()
-    if not folder.is_dir():
-        if is_inverse:
-            log.warning("%s is not used, as there is no %s", params, folder)
-        return [None] * len(model.images), None
-    suffixes = (".png",) if is_inverse else _DEPTH_SUFFIXES
-    depths = reading.sidecar_files(folder, [image.name for image in model.images], suffixes)
-    files = reading.for_all(depths, folder, f"a file NAME{', NAME'.join(suffixes)}", or_none=False)
-    return files, params if is_inverse else None
 
 
 def _inverse_depths(file: Path, model: SparseModel, size: float) -> list[InverseDepth]:

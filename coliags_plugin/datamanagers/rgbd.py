@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -20,12 +21,12 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
-from coliags_plugin.datamanagers.reading.depth import scaled_depth
+from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
-from coliags_plugin.datamanagers.shots import Shot
+from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
 from coliags_plugin.geometry.meshes.files import read_mesh
@@ -137,18 +138,13 @@ class RGBDDataManager(RecordedDataManager):
                 "confidence beside the depth that it is about",
                 "Add the depth, or move confidence/ away",
             )
+        depth_files, poses = [depth for _, depth, _ in rows], trajectory.camera_to_world[[pose for _, _, pose in rows]]
+        form = None if scale is None else ScaledDepth(1.0 / scale)
         shots = [
-            Shot(
-                image.stem,
-                image,
-                rectification,
-                trajectory.camera_to_world[pose],
-                depth,
-                None if depth is None or scale is None else scaled_depth(depth, 1.0 / scale),
-                mask=mask,
-                confidence=confidence,
+            replace(shot, mask=mask, confidence=confidence)
+            for shot, mask, confidence in zip(
+                make_shots(used, rectification, poses, depth_files, form), masks, confidences, strict=True
             )
-            for (image, depth, pose), mask, confidence in zip(rows, masks, confidences, strict=True)
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
@@ -169,7 +165,7 @@ class RGBDDataManager(RecordedDataManager):
         }
         meshes = list(path.glob("[!.]*.obj"))
         points = next((file for file in (path / POINTS_FILE, *meshes[: len(meshes) == 1]) if file.is_file()), None)
-        large = (*used, *(depth for _, depth, _ in rows), *masks, *confidences)
+        large = (*used, *depth_files, *masks, *confidences)
         return Recording(
             kind=f"TUM RGB-D, associated by {association['by']}",
             shots=shots,
