@@ -103,7 +103,7 @@ def of_decoding():
     constants = {
         **{"NETWORK": opacity, "OPACITY": opacity, "COVARIANCE": covariance, "COLOR": color, "LENGTH": color.end},
         **{"CHILDREN": color.children, "WITH_GEOMETRY": True, "WITH_APPEARANCE": True},
-        **{"SLOTS": children.block_of(color.children), "INPUTS": children.block_of(color.given)},
+        **{"SLOTS": children.block_of(color.children), "INPUTS": children.block_of(color.plain_inputs)},
     }
     for kernel in (decoding.decode_opacities, decoding.draw, decoding.draw_backward):
         yield kernel.__name__, kernel, TYPES, constants, children.OPTIONS

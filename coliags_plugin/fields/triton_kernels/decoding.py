@@ -200,12 +200,14 @@ def networks_backward(
                 of_inputs, COVARIANCE, WITH_GEOMETRY,
             )  # fmt: skip
             if WITH_GEOMETRY:
-                here = shown[:, None] & (column < COVARIANCE.given)[None, :]
-                tl.store(of_geometry_inputs + rows[:, None] * COVARIANCE.given + column[None, :], of_inputs, here)
+                here = shown[:, None] & (column < COVARIANCE.plain_inputs)[None, :]
+                tl.store(
+                    of_geometry_inputs + rows[:, None] * COVARIANCE.plain_inputs + column[None, :], of_inputs, here
+                )
             of_inputs = outputs_backward(
                 table, features, of_appearance, rows, shown, child, number, drawn, of_outputs + 8, of_table,
                 of_features, zeros, COLOR, WITH_APPEARANCE,
             )  # fmt: skip
             if WITH_APPEARANCE:
-                here = shown[:, None] & (column < COLOR.given)[None, :]
-                tl.store(of_appearance_inputs + rows[:, None] * COLOR.given + column[None, :], of_inputs, here)
+                here = shown[:, None] & (column < COLOR.plain_inputs)[None, :]
+                tl.store(of_appearance_inputs + rows[:, None] * COLOR.plain_inputs + column[None, :], of_inputs, here)

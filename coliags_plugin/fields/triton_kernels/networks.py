@@ -65,10 +65,10 @@ def tanh(x):
 def _sources(column, NETWORK: tl.constexpr):
     """The given input of a column, factor and right angles of its phase, and whether it is a sine of that. [C] each"""
     EMBEDDED: tl.constexpr = max(NETWORK.embedded, 1)
-    is_source = column - NETWORK.features
-    wave = is_source - NETWORK.given
+    input_column = column - NETWORK.features
+    wave = input_column - NETWORK.plain_inputs
     place = tl.maximum(wave, 0)
-    source = tl.where(wave < 0, is_source, NETWORK.given - NETWORK.embedded + place % EMBEDDED)
+    source = tl.where(wave < 0, input_column, NETWORK.plain_inputs - NETWORK.embedded + place % EMBEDDED)
     return source, (1 << (place // (2 * EMBEDDED))).to(tl.float32), place // EMBEDDED % 2, wave >= 0
 
 
@@ -76,7 +76,9 @@ def _sources(column, NETWORK: tl.constexpr):
 def _given(inputs, rows, visible, column, source, NETWORK: tl.constexpr):
     """The given inputs of columns, 0 of features. [R, C]"""
     here = (column >= NETWORK.features) & (column < NETWORK.columns)
-    return tl.load(inputs + rows[:, None] * NETWORK.given + source[None, :], visible[:, None] & here[None, :], 0.0)
+    return tl.load(
+        inputs + rows[:, None] * NETWORK.plain_inputs + source[None, :], visible[:, None] & here[None, :], 0.0
+    )
 
 
 @triton.jit
