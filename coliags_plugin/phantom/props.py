@@ -5,6 +5,7 @@ Bodies are triangle meshes, in the world or fixed to the camera, that are drawn 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -12,11 +13,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.phantom.colon import ColonSurface, around_the_colon, grid_triangles, unit
 from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
-from coliags_plugin.phantom.tracing import Mesh, Tracer, rotated
+from coliags_plugin.phantom.tracing import Tracer, rotated
 
 #: Absorption by fluid per mm, RGB, and the colour that it scatters.
 _FLUID_ABSORPTION, _FLUID_ALBEDO = np.array([0.06, 0.09, 0.3]), np.array([0.62, 0.44, 0.14])
@@ -52,7 +54,6 @@ class Body:
     cover: Cover
     tracer: Tracer
     normals: Float[np.ndarray, "V 3"]
-    in_camera: bool  # whether its mesh is in camera axes instead of the world's
 
     def draw(
         self,
@@ -64,7 +65,8 @@ class Body:
         light: Float[np.ndarray, "N 3"],
     ) -> Bool[np.ndarray, "N"]:
         """Draw it over ``light`` where it is nearer than ``z_depth``; changes both and returns where."""
-        pose = np.eye(4) if self.in_camera else camera_to_world
+        # The tool is in camera axes.
+        pose = np.eye(4) if self.cover is Cover.TOOL else camera_to_world
         hits = self.tracer.cast(pose, directions)
         nearer = hits.found & (hits.z_depth < z_depth)
         if not nearer.any():
@@ -102,19 +104,27 @@ class Body:
         return nearer
 
 
+#: Vertices, their unit normals, and triangles.
+Parts = tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]
+
+
 def bodies_at(surface: ColonSurface, settings: PhantomSettings, time: float) -> tuple[Body, ...]:
     """The bodies at a time, s, over the wall as it then is; farther ones first."""
-    meshes = []
-    if settings.fluid:
-        meshes.append((Cover.FLUID, _pool(surface, settings, time), False))
-    if settings.bubbles:
-        meshes.append((Cover.BUBBLE, _bubbles(surface, settings, time), False))
-    if settings.tool:
-        meshes.append((Cover.TOOL, _tool(settings, time), True))
-    return tuple(Body(cover, Tracer(mesh), mesh.normals, in_camera) for cover, mesh, in_camera in meshes)
+    makers: tuple[tuple[bool, Cover, Callable[[ColonSurface, PhantomSettings, float], Parts]], ...] = (
+        (settings.fluid > 0.0, Cover.FLUID, _pool),
+        (settings.bubbles > 0, Cover.BUBBLE, _bubbles),
+        (settings.tool, Cover.TOOL, _tool),
+    )
+    bodies = []
+    for is_there, cover, make in makers:
+        if is_there:
+            vertices, normals, triangles = make(surface, settings, time)
+            tracer = Tracer(TriangleMesh(vertices.astype(np.float32), triangles))
+            bodies.append(Body(cover, tracer, normals.astype(np.float32)))
+    return tuple(bodies)
 
 
-def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh:
+def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Parts:
     """The level surface of a pool on one side of the colon, with ripples."""
     generator = stream(settings.seed, Purpose.PROPS, 0)
     clock = round(generator.uniform(0.0, surface.columns))
@@ -139,10 +149,10 @@ def _pool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh
         slope += 0.03 * np.sin(2.0 * np.pi * (along - speed * time) / scale)
     normals = unit(-down + slope[:, :, None] * side + slope[:, ::-1, None] * np.cross(side, down))
     triangles = grid_triangles(len(rows), len(across), "acb cdb", wraps=False)
-    return _mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles)
+    return points.reshape(-1, 3), normals.reshape(-1, 3), triangles
 
 
-def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> Mesh:
+def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> Parts:
     """Bubbles in clusters on the wall, which drift along it towards the shallow end."""
     generator = stream(settings.seed, Purpose.PROPS, 1)
     count = settings.bubbles
@@ -158,14 +168,13 @@ def _bubbles(surface: ColonSurface, settings: PhantomSettings, time: float) -> M
     grids = (values.reshape(shape).astype(np.float64) for values in (surface.vertices, surface.normals))
     foot, normal = (around_the_colon(grid, row, column) for grid in grids)
     centres = foot + 0.5 * radius[:, None] * unit(normal)
-    sphere = _sphere()
-    vertices = centres[:, None] + radius[:, None, None] * sphere.vertices
-    normals = np.broadcast_to(sphere.normals, vertices.shape)
-    triangles = sphere.triangles[None] + len(sphere.vertices) * np.arange(count)[:, None, None]
-    return _mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3))
+    sphere, triangles = _sphere()
+    vertices = centres[:, None] + radius[:, None, None] * sphere
+    triangles = triangles[None] + len(sphere) * np.arange(count)[:, None, None]
+    return vertices.reshape(-1, 3), np.tile(sphere, (count, 1)), triangles.reshape(-1, 3).astype(np.uint32)
 
 
-def _tool(settings: PhantomSettings, time: float) -> Mesh:
+def _tool(surface: ColonSurface, settings: PhantomSettings, time: float) -> Parts:
     """A rod with a round end, in camera axes, that moves in and out of its channel and swings."""
     phase = stream(settings.seed, Purpose.PROPS, 2).uniform(0.0, 2.0 * np.pi, 3)
     low, high = _TOOL_REACH
@@ -173,30 +182,24 @@ def _tool(settings: PhantomSettings, time: float) -> Mesh:
     reach = low + (high - low) * (0.5 - 0.5 * np.cos(turn + phase[0]))
     swing = 0.06 * np.sin(np.array([1.7, 1.3]) * turn + phase[1:])
     aim = unit(np.array([swing[0] - 0.12, swing[1] - 0.16, 1.0]))
-    sphere = _sphere()
+    sphere, triangles = _sphere()
     # A sphere whose rear half is drawn out behind the lens.
-    behind = sphere.vertices[:, 2] < 0.0
-    vertices = _TOOL_RADIUS * sphere.vertices
+    behind = sphere[:, 2] < 0.0
+    vertices = _TOOL_RADIUS * sphere
     vertices[behind, 2] = -60.0
-    normals = np.where(behind[:, None], sphere.vertices * [1.0, 1.0, 0.0], sphere.vertices)
+    normals = np.where(behind[:, None], sphere * [1.0, 1.0, 0.0], sphere)
     side = unit(np.cross([0.0, 1.0, 0.0], aim))
     axes = np.stack([side, np.cross(aim, side), aim], axis=1)
-    return _mesh(_CHANNEL + reach * aim + vertices @ axes.T, unit(normals + 1e-9) @ axes.T, sphere.triangles)
+    return _CHANNEL + reach * aim + vertices @ axes.T, unit(normals + 1e-9) @ axes.T, triangles
 
 
-def _sphere() -> Mesh:
-    """The unit sphere by latitude and longitude."""
+def _sphere() -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Vertices and triangles of the unit sphere by latitude and longitude."""
     bands, sectors = 12, 24
     theta = np.linspace(0.0, np.pi, bands + 1)[:, None]
     phi = np.arange(sectors) * (2.0 * np.pi / sectors)
     points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi], axis=-1)
-    return _mesh(points.reshape(-1, 3), points.reshape(-1, 3), grid_triangles(bands + 1, sectors, "abc cbd"))
-
-
-def _mesh(
-    vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], triangles: Int[np.ndarray, "F 3"]
-) -> Mesh:
-    return Mesh(vertices.astype(np.float32), normals.astype(np.float32), triangles.astype(np.uint32))
+    return points.reshape(-1, 3).astype(np.float32), grid_triangles(bands + 1, sectors, "abc cbd")
 
 
 def wet_lens(

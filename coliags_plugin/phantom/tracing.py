@@ -32,19 +32,10 @@ def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh with normals."""
-
-    vertices: Float[np.ndarray, "V 3"]  # mm
-    normals: Float[np.ndarray, "V 3"]  # unit
-    triangles: Int[np.ndarray, "F 3"]
-
-
 class Tracer:
     """Ray-casting scene of a mesh: the wall, or a body over it."""
 
-    def __init__(self, surface: ColonSurface | Mesh) -> None:
+    def __init__(self, surface: ColonSurface | TriangleMesh) -> None:
         self._triangles = surface.triangles
         self._rays = TriangleMesh(surface.vertices, surface.triangles).rays
 
