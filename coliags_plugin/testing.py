@@ -1,6 +1,6 @@
 """The contract of a method, as a list of checks for plugin authors, pytest and ``coliags check``.
 
-A test module that checks a method of your own::
+A test module that checks a method of your own:
 
     @pytest.fixture(scope="module")
     def context(tmp_path_factory):
