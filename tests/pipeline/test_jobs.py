@@ -63,21 +63,15 @@ def test_a_video_by_workers_is_what_one_process_makes(posed, video, tmp_path, wo
     assert calls == alone
 
 
-@pytest.mark.thorough
-def test_a_worker_that_dies_is_tried_again_and_at_last_its_sub_map_fails(calls, atlas, tmp_path, workers, caplog):
+def test_a_sub_map_whose_worker_dies_three_times_has_failed_and_the_others_go_on(calls, atlas, tmp_path, workers):
     died = TaskOutcome("died", "the process was ended by SIGKILL")
-    executor = workers(died)
-    cp.reconstruct(atlas, tmp_path / "out", jobs=1)
-    assert parts(executor) == [0, 1, 0] or parts(executor) == [0, 0, 1]
-    assert caplog.text.count("trying again") == 1
     executor = workers(None, died, died, died)
-    record = cp.reconstruct(atlas, tmp_path / "again", jobs=1)
+    record = cp.reconstruct(atlas, tmp_path / "out", jobs=1)
     assert parts(executor) == [0, 1, 1, 1]
-    assert all(stage.state == "done" for name, stage in record.stages.items() if "/" not in name)
-    assert "3 times" in caplog.text or (tmp_path / "again" / PAGE_FILE).is_file()
+    assert {stage.state for name, stage in record.stages.items() if "/" not in name} == {"done"}
+    workers(died, died, died)
     with pytest.raises(InputError, match="SIGKILL, 3 times"):
-        workers(died, died, died)
-        cp.reconstruct(atlas, tmp_path / "third", jobs=1)
+        cp.reconstruct(atlas, tmp_path / "again", jobs=1)
 
 
 def test_the_stage_that_a_worker_is_at_is_told(tmp_path):

@@ -74,8 +74,11 @@ def test_a_calibration_file_is_named_as_the_camera(recording, tmp_path, kind):
         opened_recording(source, SfmSettings(camera=CameraSettings(model="gone.xml")))
 
 
-def test_images_beside_a_video_without_calibration_are_the_frames(recording):
+def test_without_calibration_images_beside_a_video_are_the_frames_or_its_camera_is_estimated(recording, caplog):
     (recording / "endoscope.xml").unlink()
+    with caplog.at_level(logging.WARNING):
+        assert opened_recording(recording, SfmSettings()) == (recording / "Seq_001.MOV", SfmSettings())
+    assert "Seq_001 has no calibration file: its camera is estimated" in caplog.text
     write_images(recording, film(range(3)))
     assert opened_recording(recording, SfmSettings()) == (recording, SfmSettings())
 
@@ -112,13 +115,6 @@ def test_a_screening_video_of_c3vd_v2_is_a_procedure_by_its_images_and_a_scene_b
     workers()
     cp.reconstruct(folder, tmp_path / "posed")
     assert calls == [*CAPTURE[1:], *TRAINING]
-
-
-def test_a_recording_without_calibration_is_warned_of(recording, caplog):
-    (recording / "endoscope.xml").unlink()
-    with caplog.at_level(logging.WARNING):
-        assert opened_recording(recording, SfmSettings()) == (recording / "Seq_001.MOV", SfmSettings())
-    assert "Seq_001 has no calibration file: its camera is estimated" in caplog.text
 
 
 def test_what_does_not_fit_is_refused(recording):

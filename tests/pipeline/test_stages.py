@@ -109,18 +109,17 @@ def test_a_stage_that_failed_can_be_tried_with_other_options(tmp_path):
     assert Workshop(tmp_path).run(third=1) == ["third"]
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path):
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(InputError, match="already exists and is no reconstruction"):
-        Record.of(tmp_path)
-    (tmp_path / RECORD_FILE).write_text('{"format": 2, "stages": 3}')
-    with pytest.raises(InputError, match=r"cannot read .*reconstruction.json"):
-        Record.of(tmp_path)
-
-
-def test_records_of_other_versions_are_refused(tmp_path):
-    (tmp_path / RECORD_FILE).write_text('{"format": 1, "version": "0.0.1", "stages": {}}')
-    with pytest.raises(InputError, match=rf"{RECORD_FILE} is of version 0\.0\.1 .*Choose another `output`"):
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("thesis.tex", "", "already exists and is no reconstruction"),
+        (RECORD_FILE, '{"format": 2, "stages": 3}', r"cannot read .*reconstruction.json"),
+        (RECORD_FILE, '{"format": 1, "version": "0.0.1", "stages": {}}', r"is of version 0\.0\.1 .*Choose another"),
+    ],
+)
+def test_folders_of_something_else_or_of_other_versions_are_refused(tmp_path, file, content, message):
+    (tmp_path / file).write_text(content)
+    with pytest.raises(InputError, match=message):
         Record.of(tmp_path)
 
 
