@@ -38,25 +38,15 @@ _MOST_FRAMES = 6_000_000
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Measures of each frame of a video.
+    """Measures of each frame of a video."""
 
-    Attributes:
-        sharpness: Root mean square of the Laplacian over the mean brightness; 0 without any texture. [N]
-        followed: Share of corners that were followed from the frame before. [N]
-        motion: Their median displacement, as a share of the larger side; infinity where too few were followed. [N]
-        size: Height and width of the frames, pixels.
-        mask: False outside of the lens's image and on overlays; None where all counts. [H, W]
-        first: Number of the first frame.
-        times: After that of the video's first frame, s, where they are not numbers over a rate; else None. [N]
-    """
-
-    sharpness: Float[np.ndarray, "N"]
-    followed: Float32[np.ndarray, "N"]
-    motion: Float32[np.ndarray, "N"]
-    size: tuple[int, int]
-    mask: Bool[np.ndarray, "H W"] | None
-    first: int = 0
-    times: Float64[np.ndarray, "N"] | None = None
+    sharpness: Float[np.ndarray, "N"]  # RMS of the Laplacian over the mean brightness; 0 without any texture
+    followed: Float32[np.ndarray, "N"]  # share of corners that were followed from the frame before
+    motion: Float32[np.ndarray, "N"]  # their median displacement over the larger side; infinity: too few were followed
+    size: tuple[int, int]  # height and width of the frames, pixels
+    mask: Bool[np.ndarray, "H W"] | None  # False outside of the lens's image and on overlays; None where all counts
+    first: int = 0  # number of the first frame
+    times: Float64[np.ndarray, "N"] | None = None  # after the video's first frame, s; None: numbers over a rate
 
     def __len__(self) -> int:
         return len(self.sharpness)

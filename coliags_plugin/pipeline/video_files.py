@@ -57,19 +57,12 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VideoIndex:
-    """Times of a file's frames by its packets, in units of the stream.
+    """Times of a file's frames by its packets, in units of the stream."""
 
-    Attributes:
-        times: Presentation times of the frames, ascending. [N]
-        keys: Of frames from which decoding can begin, presentation times, ascending, decoding times and bytes. [K, 3]
-        unit: Seconds.
-        stated: Number of frames that the file should have: more than N where it is cut off.
-    """
-
-    times: Int64[np.ndarray, "N"]
-    keys: Int64[np.ndarray, "K 3"]
-    unit: Fraction
-    stated: int
+    times: Int64[np.ndarray, "N"]  # presentation times of the frames, ascending
+    keys: Int64[np.ndarray, "K 3"]  # of frames to begin decoding from: presentation and decoding times, bytes
+    unit: Fraction  # seconds
+    stated: int  # number of frames that the file should have: more than N where it is cut off
 
     @property
     def room(self) -> int:
