@@ -89,58 +89,56 @@ def write_frames(
     line.
     """
     used = survey.mask if mask is None else read_mask(mask, colored=True)
-    sharpnesses, (height, width), total = survey.sharpness.tolist(), survey.size, len(survey)
+    sharpnesses, (height, width), first = survey.sharpness.tolist(), survey.size, source.span.first
     if used is not None and used.shape != survey.size:
         raise InputError(
             f"{mask} is {used.shape[1]} x {used.shape[0]}, the frames {width} x {height}", "a mask of the frames' size"
         )
     chosen, dropped = sharpest_frames(sharpnesses, settings, survey.times)
-    blurred = blurred_frames(chosen, sharpnesses, settings)
+    blurred, sharpest = blurred_frames(chosen, sharpnesses, settings), set(chosen)
+    frames, last = list[KeptFrame](), None
     with atomic_folder(folder, overwrite=True) as scratch:
-        used_frames, last, wanted_indices = list[tuple[int, str]](), None, set(chosen)
         for index, (name, image) in enumerate(watched(source, "write frames", progress)):
-            if index not in wanted_indices:
+            if index not in sharpest:
                 continue
             gray = reduced(image)
             if last is not None and corner_motion(last, gray, used)[0] < settings.least_motion:
                 dropped[index] = RESTING
                 continue
-            last = gray
-            used_frames.append((index, name))
+            last, is_blurred = gray, index in blurred
+            frames.append(KeptFrame(frame=first + index, name=name, blurred=is_blurred, sharpness=sharpnesses[index]))
             write_image(scratch / IMAGES / f"{name}.png", source.with_alpha(name, image))
-        blurred &= {index for index, _ in used_frames}
-        reasons = [f"{len(blurred)} blurred, of use for poses alone"] if blurred else []
-        why = ", ".join([*reasons, *(f"{n} {reason}" for reason, n in sorted(Counter(dropped.values()).items()))])
-        if (count := len(used_frames) - len(blurred)) < FEWEST:
+        reasons = [f"{count} {why}" for why, count in sorted(Counter(dropped.values()).items())]
+        if unsharp := sum(frame.blurred for frame in frames):
+            reasons.insert(0, f"{unsharp} blurred, of use for poses alone")
+        if (count := len(frames) - unsharp) < FEWEST:
             raise InputError(
-                f"{count} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
+                f"{count} of {len(survey)} frames of {source.path} are of use: "
+                f"{', '.join(reasons) or 'it has no more'}",
                 f"at least {FEWEST}",
                 f"Give a longer part of the video in which the camera moves{_KEEP_MORE if dropped else ''}",
             )
         if used is not None:
             write_mask(scratch / MASK, used)
-        first, masked = source.span.first, None if used is None else round(float(1.0 - used.mean()), 4)
         record = FramesRecord(
-            kept=[
-                KeptFrame(frame=first + index, name=name, blurred=index in blurred, sharpness=sharpnesses[index])
-                for index, name in used_frames
-            ],
+            kept=frames,
             dropped=[
                 DroppedFrame(frame=first + index, why=why, sharpness=sharpnesses[index])
                 for index, why in sorted(dropped.items())
                 if why != THINNED
             ],
             source=source.path.name,
-            frames=total,
+            frames=len(survey),
             every=settings.every,
             deinterlaced=bool(source.span.deinterlace),
             size=[width, height],
-            masked=masked,
+            masked=None if used is None else round(float(1.0 - used.mean()), 4),
         )
         write_json(scratch / RECORD, record.model_dump(mode="json"))
-    outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
-    fields = ", deinterlaced" if source.span.deinterlace else ""
-    return f"{len(used_frames)} of {total} frames, {width} x {height} px{fields}{f'; {why}' if why else ''}{outside}"
+    outside = "" if used is None else f"{100.0 * (1.0 - used.mean()):.0f} % of the image masked"
+    size = f"{width} x {height} px{', deinterlaced' if source.span.deinterlace else ''}"
+    counts = f"{len(frames)} of {len(survey)} frames, {size}"
+    return "; ".join(filter(None, (counts, ", ".join(reasons), outside)))
 
 
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
