@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import islice, pairwise
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
@@ -76,8 +77,6 @@ def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | 
     False where a pixel is dark in every frame and connected to the image's edge. ``brightest`` is the largest value of
     each pixel in any channel of any frame.
     """
-    import cv2
-
     dark = (brightest <= _DARK).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark)
     rim = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
@@ -93,8 +92,6 @@ def overlays(
 
     True there. ``darkest`` and ``brightest`` are the extremes of each pixel over the frames, ``mean`` its mean.
     """
-    import cv2
-
     change = (brightest - darkest).max(axis=2)
     dark = brightest.max(axis=2) <= _DARK
     still = (change <= _STILL) & ~dark
@@ -111,7 +108,7 @@ def overlays(
     return dilated(np.isin(labels, marked[marked > 0]), _MARGIN)
 
 
-def combing(image: UInt8[np.ndarray, "H W 3"]) -> float:
+def _combing(image: UInt8[np.ndarray, "H W 3"]) -> float:
     """Mean difference of green between neighbouring rows, relative to that between rows two apart."""
     green = image[..., 1].astype(np.int16)
     return float(np.abs(green[1:] - green[:-1]).mean() / max(np.abs(green[2:] - green[:-2]).mean(), 1e-6))
@@ -122,7 +119,7 @@ def looks_interlaced(images: Iterable[UInt8[np.ndarray, "H W 3"]]) -> bool:
     combs, last = list[float](), None
     for image in islice(images, _LOOKED_AT):
         if last is not None and not is_repeated(last, image):
-            combs.append(combing(image))
+            combs.append(_combing(image))
         last = image
         if len(combs) == _CHANGING:
             break
@@ -143,8 +140,6 @@ def one_field(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
 
 def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
     """The grey image at the size at which frames are measured."""
-    import cv2
-
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     factor = _SIDE / max(gray.shape)
     if factor >= 1.0:
@@ -160,36 +155,20 @@ def corner_motion(
 
     ``mask``, of the frames before they were reduced, is False where corners do not count, as on text, which rests.
     """
-    import cv2
-
-    counted = (
-        None if mask is None else cv2.resize(mask.astype(np.uint8), before.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    )
-    if counted is not None:
+    counted = None
+    if mask is not None:
+        counted = cv2.resize(mask.astype(np.uint8), before.shape[::-1], interpolation=cv2.INTER_NEAREST)
         counted = cv2.erode(counted, np.ones((_RIM, _RIM), np.uint8))
-    corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8, mask=counted)
+    # The colon's wall is smooth, and the lamp's brightness changes: local contrast is enhanced.
+    first, second = (cv2.createCLAHE(4.0, (8, 8)).apply(gray) for gray in (before, after))
+    corners = cv2.goodFeaturesToTrack(first, _CORNERS, 0.01, 8, mask=counted)
     if corners is None or len(corners) < _FEWEST:
         return float("inf"), 0.0
-    moved, tracked = _followed(before, after, corners)
-    back, again = _followed(after, before, moved)
-    survived = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
+    moved, is_tracked, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None)
+    back, is_tracked_back, _ = cv2.calcOpticalFlowPyrLK(second, first, moved, None)
+    returned = np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN
+    survived = (is_tracked[:, 0] > 0) & (is_tracked_back[:, 0] > 0) & returned
     if survived.sum() < _FEWEST:
         return float("inf"), float(survived.sum()) / _CORNERS
     lengths = np.linalg.norm(moved - corners, axis=2)[survived, 0]
     return float(np.median(lengths)) / max(before.shape), float(survived.sum()) / _CORNERS
-
-
-def _followed(
-    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], corners: Float32[np.ndarray, "N 1 2"]
-) -> tuple[Float32[np.ndarray, "N 1 2"], Bool[np.ndarray, "N"]]:
-    import cv2
-
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(_equalised(before), _equalised(after), corners, None)
-    return moved, status[:, 0] > 0
-
-
-def _equalised(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Local contrast enhanced: the colon's wall is smooth, and the lamp's brightness changes."""
-    import cv2
-
-    return np.asarray(cv2.createCLAHE(4.0, (8, 8)).apply(gray))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
+import cv2
 import numpy as np
 from av import Packet, VideoFrame
 from av.container import InputContainer
@@ -209,8 +210,6 @@ class VideoFile:
         self, frame: VideoFrame, shown: Callable[[np.ndarray, bool], np.ndarray]
     ) -> UInt8[np.ndarray, "H W 3"]:
         """Convert a frame to RGB with square pixels, turned as the file says; columns alone are resampled."""
-        import cv2
-
         try:
             image: Any = frame.to_ndarray(format="rgb24", interpolation="BICUBIC", threads=1)
         except av.FFmpegError as error:
