@@ -124,9 +124,7 @@ class Hypothesis:
 
 
 def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> Hypothesis:
-    """Choose the :func:`best` model of plausible nominal field of view, degrees, and log all of them."""
-    for hypothesis in hypotheses:
-        log.info("%s", hypothesis.described())
+    """Choose the :func:`best` model of plausible nominal field of view, degrees; refuses models if none has one."""
     candidates = [hypothesis for hypothesis in hypotheses if hypothesis.is_plausible(plausible)]
     if not candidates:
         raise InputError(
@@ -210,10 +208,12 @@ def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: boo
     """The model, bundle-adjusted in place if refined, and its reversal in depth unless it is lit from the camera."""
     if refined:
         bundle_adjust(model, refine_camera=True)
-    hypothesis = Hypothesis.of(model, video.brightness)
-    if hypothesis.is_lit_from_the_camera:
-        return [hypothesis]
-    return [hypothesis, Hypothesis.of(reversed_in_depth(model, refined), video.brightness, is_reversed=True)]
+    signs = [Hypothesis.of(model, video.brightness)]
+    if not signs[0].is_lit_from_the_camera:
+        signs.append(Hypothesis.of(reversed_in_depth(model, refined), video.brightness, is_reversed=True))
+    for hypothesis in signs:
+        log.info("%s", hypothesis.described())
+    return signs
 
 
 #: Adds cameras to those that were tried; returns the best of all, and the focal lengths, pixels, that fit as well.
@@ -247,7 +247,7 @@ def find_camera(
     if max(lengths) > _OTHER_FOCAL_LENGTH * min(lengths):
         log.warning(
             "the images hardly determine the focal length (%.0f to %.0f px fit as well), and a wrong one distorts path "
-            "and surface: give the camera's calibration (--camera, --params) if there is one",
+            "and surface: give the camera's calibration (`camera`, `params`) if there is one",
             *(min(lengths), max(lengths)),
         )
     return best

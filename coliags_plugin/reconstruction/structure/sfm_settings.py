@@ -82,7 +82,7 @@ class TrackSettings(Settings):
 
 
 class SfmSettings(Settings):
-    """Options of matching and incremental mapping."""
+    """Options of matching and mapping."""
 
     camera: CameraSettings = CameraSettings()
     """Camera model and initial intrinsics, shared by all images."""
