@@ -9,31 +9,39 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from coliags_plugin.core.jobs import Progress
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 if TYPE_CHECKING:
     import pycolmap
 
 
-def map_matches(
-    database: Path, scratch: Path, settings: SfmSettings, max_error: float
-) -> list[pycolmap.Reconstruction]:
-    """Models of matches by two-view verification and global mapping with fixed intrinsics, the largest first.
+#: RANSAC inlier threshold of the two-view geometry of any two frames that tracks link, pixels.
+_MAX_PAIR_ERROR = 2.0
 
-    All rotations are averaged, then all positions found at once: small motion between frames does not add up.
-    Intrinsics that are to be refined stay fixed until then (:func:`bundle_adjust`): motion along the optical axis makes
-    them diverge. ``max_error`` is the RANSAC inlier threshold of two-view geometries, pixels.
-    """
+
+def _verify_pairs(database: Path, max_error: float, seed: int) -> None:
+    """Verify the matches of all pairs by their two-view geometry."""
     import pycolmap
 
     views = pycolmap.TwoViewGeometryOptions()
     views.ransac.max_error = max_error
-    views.ransac.random_seed = settings.seed
+    views.ransac.random_seed = seed
     # The endoscope's dark border is masked instead of being detected as a watermark of static matches.
     views.detect_watermark = False
     pycolmap.geometric_verification(
         str(database), pycolmap.GeometricVerifierOptions(num_threads=1), two_view_geometry_options=views
     )
+
+
+def map_tracks(database: Path, scratch: Path, settings: SfmSettings) -> list[pycolmap.Reconstruction]:
+    """Models of verified matches by global mapping with fixed intrinsics, the largest first.
+
+    All rotations are averaged, then all positions found at once: small motion between frames does not add up.
+    """
+    import pycolmap
+
+    _verify_pairs(database, _MAX_PAIR_ERROR, settings.seed)
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = settings.min_model_size
     mapper = options.mapper
@@ -47,6 +55,50 @@ def map_matches(
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
     scratch.mkdir()
     models = pycolmap.global_mapping(str(database), str(scratch), str(scratch), options)
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def map_images(
+    database: Path, scratch: Path, settings: SfmSettings, count: int, progress: Progress | None
+) -> list[pycolmap.Reconstruction]:
+    """Models of verified matches by incremental mapping with fixed intrinsics, the largest first.
+
+    Intrinsics that are to be refined stay fixed until all images are registered (:func:`bundle_adjust`): with few
+    images, motion along the optical axis makes them diverge. ``count``, the number of images, is for the progress.
+    """
+    import pycolmap
+
+    _verify_pairs(database, settings.max_error, settings.seed)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = settings.seed
+    options.min_model_size = settings.min_model_size
+    options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    scratch.mkdir()
+    posed = 0
+
+    def start() -> None:
+        nonlocal posed
+        posed = 1
+        next_image()
+
+    # The callback lets Python handle Ctrl-C.
+    def next_image() -> None:
+        nonlocal posed
+        posed += 1
+        if progress is not None:
+            progress("find poses", min(posed, count), count)
+
+    models = pycolmap.incremental_mapping(
+        str(database),
+        str(scratch),
+        str(scratch),
+        options,
+        initial_image_pair_callback=start,
+        next_image_callback=next_image,
+    )
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 

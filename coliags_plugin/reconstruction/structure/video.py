@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.reconstruction.structure.adjustment import TEST_EVERY
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, is_repeated, mask_of, read_image
-from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_matches
+from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images, map_tracks
 from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, epipolar_inliers, mutual_matches
 from coliags_plugin.reconstruction.structure.point_tracks import FramePoints, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import (
@@ -37,10 +38,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
-
-
-#: RANSAC inlier threshold of the two-view geometry of any two frames that tracks link, pixels.
-_MAX_TRACK_ERROR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +78,23 @@ class MatchedVideo:
         cameras = starting_cameras(settings.camera, self.images, self.sizes, start)
         kinds = list(dict.fromkeys(self.sizes))
         named = [(name, kinds.index(size)) for name, size in zip(self.names, self.sizes, strict=True)]
-        windows, max_error = [range(len(self.images))], settings.max_error
-        if self.tracks:
-            windows = cut_where_lost([frame.followed for frame in self.tracks], settings.tracks.longest_window)
-            max_error = _MAX_TRACK_ERROR
-        if len(windows) > 1:
-            cuts = ", ".join(str(window.start) for window in windows[1:])
-            log.info("the video is mapped in %d windows, cut before frames %s", len(windows), cuts)
         models = []
-        for window in with_progress(windows, "find poses", progress):
-            frames = slice(window.start, window.stop)
-            inside = {(i, j): pairs for (i, j), pairs in self.matches.items() if i in window and j in window}
-            with tempfile.TemporaryDirectory() as scratch:
-                database, folder = Path(scratch) / "database.db", Path(scratch) / "models"
+        with tempfile.TemporaryDirectory() as scratch:
+            database, folder = Path(scratch) / "database.db", Path(scratch) / "models"
+            if not self.tracks:
+                write_database(database, cameras, named, self.keypoints, self.matches)
+                return map_images(database, folder, settings, len(self.images), progress)
+            windows = cut_where_lost([frame.followed for frame in self.tracks], settings.tracks.longest_window)
+            if len(windows) > 1:
+                cuts = ", ".join(str(window.start) for window in windows[1:])
+                log.info("the video is mapped in %d windows, cut before frames %s", len(windows), cuts)
+            for window in with_progress(windows, "find poses", progress if len(windows) > 1 else None):
+                frames = slice(window.start, window.stop)
+                inside = {(i, j): pairs for (i, j), pairs in self.matches.items() if i in window and j in window}
                 write_database(database, cameras, named[frames], self.keypoints[frames], inside, window.start)
-                models += map_matches(database, folder, settings, max_error)
+                models += map_tracks(database, folder, settings)
+                database.unlink()
+                shutil.rmtree(folder)
         return sorted(models, key=lambda model: -model.num_reg_images())
 
 
