@@ -55,11 +55,11 @@ def train(options: TrainOptions, *, view_port: int | None = None) -> Run:
         config = trainer.method.config.model_dump()
         followers: list[Follower] = [logger(folder.path, title, config, trainer.step) for logger in chosen_loggers]
         if view_port is not None:
-            from coliags_plugin.export.viewer.live import LiveView
+            from coliags_plugin.export.viewer.live import Viewer
 
-            live = LiveView(trainer, view_port)
-            log.info("%s shows the run until training ends", live.viewer.url)
-            followers.append(live)
+            viewer = Viewer.of_training(trainer, view_port)
+            log.info("%s shows the run until training ends", viewer.url)
+            followers.append(viewer)
         trainer.train(followers=followers)
     return Run(folder.path, data=options.data, device=options.device)
 

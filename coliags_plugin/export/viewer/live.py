@@ -83,10 +83,12 @@ def check_server(host: str, port: int) -> None:
         raise InputError(f"`host={host}`: {error.strerror or error}", expected) from error
 
 
-class Viewer:
+class Viewer(Follower):
     """A run that is served to browsers, until it is closed. Use it as a context manager, or close it.
 
-    A thread draws for all browsers in turn, and takes up newer checkpoints of the run.
+    A thread draws for all browsers in turn, and takes up newer checkpoints of the run. As a follower of a trainer it
+    shows the run as it is after the newest step: pictures are drawn between steps, by the thread that trains, so that
+    nothing changes meanwhile, and the run is the same to the bit.
 
     Args:
         trained: The run.
@@ -100,7 +102,7 @@ class Viewer:
     ) -> None:
         self.trained, self._host = trained, host
         self._sessions: dict[int, Session] = {}
-        self._wake, self._closed = threading.Event(), False
+        self._wake, self._closed, self._due = threading.Event(), False, 0.0
         check_server(host, port)
         import viser
 
@@ -115,6 +117,17 @@ class Viewer:
         self._server.on_client_disconnect(lambda client: self._sessions.pop(client.client_id, None))
         if threaded:
             self._thread.start()
+
+    @classmethod
+    def of_training(cls, trainer: Trainer, port: int) -> Self:
+        """A view of a run that is trained, a follower of its trainer."""
+        method, provenance, scale = trainer.method, trainer.provenance(), trainer.scene.provenance.training_scale
+        scene, model = trainer.scene.scaled(1.0 / scale), trainer.model.with_field(trainer.model.field, scale)
+        trained = TrainedRun(
+            trainer.run, method.config, method.name, scene, model, trainer.step, trainer.device,
+            trainer.seed, provenance,
+        )  # fmt: skip
+        return cls(trained, port=port, threaded=False)
 
     @property
     def port(self) -> int:
@@ -173,6 +186,16 @@ class Viewer:
         self.trained = trained
         for session in self.sessions:
             session.model_changed()
+
+    def stepped(self, step: int) -> None:
+        """Bring browsers up to date after a training step, where it is time to."""
+        began = time.monotonic()
+        if began < self._due:
+            return
+        self.show(replace(self.trained, step=step))
+        self.draw()
+        now = time.monotonic()
+        self._due = now + (now - began) * (1.0 / _SHARE - 1.0)
 
     def wait(self) -> None:
         """Wait until the process is interrupted."""
@@ -407,39 +430,6 @@ class Session:
             return
         command = shlex.join(["coliags", "render", str(run), "--path", str(run / PATH_FILE)])
         self.path_line.content = f"Saved. Its video: `{command}`"
-
-
-class LiveView(Follower):
-    """Shows a run to browsers while it is trained, as it is after the newest step.
-
-    Pictures are drawn between steps, by the thread that trains: nothing changes meanwhile, and the run is the same to
-    the bit.
-    """
-
-    def __init__(self, trainer: Trainer, port: int = 8080) -> None:
-        method, provenance = trainer.method, trainer.provenance()
-        scale = trainer.scene.provenance.training_scale
-        scene, model = trainer.scene.scaled(1.0 / scale), trainer.model.with_field(trainer.model.field, scale)
-        trained = TrainedRun(
-            trainer.run, method.config, method.name, scene, model, trainer.step, trainer.device,
-            trainer.seed, provenance,
-        )  # fmt: skip
-        self.viewer = Viewer(trained, port=port, threaded=False)
-        self._due = 0.0
-
-    def stepped(self, step: int) -> None:
-        """Bring browsers up to date, where it is time to."""
-        began = time.monotonic()
-        if began < self._due:
-            return
-        self.viewer.show(replace(self.viewer.trained, step=step))
-        self.viewer.draw()
-        now = time.monotonic()
-        self._due = now + (now - began) * (1.0 / _SHARE - 1.0)
-
-    def close(self) -> None:
-        """Stop serving."""
-        self.viewer.close()
 
 
 def _fov(camera: Camera) -> float:

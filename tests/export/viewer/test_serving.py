@@ -222,21 +222,21 @@ def test_a_browser_sees_what_the_newest_step_has_of_a_run_that_stays_the_same(tm
     alone.start()
     alone.train()
     watched.start()
-    view = live.LiveView(watched, port=0)
+    view = live.Viewer.of_training(watched, port=0)
     camera = watched.scene.train[1].camera
-    with ViserClient(view.viewer.port) as client:
+    with ViserClient(view.port) as client:
         client.look(camera)
-        session_of(view.viewer)
+        session_of(view)
         watched.train(followers=[view])
         assert client.picture().shape[2] == 3
     assert_same(final_state(alone), final_state(watched))
-    again = live.LiveView(watched, port=0)
-    with ViserClient(again.viewer.port) as client:
+    again = live.Viewer.of_training(watched, port=0)
+    with ViserClient(again.port) as client:
         client.look(camera)
-        session = session_of(again.viewer)
+        session = session_of(again)
         time.sleep(live.REST)
         again.stepped(7)
-        assert_like(newest(client), eight_bit(render_view(again.viewer.trained, browsers(camera)).rgb))
+        assert_like(newest(client), eight_bit(render_view(again.trained, browsers(camera)).rgb))
         assert session._about.content.startswith("Step 7;")
     again.close()
 
@@ -244,14 +244,14 @@ def test_a_browser_sees_what_the_newest_step_has_of_a_run_that_stays_the_same(tm
 def test_drawing_takes_a_share_of_the_time(tmp_path, monkeypatch):
     trainer = make_trainer(tmp_path / "run")
     trainer.start()
-    view, now, drawn = live.LiveView(trainer, port=0), [0.0], []
+    view, now, drawn = live.Viewer.of_training(trainer, port=0), [0.0], []
 
     def draw():
-        drawn.append(view.viewer.trained.step)
+        drawn.append(view.trained.step)
         now[0] += 2.0
 
     monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(view.viewer, "draw", draw)
+    monkeypatch.setattr(view, "draw", draw)
     for step in range(1, 31):
         now[0] += 1.0
         view.stepped(step)
