@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,8 +19,8 @@ from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.distillation import adjusted_camera, distil, needs_distillation
-from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, cloud_of_field, field_of_cloud
-from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians, ExplicitGaussiansSettings
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud
+from coliags_plugin.fields.explicit_gaussians import INVERSE_SQUARE, ExplicitGaussians
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE, Y0, basis
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
@@ -101,32 +100,20 @@ class GaussianAverages:
         shown = self._element_weights.repeat_interleave(self._per_element)
         return self._opacities / shown.clamp_min(_NONE)
 
-    def field(
-        self,
-        slots: Int[Tensor, "N"],
-        harmonics: Float[Tensor, "N B 3"],
-        kind: type[ExplicitGaussians] = ExplicitGaussians,
-    ) -> ExplicitGaussians:
-        """The averages of some slots as an explicit field of a kind, with colours to degree D, B = (D + 1)^2."""
+    def cloud(self, slots: Int[Tensor, "N"], harmonics: Float[Tensor, "N B 3"], attenuated: bool = False) -> SplatCloud:
+        """The averages of some slots with given colours, which may fall with the distance to the lamp."""
         weights = self._weights[slots][:, None]
-        log_scales = self._log_scales[slots] / weights
-        thickness = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS_SHARE)  # of surfels, as in files
-        values = {
-            "means": self._means[slots] / weights,
-            "scales": torch.cat([log_scales, thickness], dim=1)[:, :3],
-            "quats": torch.linalg.eigh(self._rotations[slots]).eigenvectors[:, :, -1],
-            "opacities": torch.logit(self._mean_opacities()[slots].clamp(1e-4, 1.0 - 1e-4)),
-            "sh0": harmonics[:, :1],
-            "shN": harmonics[:, 1:],
-            "degree": torch.tensor(math.isqrt(harmonics.shape[1]) - 1),
-        }
-        if issubclass(kind, AttenuatedGaussians):
-            values["distances"] = (self._log_distances[slots] / weights).exp()
-        field = kind(ExplicitGaussiansSettings(sh_degree=int(values["degree"])), len(slots)).to(slots.device)
-        with torch.no_grad():
-            for name, value in values.items():
-                getattr(field, name).copy_(value)
-        return field
+        parts = [
+            self._means[slots] / weights,
+            torch.linalg.eigh(self._rotations[slots]).eigenvectors[:, :, -1],
+            (self._log_scales[slots] / weights).exp(),
+            self._mean_opacities()[slots].clamp(1e-4, 1.0 - 1e-4),
+            harmonics,
+        ]
+        if attenuated:
+            distances = (self._log_distances[slots] / weights).exp()
+            parts.append(torch.cat([distances, torch.full_like(distances, INVERSE_SQUARE)], dim=1))
+        return SplatCloud.of_tensors(*parts).with_thickness()
 
 
 #: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
@@ -143,7 +130,7 @@ def bake(
     seconds: float = SECONDS,
     most: int | None = None,
     degree: int = MAX_DEGREE,
-    kind: type[ExplicitGaussians] = ExplicitGaussians,
+    attenuated: bool = False,
     most_steps: int | None = None,
 ) -> tuple[SplatCloud, dict[str, Any]]:
     """Convert a field to one cloud of Gaussians for all views, under a held light; facts are empty if unchanged.
@@ -170,7 +157,8 @@ def bake(
     visible, steps = len(slots), 0
 
     def field(slots: Int[Tensor, "N"]) -> ExplicitGaussians:
-        return averages.field(slots, fit_harmonics(colors, slots, averages.mean_colors(slots), degree), kind)
+        harmonics = fit_harmonics(colors, slots, averages.mean_colors(slots), degree)
+        return field_of_cloud(averages.cloud(slots, harmonics, attenuated))
 
     if most is not None:
         slots = averages.heaviest(most)

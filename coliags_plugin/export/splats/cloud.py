@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 from scipy.special import logit
+from torch import Tensor
 
 from coliags_plugin.config.options import SPLAT_FORMATS
 from coliags_plugin.core import bounds
@@ -48,6 +49,11 @@ class SplatCloud:
     # of colours that follow a lamp at the camera: distances where they are as given, scene units, and the exponents of
     # their fall (:class:`~coliags_plugin.fields.explicit_gaussians.AttenuatedGaussians`); no file format keeps them
     attenuation: Float32[np.ndarray, "N 2"] | None = None
+
+    @classmethod
+    def of_tensors(cls, *parts: Tensor) -> SplatCloud:
+        """A cloud of tensors in the order of its arrays."""
+        return cls(*(np.ascontiguousarray(part.detach().cpu().float().numpy()) for part in parts))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -130,7 +136,7 @@ def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:
     parts = [field.means, field.quats, field.scales.exp(), field.opacities.sigmoid(), harmonics]
     if isinstance(field, AttenuatedGaussians):
         parts.append(torch.cat([field.distances, field.exponents], dim=1))
-    return SplatCloud(*(np.ascontiguousarray(part.detach().cpu().float().numpy()) for part in parts))
+    return SplatCloud.of_tensors(*parts)
 
 
 def load_cloud(field: ExplicitGaussians, cloud: SplatCloud) -> None:

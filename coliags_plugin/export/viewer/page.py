@@ -33,7 +33,7 @@ from coliags_plugin.export.baking.distillation import adjusted_camera, best_fram
 from coliags_plugin.export.baking.exporting import cost_lines, export_cost, light_facts
 from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import SplatCloud, field_of_cloud
-from coliags_plugin.fields.explicit_gaussians import FARTHEST, AttenuatedGaussians, ExplicitGaussians
+from coliags_plugin.fields.explicit_gaussians import FARTHEST
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.renderers.splatting import SplattingRenderer
@@ -250,8 +250,8 @@ def _page_of_gaussians(
     empty = len(_html(trained, path, meshes).encode()) + _LINE_BYTES
     if largest < empty + _BYTES:
         raise InputError(f"a page of {largest} bytes", f"more than {empty + _BYTES} bytes, what an empty one takes")
-    kind = AttenuatedGaussians if lamp is None and field.knows_lamp else ExplicitGaussians
-    splats, baking = bake(trained, lamp, options.seconds, (largest - empty) // _BYTES, 0, kind, most_steps)
+    attenuated = lamp is None and field.knows_lamp
+    splats, baking = bake(trained, lamp, options.seconds, (largest - empty) // _BYTES, 0, attenuated, most_steps)
     first = best_frame(field_of_cloud(splats), trained, lamp)
     layer, drawn = Layer.of_cloud("Gaussians", splats)
     while empty + (size := len(json.dumps(layer.packed))) > largest:

@@ -14,6 +14,7 @@ from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.engine.held_light import mean_camera
 from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
+from coliags_plugin.export.splats.cloud import field_of_cloud
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
 from tests.scenes import camera_at
@@ -81,7 +82,7 @@ def test_averages_of_the_same_gaussians_are_these():
     averages, camera = GaussianAverages(12, 1, 3, torch.device("cpu")), camera_at(0, 0, 0)
     for flip in (1.0, -1.0, 2.5):  # a quaternion and its negative are the same rotation
         averages.add(replace(gaussians, quats_wxyz=flip * gaussians.quats_wxyz), torch.rand(12) + 0.1, camera)
-    field = averages.field(averages.visible(), torch.zeros(12, 16, 3))
+    field = field_of_cloud(averages.cloud(averages.visible(), torch.zeros(12, 16, 3)))
     assert int(field.degree) == 3
     torch.testing.assert_close(field.means, gaussians.means)
     torch.testing.assert_close(field.scales.exp(), gaussians.scales)
@@ -99,7 +100,7 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
     averages = GaussianAverages(1, 2, 3, torch.device("cpu"))
     averages.add(both, torch.tensor([3.0, 1.0]), camera_at(0, 0, 0))
     averages.add(first, torch.tensor([4.0]), camera_at(0, 0, 0))
-    field = averages.field(averages.visible(), torch.zeros(2, 1, 3))
+    field = field_of_cloud(averages.cloud(averages.visible(), torch.zeros(2, 1, 3)))
     # Both views show 4 pixels of the anchor; the second child is in the first view only.
     torch.testing.assert_close(field.opacities.sigmoid(), torch.tensor([0.8, 0.3]))
     torch.testing.assert_close(field.means, both.means)

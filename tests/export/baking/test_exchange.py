@@ -23,7 +23,6 @@ from coliags_plugin.export.baking import distillation
 from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.exporting import export_cost
 from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud, read_splats, write_splats
-from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians, ExplicitGaussians
 from tests.commands import refused, run
 from tests.export.splats.clouds import PARTS, random_cloud
 
@@ -123,8 +122,8 @@ def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatc
         frames[index] = Frame.of(name=frame.name, index=frame.index, camera=frame.camera, image=image)
     monkeypatch.setattr(distillation, "STEPS", 60)
     between, clouds = [], []
-    for kind in (ExplicitGaussians, AttenuatedGaussians):
-        field = field_of_cloud(bake(trained, None, degree=0, kind=kind)[0])
+    for attenuated in (False, True):
+        field = field_of_cloud(bake(trained, None, degree=0, attenuated=attenuated)[0])
         distillation.distil(field, trained, None, seconds=600.0)
         clouds.append(cloud_of_field(field))
         between.append(export_cost(trained, clouds[-1], None)["test"]["psnr_between"])
