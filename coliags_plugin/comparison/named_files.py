@@ -70,7 +70,7 @@ class BenchmarkScene(Settings):
         return ((self.folder,) if isinstance(self.folder, str) else self.folder) or (name,)
 
 
-class BenchmarkSettings(Settings):
+class Benchmark(Settings):
     """Content of a benchmark's file."""
 
     description: str  # one line
@@ -89,26 +89,16 @@ class BenchmarkSettings(Settings):
                 raise ValueError(f"scene name '{name}': expected letters, digits, dots, hyphens and underscores")
         return {name: {} if entry is None else entry for name, entry in scenes.items()}
 
-
-@dataclass(frozen=True)
-class Benchmark:
-    """A benchmark by its name."""
-
-    name: str
-    settings: BenchmarkSettings
-
     def overrides(self, scene: str) -> tuple[str, ...]:
         """``key.path=value`` changes of a method config with which a scene is read."""
-        entry = self.settings.scenes[scene]
-        split = {} if self.settings.split is None else {"split": self.settings.split}
-        options = {**split, **self.settings.options, **entry.options}
+        split = {} if self.split is None else {"split": self.split}
+        options = {**split, **self.options, **self.scenes[scene].options}
         return tuple(f"datamanager.{key}={dump_inline(value)}" for key, value in options.items())
 
 
 def load_benchmark(name: str) -> Benchmark:
     """Read a shipped benchmark by its name, or a YAML file."""
-    path, settings = _read_file(name, "", BenchmarkSettings, "benchmark")
-    return Benchmark(path.stem, settings)
+    return _read_file(name, "", Benchmark, "benchmark")[1]
 
 
 @dataclass(frozen=True)

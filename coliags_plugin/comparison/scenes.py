@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.comparison.named_files import Benchmark, load_benchmark, shipped
+from coliags_plugin.comparison.named_files import load_benchmark, shipped
 from coliags_plugin.config.method_files import is_path
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, check_name, did_you_mean
@@ -61,10 +61,10 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
     sources: list[SceneSource] = []
     benchmarks: set[str] = set()
     for name in names:
-        benchmark, scene = _benchmark(name)
-        if benchmark is not None:
-            benchmarks.add(benchmark.name)
-            sources += _scenes_of(benchmark, scene, data or SCENES / benchmark.name)
+        file, scene = _benchmark(name)
+        if file:
+            benchmarks.add(Path(file).stem)
+            sources += _scenes_of(file, scene, data or SCENES / Path(file).stem)
         elif (folder := user_path(name)).is_dir():
             sources.append(SceneSource(folder.resolve().name, folder.resolve()))
         else:
@@ -104,27 +104,26 @@ def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = No
                 generate(source.phantom, source.path, progress=progress)
 
 
-def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
-    """The benchmark that a name stands for, and the one scene of it; None and None for a folder."""
+def _benchmark(name: str) -> tuple[str, str | None]:
+    """Benchmark, by name or path, that a name stands for, and the one scene of it; no benchmark for a folder."""
     files = shipped()
     if name in files or is_path(name):
-        return load_benchmark(name), None
+        return name, None
     first, _, scene = name.rpartition("/")
-    if (first in files or is_path(first)) and scene and not user_path(name).is_dir():
-        return load_benchmark(first), scene
-    return None, None
+    is_scene = (first in files or is_path(first)) and scene and not user_path(name).is_dir()
+    return (first, scene) if is_scene else ("", None)
 
 
-def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[SceneSource]:
+def _scenes_of(file: str, only: str | None, data: Path) -> list[SceneSource]:
     """Scenes of a benchmark, or one of them, each in the first of its folders that is there."""
-    scenes, sources = benchmark.settings.scenes, []
+    benchmark, sources = load_benchmark(file), []
     if only is not None:
-        check_name(f"scene of benchmark '{benchmark.name}'", only, scenes)
-    for name in scenes if only is None else [only]:
-        entry = scenes[name]
+        check_name(f"scene of benchmark '{Path(file).stem}'", only, benchmark.scenes)
+    for name in benchmark.scenes if only is None else [only]:
+        entry = benchmark.scenes[name]
         folders = [(data / user_path(folder)).resolve() for folder in entry.folders(name)]
         folder = next((path for path in folders if path.is_dir()), folders[0])
-        data_format = entry.format or benchmark.settings.format
+        data_format = entry.format or benchmark.format
         sources.append(SceneSource(name, folder, benchmark.overrides(name), data_format, entry.phantom))
     return sources
 

@@ -61,7 +61,7 @@ def departures(settings: PhantomSettings) -> set[str]:
 
 @pytest.mark.parametrize(("name", "unassumed"), [("phantoms-12", 7), ("phantoms-tuning", 2)])
 def test_the_benchmarks_have_both_kinds_of_scenes(name, unassumed):
-    scenes = {key: scene.phantom for key, scene in load_benchmark(name).settings.scenes.items()}
+    scenes = {key: scene.phantom for key, scene in load_benchmark(name).scenes.items()}
     assert all(key.endswith(f"-{chosen.seed}") for key, chosen in scenes.items())
     kinds = [kind for chosen in scenes.values() if (kind := departures(chosen))]
     assert len(kinds) == len({frozenset(kind) for kind in kinds}) == unassumed < len(scenes)
@@ -72,7 +72,7 @@ def test_the_benchmarks_have_both_kinds_of_scenes(name, unassumed):
 
 
 def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
-    scenes = {key: scene.phantom for key, scene in load_benchmark("phantoms-tracked").settings.scenes.items()}
+    scenes = {key: scene.phantom for key, scene in load_benchmark("phantoms-tracked").scenes.items()}
     errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
     for key, chosen in scenes.items():
         assert key.endswith(f"-{chosen.seed}")

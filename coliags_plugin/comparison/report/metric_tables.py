@@ -171,13 +171,11 @@ def _footnote(
     lacking, shared = [scene for scene in evaluated if scene not in values[method]], shared_scenes(values)
     if not evaluated:
         return f"{method}: no result"
-    if lacking:
-        reason = test_set.reason(method, column.key, lacking[0])
-        where = f"not available for {', '.join(lacking)}; " if shared and values[method] else ""
-        if where or not values[method]:
-            return f"{column.title}: {where}{reason}"
-    if not shared:
+    if values[method] and not shared:
         return f"{column.title}: no scene that all methods have"
+    if lacking:
+        where = f"not available for {', '.join(lacking)}; " if values[method] else ""
+        return f"{column.title}: {where}{test_set.reason(method, column.key, lacking[0])}"
     frames = [
         value
         for scene in shared
@@ -186,9 +184,8 @@ def _footnote(
     ]
     if None not in frames:
         return ""
-    having = len(frames) - frames.count(None)
-    reason = test_set.reason(method, column.key)
-    return f"{column.title}: mean over {having} of {len(frames)} frames; {reason}"
+    share = f"{len(frames) - frames.count(None)} of {len(frames)} frames"
+    return f"{column.title}: mean over {share}; {test_set.reason(method, column.key)}"
 
 
 def _summary_notes(test_set: TestSet, columns: Sequence[Column]) -> list[str]:
@@ -228,7 +225,6 @@ def _titles(columns: Sequence[Column]) -> str:
 
 
 # Costs
-
 
 #: Largest number of PSNR marks.
 _MARKS_SHOWN = 3
