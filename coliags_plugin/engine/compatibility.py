@@ -51,7 +51,7 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
         raise InputError(
             f"sampler '{config.sampler.name}' with renderer '{chosen.name}', which draws whole images",
             "a renderer of radiance fields",
-            "Set `sampler=frames`",
+            "Use `sampler=frames`",
         )
     whole = [(f"loss term '{key}'", "losses of", f"losses.{key}") for key, loss in losses.items() if loss.whole_image]
     whole += [
@@ -63,7 +63,7 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
         raise InputError(
             f"{what} needs whole images, and sampler '{config.sampler.name}' gives single pixels",
             f"{others} single pixels",
-            f"Remove it with `{option}=null`, or set `sampler=frames`",
+            f"Remove it with `{option}=null`, or use `sampler=frames`",
         )
 
 

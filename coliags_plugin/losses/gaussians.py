@@ -111,7 +111,7 @@ class SurfaceNormalsLoss(Loss[SurfaceNormalsSettings]):
                 "loss term 'surface-normals' compares Gaussians with normals of the initial points, and the field has "
                 "none",
                 "a field of explicit Gaussians with reference normals",
-                "Set `field.normal_neighbours=10`, or remove the term",
+                "Use `field.normal_neighbours=10`, or remove the term",
             )
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:

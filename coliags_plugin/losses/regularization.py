@@ -53,7 +53,7 @@ class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
         """The unweighted term, from 0 (consistent and opaque) to 2; refuses pixels of several cameras."""
         output, mask = step.output, step.target.mask
         if output.camera is None:
-            raise InputError("normals of single pixels", "whole images", "Set `sampler=frames`")
+            raise InputError("normals of single pixels", "whole images", "Use `sampler=frames`")
         depth = output[self.settings.depth]
         is_known = depth > 0 if mask is None else (depth > 0) & mask
         of_depth = depth_normals(depth, output.camera, is_known) * zero_outside(output.alpha.detach(), mask)[..., None]

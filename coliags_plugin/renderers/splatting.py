@@ -260,4 +260,4 @@ def _others(primitive: str, device: torch.device) -> str:
         for name, renderer_class in classes.items()
         if primitive in renderer_class.primitives and device.type in renderer_class.devices
     ]
-    return f"Set `renderer=NAME`, NAME being {' or '.join(able)}" if able else ""
+    return f"Use `renderer=NAME`, NAME being {' or '.join(able)}" if able else ""
