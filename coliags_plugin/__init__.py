@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, report, variant

@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coliags_plugin._version import __version__
 from coliags_plugin.checks.results import CheckFailedError, CheckResult, CheckSkippedError, fail_if, run_check
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import is_auto, make_component
+from coliags_plugin.core import __version__
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.gaussians import Gaussians

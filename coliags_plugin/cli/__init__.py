@@ -11,9 +11,9 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from coliags_plugin._version import __version__
 from coliags_plugin.cli import comparing, methods, poses, reconstruct, runs, scenes
 from coliags_plugin.cli.arguments import Runnable, hint, in_flags, translate_for
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import ReportedError
 from coliags_plugin.core.libraries import separate_stderr
 

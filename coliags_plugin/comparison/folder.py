@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 
-from coliags_plugin._version import __version__
 from coliags_plugin.comparison.plan import ComparisonCell, Request
 from coliags_plugin.comparison.plan_file import (
     PLAN_FILE,
@@ -21,6 +20,7 @@ from coliags_plugin.comparison.plan_file import (
 )
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked

@@ -16,9 +16,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Renderer, Sampler, Strategy
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder, differing_files, final_place, write_checksums, write_json
 from coliags_plugin.core.json_files import JsonObject, json_text, parse_json

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.results.hashing import code_key

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.tasks import STOPPING, Executor, LocalWorker, Task, TaskOutcome

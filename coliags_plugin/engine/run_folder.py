@@ -15,8 +15,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, reporting_unwritable, write_json
 from coliags_plugin.core.jobs import locked

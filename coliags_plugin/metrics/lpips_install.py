@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.files import atomic_path, file_sha256
 from coliags_plugin.metrics.lpips import (

@@ -15,8 +15,8 @@ import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin._version import __version__
 from coliags_plugin.config.registry import phantom_layouts
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_arrays, write_json
 from coliags_plugin.core.images import write_image

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import locked

@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from jinja2.environment import TemplateModule
 from markupsafe import Markup, escape
 
-from coliags_plugin._version import __version__
+from coliags_plugin.core import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.reporting.charts import Axes, color_stops, style_classes

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import tyro
 
-from coliags_plugin._version import __version__
 from coliags_plugin.cli import COMMANDS
 from coliags_plugin.cli.arguments import hint, in_flags, subcommands, translate_for
 from coliags_plugin.cli.summaries import print_summary
+from coliags_plugin.core import __version__
 from tests.commands import run
 
 #: Options that come last, in this order.
