@@ -64,7 +64,7 @@ def drawn_children(
 def visible_anchors(rows: AnchorRows, camera: Camera) -> Int[Tensor, "V"]:
     """Indices of anchors of which any child may overlap the image, by a kernel for float32 on the CPU."""
     from coliags_plugin.core.numba_kernels.threads import workers
-    from coliags_plugin.fields.numba_kernels.frustum import find_visible
+    from coliags_plugin.fields.numba_kernels.decoding import find_visible
 
     camera = camera.to(torch.device("cpu"), torch.float32)
     visible = torch.empty(len(rows.positions), dtype=torch.bool)

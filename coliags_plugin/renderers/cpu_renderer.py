@@ -34,15 +34,10 @@ _IMAGES = {
 }
 
 
-class CpuRendererSettings(CutSettings):
-    """Options of :class:`CpuRenderer`: those of the torch renderer, with its defaults."""
-
-
-class CpuRenderer(SplattingRenderer[CpuRendererSettings]):
+class CpuRenderer(SplattingRenderer[CutSettings]):
     """CPU renderer of float32 3D Gaussians and surfels: ``docs/rendering.md``, section "The cpu backend"."""
 
-    Settings = CpuRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
+    Settings = CutSettings
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
     name: ClassVar[str] = "cpu"
 
@@ -62,7 +57,7 @@ def render_gaussians(
     gaussians: Gaussians,
     camera: Camera,
     wants: Sequence[str] = ("rgb", "alpha"),
-    settings: CpuRendererSettings | None = None,
+    settings: CutSettings | None = None,
 ) -> RenderOutput:
     """Render float32 3D Gaussians on the CPU, or surfels where they have two scales, from a camera.
 
@@ -76,7 +71,7 @@ def render_gaussians(
     """
     from coliags_plugin.renderers.numba_kernels import autograd, pipeline
 
-    settings = settings or CpuRendererSettings()
+    settings = settings or CutSettings()
     check_gaussian_outputs(wants, gaussians)
     _check_tensors(gaussians)
     pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
@@ -108,7 +103,7 @@ def render_gaussians(
     return RenderOutput(by_name["rgb"], by_name["alpha"], camera, maps, Splats(gaussians, means2d, radii))
 
 
-def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:
+def _view_table(camera: Camera, pose: Tensor, settings: CutSettings) -> np.ndarray:
     """Camera and options as the float32 table of the kernels (``numba_kernels/layout.py``)."""
     matrix = pose.detach().double().numpy()
     if matrix.shape != (4, 4):

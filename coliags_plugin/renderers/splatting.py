@@ -42,7 +42,7 @@ class SplattingSettings(Settings):
 
 
 class CutSettings(SplattingSettings):
-    """Options of renderers whose alpha and transmittance thresholds are configurable."""
+    """Options of this package's renderers, whose alpha and transmittance thresholds are configurable."""
 
     alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
     """Upper bound of alpha at any pixel."""
@@ -72,6 +72,7 @@ SplattingT = TypeVar("SplattingT", bound=SplattingSettings, default=SplattingSet
 class SplattingRenderer(Renderer[SplattingT, GaussianField]):
     """Base class of renderers that splat a :class:`GaussianField` into whole images."""
 
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS) - SURFEL_OUTPUTS
 
     @classmethod

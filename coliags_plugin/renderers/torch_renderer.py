@@ -31,7 +31,6 @@ class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
     """Reference renderer of 3D Gaussians and surfels, on any device, in float32 or float64: ``docs/rendering.md``."""
 
     Settings = TorchRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     name: ClassVar[str] = "torch"
 

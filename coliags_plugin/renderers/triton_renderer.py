@@ -17,15 +17,10 @@ from coliags_plugin.renderers.stages import Stages, draw_view
 from coliags_plugin.renderers.tiles import TileGrid
 
 
-class TritonRendererSettings(CutSettings):
-    """Options of :class:`TritonRenderer`: those of the torch renderer, with its defaults."""
-
-
-class TritonRenderer(SplattingRenderer[TritonRendererSettings]):
+class TritonRenderer(SplattingRenderer[CutSettings]):
     """Renderer of float32 3D Gaussians and surfels on CUDA: ``docs/rendering.md``, section "The triton backend"."""
 
-    Settings = TritonRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
+    Settings = CutSettings
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
     name: ClassVar[str] = "triton"
 
@@ -48,7 +43,7 @@ def render_gaussians(
     gaussians: Gaussians,
     camera: Camera,
     wants: Sequence[str] = ("rgb", "alpha"),
-    settings: TritonRendererSettings | None = None,
+    settings: CutSettings | None = None,
 ) -> RenderOutput:
     """Render float32 3D Gaussians, or surfels where they have two scales, from a camera, on their device.
 
@@ -60,10 +55,10 @@ def render_gaussians(
         InputError: An output is unknown or not of these Gaussians, or these are not float32.
     """
     check_float32(gaussians, "triton")
-    from coliags_plugin.renderers.triton_kernels import compositing, placing, tile
+    from coliags_plugin.renderers.triton_kernels import compositing, placing, sweeps
 
-    settings = settings or TritonRendererSettings()
-    grid = TileGrid(camera.width, camera.height, tile.TILE_SIZE)
+    settings = settings or CutSettings()
+    grid = TileGrid(camera.width, camera.height, sweeps.TILE_SIZE)
     stages = Stages(
         placing.place_gaussians, compositing.composite_gaussians, placing.place_surfels, compositing.composite_surfels
     )

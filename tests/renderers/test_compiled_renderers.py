@@ -20,6 +20,7 @@ from coliags_plugin.core.gaussians import rotation_matrices
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer, triton_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
+from coliags_plugin.renderers.torch_renderer import TorchRendererSettings
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
 from tests.renderers.test_surfels import as_surfels, make_surfels, outputs_of
@@ -32,8 +33,6 @@ needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton is
 
 class OnCuda:
     """The triton renderer on a device, from and to tensors on the CPU."""
-
-    TritonRendererSettings = triton_renderer.TritonRendererSettings
 
     @staticmethod
     def render_gaussians(gaussians, camera, wants=("rgb", "alpha"), settings=None):
@@ -102,7 +101,7 @@ def on_a_cutoff(gaussians, camera):
     """Pixels that look different where the cut-offs are moved, or show a disc close to its horizon."""
     gaussians, camera = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
     are_surfels = gaussians.scales.shape[1] == 2
-    kind = torch_renderer.TorchRendererSettings
+    kind = TorchRendererSettings
     alphas = []
     for factor in (1 - CUTOFF_MARGIN, 1 + CUTOFF_MARGIN):
         cuts = {name: getattr(kind(), name) * factor for name in ("alpha_min", "transmittance_min")}
@@ -114,7 +113,7 @@ def on_a_cutoff(gaussians, camera):
 
 
 def near_horizon(gaussians, camera):
-    plain = torch_renderer.TorchRendererSettings()
+    plain = TorchRendererSettings()
     pose = camera.camera_to_world
     axes = pose[:3, :3].T @ rotation_matrices(gaussians.quats_wxyz)
     centers = (gaussians.means - pose[:3, 3]) @ pose[:3, :3]
@@ -134,10 +133,6 @@ def near_horizon(gaussians, camera):
     return horizon
 
 
-def settings_of(module):
-    return next(value for name, value in vars(module).items() if name.endswith("RendererSettings"))
-
-
 def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d=0.0):
     """Output and gradients of one renderer under random cotangents, which are 0 at the pixels ignored."""
     wants = wants or outputs_of(gaussians)
@@ -148,7 +143,7 @@ def drawn(module, gaussians, camera, dtype, wants=None, ignored=None, of_means2d
         dataclasses.replace(gaussians, features=features),
         dataclasses.replace(camera, camera_to_world=pose),
         wants,
-        settings_of(module)(background=BACKGROUND),
+        TorchRendererSettings(background=BACKGROUND),
     )
     generator = torch.Generator().manual_seed(1)
     widths = {name: 3 if name in ("rgb", "normals") else 0 for name in OUTPUTS} | FEATURES
@@ -318,8 +313,8 @@ def test_bins_miss_no_pixel_that_a_surfel_reaches(renderer, seed, size, depth, l
     )
     gaussians = cast(as_surfels(gaussians), torch.float32)
     camera = pinhole(45, 38, 30.0, 27.0, dtype=torch.float32)
-    ours = renderer.render_gaussians(gaussians, camera, settings=settings_of(renderer)(surfel_filter=low_pass))
-    kind = torch_renderer.TorchRendererSettings
+    ours = renderer.render_gaussians(gaussians, camera, settings=TorchRendererSettings(surfel_filter=low_pass))
+    kind = TorchRendererSettings
     exact, posed = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
     true = torch_renderer.render_gaussians(exact, posed, settings=kind(surfel_filter=low_pass)).alpha
     # Pixels on the edge of what is drawn may fall to either side.
@@ -360,7 +355,7 @@ def test_what_is_not_drawn_leaves_no_trace(renderer, near_plane):
     scales = torch.tensor([[0.3, 0.3], [0.3, 0.0], [0.3, 0.3], [0.3, 0.3]])
     gaussians = make_surfels(means, scales, torch.tensor([0.9, 0.9, 1 / 256, 0.9]))
     gaussians = cast(gaussians, torch.float32, grad=True)
-    options = settings_of(renderer)(background=(0.1, 0.2, 0.3))
+    options = TorchRendererSettings(background=(0.1, 0.2, 0.3))
     camera = dataclasses.replace(pinhole(dtype=torch.float32), near_plane=near_plane)
     output = renderer.render_gaussians(gaussians, camera, OUTPUTS, options)
     assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(7, 9, 3))
@@ -455,7 +450,7 @@ def test_extreme_sizes_and_views_stay_finite(renderer, seed, exponent):
 
 def test_triton_refuses_what_its_kernels_cannot_take():
     gaussians, camera = scene("gaussians3d")
-    renderer = triton_renderer.TritonRenderer(triton_renderer.TritonRendererSettings())
+    renderer = triton_renderer.TritonRenderer(TorchRendererSettings())
     with pytest.raises(InputError, match="Gaussians on cpu for the triton renderer"):
         renderer.draw(gaussians, camera, ("rgb",))
     with pytest.raises(InputError, match="Gaussians of dtype float64 for the triton renderer"):

@@ -37,25 +37,20 @@ TYPES = {
 
 def of_renderer():
     """Kernels for images of few and many channels, with all outputs: name, kernel, types, constants and options."""
-    from coliags_plugin.renderers.triton_kernels import (
-        binning,
-        gaussians,
-        geometry,
-        projection,
-        surfel_projection,
-        surfels,
-        tile,
-    )
+    from coliags_plugin.renderers.triton_kernels import binning, geometry, projection, surfel_projection, sweeps
 
     everything = dict.fromkeys(("WITH_MEDIANS", "WITH_DEPTHS", "WITH_NORMALS"), True)
     composited = [
-        (kernel, warps, {"CHANNELS": wide, "SIZE": tile.TILE_SIZE, "RANKS": tile.RANKS})
-        for module in (gaussians, surfels)
-        for kernel, warps in ((module.forward, tile.FORWARD_WARPS), (module.backward, tile.BACKWARD_WARPS))
+        (kernel, warps, {"CHANNELS": wide, "SIZE": sweeps.TILE_SIZE, "RANKS": sweeps.RANKS})
+        for kernels, warps in (
+            ((sweeps.gaussians_forward, sweeps.surfels_forward), sweeps.FORWARD_WARPS),
+            ((sweeps.gaussians_backward, sweeps.surfels_backward), sweeps.BACKWARD_WARPS),
+        )
+        for kernel in kernels
         for wide in (16, 32)
     ]
     placed = [
-        (kernel, geometry.WARPS, {"SIZE": tile.TILE_SIZE, "BLOCK": geometry.BLOCK, "EMIT": emit})
+        (kernel, geometry.WARPS, {"SIZE": sweeps.TILE_SIZE, "BLOCK": geometry.BLOCK, "EMIT": emit})
         for kernel, emits in (
             (projection.forward, [0]), (projection.backward, [0]), (binning.find_pairs, [False, True]),
             *((kernel, [0]) for kernel in (surfel_projection.centers, surfel_projection.centers_backward)),

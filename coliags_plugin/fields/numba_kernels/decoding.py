@@ -1,4 +1,4 @@
-"""Anchors -> Gaussians by networks of one hidden layer, forward and backward, a tile of anchors at a time.
+"""Anchors -> Gaussians: frustum culling, and decoding by networks of one hidden layer, forward and backward, in tiles.
 
 Shapes: V visible anchors of M, K children each, N of V * K drawn; F features, G and A further inputs, embedded, of geometry
 and appearance. Networks lie side by side in the hidden layer, opacity, covariance, colour. Tables are flat float32 arrays in
@@ -15,10 +15,11 @@ import numpy as np
 from coliags_plugin.core.numba_kernels import lanes as vec
 from coliags_plugin.core.numba_kernels.compilation import Array, inline, kernel, part
 from coliags_plugin.core.numba_kernels.threads import pieces
-from coliags_plugin.fields.numba_kernels.matrices import multiply
 
-#: Anchors of a tile.
-TILE = 48
+#: Anchors of a tile, and anchors culled at a time.
+TILE, PARCEL = 48, 1024
+#: Rows of a product computed at a time: a register for each, and one for the other factor.
+ROWS = 8
 #: Parts of the tiles whose sums over anchors are kept apart, so that they do not depend on the number of threads.
 SLABS = 32
 #: Shortest quaternion, and smallest scale, that is divided by.
@@ -458,3 +459,85 @@ def _sigmoid(x):
 def _tanh(x):
     power = vec.exp2(vec.mul(vec.larger(-20.0, vec.smaller(20.0, x)), 2.0 * _LOG2_E))
     return vec.sub(1.0, vec.quick_div(2.0, vec.add(1.0, power)))
+
+
+# --- products of small matrices that stay in a core's cache -----------------------------------------------------------
+
+
+@part
+def multiply(shape, a, b, c):
+    """Add the product of two matrices to a third: C += A B.
+
+    ``shape`` is (rows of A and C, columns of B and C, a multiple of the lanes' width, columns of A and rows of B). A matrix is
+    its table, the place of its first element, the step to the next row and, of A, the step to the next column.
+    """
+    rows, columns, depth = shape
+    left, a_start, a_row, a_column = a
+    right, b_start, b_row = b
+    result, c_start, c_row = c
+    whole = rows - rows % ROWS
+    for column in range(0, columns, vec.WIDTH):
+        at_b = b_start + column
+        for row in range(0, whole, ROWS):
+            at_c, at_a = c_start + row * c_row + column, a_start + row * a_row
+            total = (
+                vec.load(result, at_c),
+                vec.load(result, at_c + c_row),
+                vec.load(result, at_c + 2 * c_row),
+                vec.load(result, at_c + 3 * c_row),
+                vec.load(result, at_c + 4 * c_row),
+                vec.load(result, at_c + 5 * c_row),
+                vec.load(result, at_c + 6 * c_row),
+                vec.load(result, at_c + 7 * c_row),
+            )
+            for d in range(depth):
+                total = vec.fma(_column(left, at_a + d * a_column, a_row), vec.load(right, at_b + d * b_row), total)
+            for r in range(ROWS):
+                vec.store(result, at_c + r * c_row, total[r])
+        for row in range(whole, rows):
+            at_c, at_a = c_start + row * c_row + column, a_start + row * a_row
+            single = vec.load(result, at_c)
+            for d in range(depth):
+                single = vec.fma(vec.broadcast(left, at_a + d * a_column), vec.load(right, at_b + d * b_row), single)
+            vec.store(result, at_c, single)
+
+
+@inline
+def _column(a, start, step):
+    """Eight numbers, ``step`` apart, each in all lanes of its vector."""
+    return (
+        vec.broadcast(a, start),
+        vec.broadcast(a, start + step),
+        vec.broadcast(a, start + 2 * step),
+        vec.broadcast(a, start + 3 * step),
+        vec.broadcast(a, start + 4 * step),
+        vec.broadcast(a, start + 5 * step),
+        vec.broadcast(a, start + 6 * step),
+        vec.broadcast(a, start + 7 * step),
+    )
+
+
+# --- frustum culling --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def find_visible(counters, children, sigmas, positions, offsets, sizes, center, planes, near_plane, visible):
+    """Write which anchors have a child that may overlap the image: one in a sphere that ``spheres_in_frustum`` finds inside.
+
+    ``positions`` [M, 3], ``offsets`` [M, K, 3] and ``sizes``, the exponentials of the scalings [M, 6], are flat float32 tables;
+    ``sigmas`` is the reach of a Gaussian in standard deviations, and ``planes`` are those of ``frustum_planes``. [5, 3]
+    """
+    for parcel in pieces(counters, 0, -(-len(visible) // PARCEL)):
+        for m in range(parcel * PARCEL, min((parcel + 1) * PARCEL, len(visible))):
+            size_x, size_y, size_z = sizes[6 * m], sizes[6 * m + 1], sizes[6 * m + 2]
+            farthest = np.float32(0.0)
+            for at in range(3 * children * m, 3 * children * (m + 1), 3):
+                x, y, z = offsets[at] * size_x, offsets[at + 1] * size_y, offsets[at + 2] * size_z
+                farthest = max(farthest, x * x + y * y + z * z)
+            largest = max(sizes[6 * m + 3], sizes[6 * m + 4], sizes[6 * m + 5])
+            radius = math.sqrt(farthest) + sigmas * largest
+            x, y, z = positions[3 * m] - center[0], positions[3 * m + 1] - center[1], positions[3 * m + 2] - center[2]
+            inside = planes[0] * x + planes[1] * y + planes[2] * z + radius > near_plane
+            for i in range(3, 15, 3):
+                inside = inside and planes[i] * x + planes[i + 1] * y + planes[i + 2] * z + radius > 0.0
+            visible[m] = inside

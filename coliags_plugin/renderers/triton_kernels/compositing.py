@@ -13,8 +13,7 @@ from torch.autograd.function import once_differentiable
 from coliags_plugin.renderers.splatting import CutSettings
 from coliags_plugin.renderers.stages import SurfelRules
 from coliags_plugin.renderers.tiles import TileGrid, TilePairs
-from coliags_plugin.renderers.triton_kernels import gaussians, surfels
-from coliags_plugin.renderers.triton_kernels.tile import BACKWARD_WARPS, FORWARD_WARPS, RANKS
+from coliags_plugin.renderers.triton_kernels import sweeps
 
 
 def composite_gaussians(
@@ -43,15 +42,15 @@ class _Gaussians(torch.autograd.Function):
         ctx: Any, table: Tensor, depths: Tensor | None, pairs: TilePairs, grid: TileGrid, cuts: CutSettings
     ) -> tuple[Tensor, Tensor | None]:
         table = table.contiguous()
-        image = table.new_empty(table.shape[1] - gaussians.OWN_COLUMNS.value, grid.height, grid.width)
+        image = table.new_empty(table.shape[1] - sweeps.GAUSSIAN_COLUMNS.value, grid.height, grid.width)
         medians = None if depths is None else table.new_empty(grid.height, grid.width)
         unused = table if depths is None else depths.contiguous()
-        gaussians.forward[(grid.columns * grid.rows,)](
+        sweeps.gaussians_forward[(grid.columns * grid.rows,)](
             *(table, unused, pairs.gaussian, pairs.starts, image, unused if medians is None else medians),
             *_sizes(grid, image),
             *_bounds(cuts),
             WITH_MEDIANS=medians is not None,
-            **_blocks(image, grid, FORWARD_WARPS),
+            **_blocks(image, grid, sweeps.FORWARD_WARPS),
         )
         ctx.save_for_backward(table, image)
         ctx.drawn = pairs, grid, cuts
@@ -65,11 +64,11 @@ class _Gaussians(torch.autograd.Function):
         table, image = ctx.saved_tensors
         pairs, grid, cuts = ctx.drawn
         of_table = torch.zeros_like(table)
-        gaussians.backward[(grid.columns * grid.rows,)](
+        sweeps.gaussians_backward[(grid.columns * grid.rows,)](
             *(table, pairs.gaussian, pairs.starts, image, of_image.contiguous(), of_table),
             *_sizes(grid, image),
             *_bounds(cuts),
-            **_blocks(image, grid, BACKWARD_WARPS),
+            **_blocks(image, grid, sweeps.BACKWARD_WARPS),
         )
         return of_table, None, None, None, None
 
@@ -78,14 +77,14 @@ class _Surfels(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, pairs: TilePairs, grid: TileGrid, rules: SurfelRules) -> tuple[Tensor, Tensor]:
         table = table.contiguous()
-        image = table.new_empty(table.shape[1] - surfels.OWN_COLUMNS.value, grid.height, grid.width)
+        image = table.new_empty(table.shape[1] - sweeps.SURFEL_COLUMNS.value, grid.height, grid.width)
         depths, spread = (table.new_zeros(count, grid.height, grid.width) for count in (4, 3))
-        surfels.forward[(grid.columns * grid.rows,)](
+        sweeps.surfels_forward[(grid.columns * grid.rows,)](
             *(table, pairs.gaussian, pairs.starts, image, depths, spread),
             *_sizes(grid, image),
             *_surfel_bounds(rules),
             WITH_DEPTHS=rules.depths,
-            **_blocks(image, grid, FORWARD_WARPS),
+            **_blocks(image, grid, sweeps.FORWARD_WARPS),
         )
         ctx.save_for_backward(table, image, depths, spread)
         ctx.drawn = pairs, grid, rules
@@ -97,13 +96,13 @@ class _Surfels(torch.autograd.Function):
         table, image, depths, spread = ctx.saved_tensors
         pairs, grid, rules = ctx.drawn
         of_table = torch.zeros_like(table)
-        surfels.backward[(grid.columns * grid.rows,)](
+        sweeps.surfels_backward[(grid.columns * grid.rows,)](
             *(table, pairs.gaussian, pairs.starts, image, depths, spread),
             *(of_image.contiguous(), of_depths.contiguous(), of_table),
             *_sizes(grid, image),
             *_surfel_bounds(rules),
             WITH_DEPTHS=rules.depths,
-            **_blocks(image, grid, BACKWARD_WARPS),
+            **_blocks(image, grid, sweeps.BACKWARD_WARPS),
         )
         return of_table, None, None, None
 
@@ -119,7 +118,13 @@ def _bounds(cuts: CutSettings) -> tuple[float, float, float]:
 def _blocks(image: Tensor, grid: TileGrid, warps: int) -> dict[str, int]:
     """Sizes of the kernels' blocks, and options of the compiler."""
     channels = max(16, triton.next_power_of_2(len(image)))
-    return {"CHANNELS": channels, "SIZE": grid.size, "RANKS": RANKS, "num_warps": warps, "enable_fp_fusion": True}
+    return {
+        "CHANNELS": channels,
+        "SIZE": grid.size,
+        "RANKS": sweeps.RANKS,
+        "num_warps": warps,
+        "enable_fp_fusion": True,
+    }
 
 
 def _surfel_bounds(rules: SurfelRules) -> tuple[float, ...]:
