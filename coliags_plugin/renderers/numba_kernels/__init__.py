@@ -1,7 +1,8 @@
 """The kernels of the cpu renderer, one stage per file. Importing any of them imports numba.
 
 They share the tables that ``layout`` describes, and ``pipeline`` calls them in order: project, bin, sweep forward; sweep
-backward, gather, project backward. Names used throughout:
+backward, gather, project backward. 3D Gaussians and surfels have the same kernels, made from what differs by factories
+(``projecting``, ``sweeping``, ``gathering``). Names used throughout:
 
 - **lanes**: a SIMD vector of sixteen float32, one Gaussian or one pixel each.
 - **group**: sixteen Gaussians, processed as lanes; tables are padded to whole groups.
@@ -18,7 +19,6 @@ backward, gather, project backward. Names used throughout:
 - **arena**: memory that is kept between renderings.
 
 Arguments of kernels, besides: ``counters`` are zeros from which threads take work; ``view``, ``grid``, ``projections``,
-``bins`` and ``pairs`` are what ``layout`` describes, and ``extras`` or ``measures`` what is composited besides colour;
-``channels`` is any tuple as long as there are channels; ``scratch`` has NUMBERS and INTEGERS for each thread. What is
-written comes last, padded to whole groups.
+``bins`` and ``pairs`` are what ``layout`` describes, and ``outputs`` what is composited; ``scratch`` has NUMBERS and
+INTEGERS of ``tiles`` for each thread. What is written comes last, padded to whole groups.
 """

@@ -1,8 +1,8 @@
 """Compositing of 3D Gaussians and of surfels, whose depth differs from pixel to pixel; forward and backward.
 
 Rows of the table (``stages.Stages``) of 3D Gaussians are means2d (2), whitening (3), log(opacity) and the features; of
-surfels means2d (2), slopes of U, V and W (6), W at the centre, D, the filter's centre (2), log(opacity) and the features
-(``ProjectedSurfels.intersections``).
+surfels means2d (2), slopes of U, V and W (6), W at the centre, D, the filter's centre (2), log(opacity) and the
+features (``ProjectedSurfels.intersections``).
 """
 
 from __future__ import annotations
