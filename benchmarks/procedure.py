@@ -46,7 +46,6 @@ from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.pipeline.contents import SegmentContents, SubmapContents, read_contents
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import Record
-from coliags_plugin.pipeline.steps import Submap
 from coliags_plugin.reporting.video import write_video
 from coliags_plugin.surface.coverage.measure import PartialCoverage, measure_coverage
 from coliags_plugin.surface.coverage.visibility import CoverageView, Level
@@ -386,7 +385,7 @@ class Truth:
             "scale varies, %": 100.0 * float(np.nanstd(np.log(model.scales))),
             "depth of points, %": float(np.nanmedian(model.errors)),
         }
-        run = out / submap.segment / Submap(submap.number).folder / "run"
+        run = out / submap.folder / "run"
         if not (run / "coverage" / "coverage.json").is_file():
             return row
         lens = PinholeLens.of(read_intrinsics(self._folders[most] / "camera.json"))

@@ -20,7 +20,6 @@ from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord
-from coliags_plugin.pipeline.steps import Submap
 from coliags_plugin.pipeline.survey import SURVEY_FILE, Segment, Survey, Video
 
 _FRAME_NAME = re.compile(r"frame_(\d+)")
@@ -59,7 +58,7 @@ class SubmapContents:
     @property
     def folder(self) -> str:
         """Folder of its results, relative to the reconstruction's."""
-        return "/".join(filter(None, (self.segment, Submap(self.number).folder)))
+        return "/".join(filter(None, (self.segment, f"submap-{self.number}" if self.number else "")))
 
     @property
     def first(self) -> int:

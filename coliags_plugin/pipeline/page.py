@@ -250,7 +250,8 @@ def _scenes(contents: Contents) -> Iterator[Block]:
 
 def _pictures(contents: Contents) -> Iterator[Block]:
     """Frames, their depth and the wall in flattened light, side by side, of the longest sub-maps."""
-    for submap in _longest_first(contents)[:_SUBMAPS]:
+    longest = _longest_first(contents)[:_SUBMAPS]
+    for submap in longest:
         for path in _files_of(contents, submap, PICTURES):
             scale = submap.figures.get("depth_scale")
             blocks: list[Block] = [Paragraph(f"Colours: {scale}, dark is near.")] if scale else []
@@ -258,7 +259,7 @@ def _pictures(contents: Contents) -> Iterator[Block]:
                 files = [file for kind in _KINDS for file in frame.glob(kind)]
                 images = [Image(EncodedImage.png(read_rgb(file)), file.stem) for file in files]
                 blocks.append(Figures(images, frame.name))
-            yield Folded(submap.name, blocks, is_open=submap is _longest_first(contents)[0])
+            yield Folded(submap.name, blocks, is_open=submap is longest[0])
 
 
 def _views(contents: Contents) -> list[Section]:
