@@ -204,13 +204,6 @@ def _levels_note(settings: CoverageSettings) -> str:
     )
 
 
-def _levels(coverage: SeenWall) -> list[tuple[str, str, str]]:
-    """Label, area and share in percent of each level."""
-    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
-    total = coverage.area()
-    return [(label, area_text(area, coverage.metric), f"{100.0 * area / total:.1f}") for label, area in areas.items()]
-
-
 def clock_text(degrees: float) -> str:
     """Clock angle as the hour on a dial: 0 degrees is 12 o'clock."""
     minutes = round(degrees / 360.0 * 720.0) % 720
@@ -236,7 +229,12 @@ def coverage_facts(coverage: WallCoverage | PartialCoverage) -> list[Fact]:
 
 def level_table(coverage: SeenWall) -> Table:
     """Area and share of each level."""
-    return simple_table(["wall", "area", "share, %"], [list(row) for row in _levels(coverage)])
+    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
+    rows = [
+        [label, area_text(area, coverage.metric), f"{100.0 * area / coverage.area():.1f}"]
+        for label, area in areas.items()
+    ]
+    return simple_table(["wall", "area", "share, %"], rows)
 
 
 def _missed_regions(coverage: WallCoverage, views: Sequence[CoverageView]) -> Iterator[Block]:
