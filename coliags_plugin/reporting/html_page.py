@@ -65,7 +65,7 @@ def refuse_folder(output: Path) -> None:
 
 
 class _Writer:
-    """Writer of blocks and figures, by the macros that ``blocks.html`` has of their kinds; it collects their pictures."""
+    """Writer of blocks and figures by the macros that ``blocks.html`` has of their kinds; collects their pictures."""
 
     def __init__(self) -> None:
         self.pictures: dict[str, EncodedImage] = {}
