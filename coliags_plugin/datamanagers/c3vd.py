@@ -19,8 +19,14 @@ from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint, poses_of_images
+from coliags_plugin.datamanagers.recorded import (
+    ROTATION,
+    RecordedDataManager,
+    Recording,
+    find_seen_masks,
+    fingerprint,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import Rectification, Shot, make_shots, whole_frame
 from coliags_plugin.geometry.lenses.models import LENSES, Lens, OmnidirectionalLens, PinholeLens, octagon_mask

@@ -24,8 +24,14 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH, ScaledDepth
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint, poses_of_images
+from coliags_plugin.datamanagers.recorded import (
+    ROTATION,
+    RecordedDataManager,
+    Recording,
+    find_seen_masks,
+    fingerprint,
+    poses_of_images,
+)
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
 from coliags_plugin.datamanagers.shots import ASPECT_TOLERANCE, Rectification, Shot, make_shots
 from coliags_plugin.geometry.lenses.models import PinholeLens

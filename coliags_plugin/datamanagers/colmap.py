@@ -22,8 +22,7 @@ from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.core.settings import read_validated
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, ScaledDepth
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit, read_unit
 from coliags_plugin.datamanagers.shots import Rectification, Shot, rectifications
 from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens

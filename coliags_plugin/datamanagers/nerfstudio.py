@@ -27,8 +27,7 @@ from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import scaled_depth
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.transforms import PixelCenters, Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import FACTORS, POINTS_FILE, SceneSettings, Unit, printed_unit
 from coliags_plugin.datamanagers.shots import Shot, rectifications
 from coliags_plugin.geometry.lenses.models import PinholeLens

@@ -20,8 +20,7 @@ from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import DepthFormat
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.reading.transforms import Transforms
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import SceneSettings, Split
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens

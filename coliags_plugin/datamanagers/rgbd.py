@@ -23,8 +23,7 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens

@@ -19,8 +19,7 @@ from coliags_plugin.datamanagers.reading.depth import ExrDepth
 from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.transforms import Transforms, camera_of
-from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import ROTATION, Recording, find_seen_masks, fingerprint
+from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, find_seen_masks, fingerprint
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
 from coliags_plugin.datamanagers.shots import Shot, make_shots
 

@@ -19,7 +19,7 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.reading.files import sidecar_files
-from coliags_plugin.datamanagers.recording import Recording
+from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 from tests.datamanagers.kinds import change_model

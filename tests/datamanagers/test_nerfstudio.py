@@ -17,7 +17,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
-from coliags_plugin.datamanagers.recording import Recording
+from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, OpenCVLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion

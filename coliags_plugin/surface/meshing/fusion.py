@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.recording import portable_name
+from coliags_plugin.datamanagers.recorded import portable_name
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
