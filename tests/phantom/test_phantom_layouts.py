@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,36 +11,24 @@ from coliags_plugin.phantom.generate import resolve
 from coliags_plugin.phantom.layouts.base import Layout
 from coliags_plugin.phantom.settings import PhantomSettings
 from tests.phantom.phantom_layouts import write_phantom
-
-PAGE = Path(__file__).parents[2] / "docs/phantom.md"
+from tests.test_docs import table_rows
 
 
 def layout_of(name: str) -> Layout:
     return phantom_layouts.get(name)()
 
 
-def told() -> dict[str, list[str]]:
-    lines = PAGE.read_text().splitlines()
-    start = lines.index("| layout | what | size, px | rotation views |") + 2
-    rows = {}
-    for line in lines[start:]:
-        if not line.startswith("|"):
-            break
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        rows[cells[0].strip("`")] = cells[1:]
-    return rows
-
-
+ROWS = {row[0]: row[1:] for row in table_rows("phantom.md", "| layout | what | size, px | rotation views |")}
 BUILT_IN = [name for name in phantom_layouts if phantom_layouts.source(name) == "built in"]
 
 
 def test_every_layout_is_told():
-    assert sorted(told()) == BUILT_IN
+    assert sorted(ROWS) == BUILT_IN
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_sizes_rotation_views_and_lenses_are_as_told_and_asked_for(name):
-    layout, (_, size, rotation) = layout_of(name), told()[name]
+    layout, (_, size, rotation) = layout_of(name), ROWS[name]
     assert isinstance(layout, Layout)
     assert size == "x".join(map(str, layout.default_size))
     assert (rotation != "none") == layout.has_rotation
