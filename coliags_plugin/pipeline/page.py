@@ -226,8 +226,7 @@ def _longest_first(contents: Contents) -> list[SubmapContents]:
 def _files_of(contents: Contents, submap: SubmapContents, kind: str) -> list[str]:
     """Paths of what the stage *scene* has made of one kind."""
     files = submap.stages["scene"].files if "scene" in submap.stages else {}
-    places = ("/".join(filter(None, (submap.segment, path))) for path, what in files.items() if what == kind)
-    return [path for path in places if (contents.folder / path).exists()]
+    return [path for path, what in files.items() if what == kind and (contents.folder / path).exists()]
 
 
 def _scenes(contents: Contents) -> Iterator[Block]:
@@ -275,7 +274,7 @@ def _views(contents: Contents) -> list[Section]:
     runs = []
     for submap in contents.submaps:
         for path in submap.stages["evaluate"].files if submap.key in shown else ():
-            evaluation = contents.folder / submap.segment / path
+            evaluation = contents.folder / path
             with suppress(InputError):
                 run = read_study([evaluation.parent.parent], evaluation.name).runs[0]
                 scene = run.result.scene.model_copy(update={"name": submap.name})

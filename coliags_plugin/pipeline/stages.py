@@ -125,15 +125,9 @@ class Record:
         return status.st_ino, status.st_mtime_ns
 
     def within(self, segment: str) -> dict[str, StageRecord]:
-        """The stages of a segment, named and with files as in its folder; of the only one, '', all."""
+        """The stages of a segment by their names in its folder; of the only one, '', all."""
         prefix = f"{segment}/" if segment else ""
-        return {
-            name.removeprefix(prefix): replace(
-                stage, files={path.removeprefix(prefix): what for path, what in stage.files.items()}
-            )
-            for name, stage in self.stages.items()
-            if name.startswith(prefix)
-        }
+        return {name.removeprefix(prefix): stage for name, stage in self.stages.items() if name.startswith(prefix)}
 
     def of_submaps(self, prefix: str) -> list[str]:
         """Names of the stages of sub-maps of the segment that a prefix is of."""
