@@ -18,7 +18,7 @@ def layout_of(name: str) -> Layout:
     return phantom_layouts.get(name)()
 
 
-ROWS = {row[0]: row[1:] for row in table_rows("phantom.md", "| layout | what | size, px | rotation views |")}
+ROWS = {row[0]: row[1:] for row in table_rows("../docs/phantom.md", "| layout | what | size, px | rotation views |")}
 BUILT_IN = [name for name in phantom_layouts if phantom_layouts.source(name) == "built in"]
 
 
