@@ -142,13 +142,15 @@ class ViewModule(nn.Module, ABC, Generic[SettingsT]):
         """Sentence for log and results on how views other than training frames are treated."""
 
     @classmethod
-    @abstractmethod
     def from_scene(cls, scene: Scene, settings: SettingsT, generator: torch.Generator) -> Self:
         """A new module for the scene's training frames, into which a checkpoint's state can be loaded.
+
+        Default: the class called with settings and scene, without random numbers.
 
         Raises:
             InputError: The settings name frames that the scene does not have.
         """
+        return cls(settings, scene)
 
     def prepare(self, scene: Scene) -> None:
         """Adapt the initial parameters to the scene, before training; not called when a run is loaded."""

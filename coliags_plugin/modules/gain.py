@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
@@ -177,11 +176,6 @@ class FrameGain(ViewModule[FrameGainSettings]):
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
         self.register_buffer("fitted", torch.zeros_like(self.log_gain))
         self.register_buffer("rate", torch.ones(()))
-
-    @classmethod
-    def from_scene(cls, scene: Scene, settings: FrameGainSettings, generator: torch.Generator) -> Self:
-        """Module with gains of 1."""
-        return cls(settings, scene)
 
     @torch.no_grad()
     def prepare(self, scene: Scene) -> None:

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.json_files import JsonObject
@@ -47,11 +46,6 @@ class ImageWarp(ViewModule[ImageWarpSettings]):
         self.frames = FrameRows(scene)
         nodes = settings.cells + 1
         self.displacement = nn.Parameter(torch.zeros(len(self.frames), 2, nodes, nodes))
-
-    @classmethod
-    def from_scene(cls, scene: Scene, settings: ImageWarpSettings, generator: torch.Generator) -> Self:
-        """Module with zero displacements."""
-        return cls(settings, scene)
 
     @property
     def untrained_views(self) -> str:

@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.cameras import Camera
@@ -53,11 +52,6 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
         self._pivot_depths = [_median_depth(frame.camera, scene) for frame in scene.train]
         self.rotation = nn.Parameter(torch.zeros(len(self.frames), 3))
         self.translation = nn.Parameter(torch.zeros(len(self.frames), 3))
-
-    @classmethod
-    def from_scene(cls, scene: Scene, settings: PoseCorrectionSettings, generator: torch.Generator) -> Self:
-        """Module with zero corrections."""
-        return cls(settings, scene)
 
     @property
     def untrained_views(self) -> str:
