@@ -1,4 +1,4 @@
-"""What commands print at their end: a summary, what was written, and what to type next."""
+"""Summaries that commands print at their end: results, files written, and commands to type next."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def print_summary(
     ``facts`` say the same as ``text`` in JSON values; ``then`` are commands to type next.
     """
     if as_json:
-        told = ({"summary": text} if text else {}) if facts is None else facts
-        summary = {**told, "written": [str(path) for path in written], "next": list(then)}
+        values = ({"summary": text} if text else {}) if facts is None else facts
+        summary = {**values, "written": [str(path) for path in written], "next": list(then)}
         print(json.dumps(summary, indent=2, allow_nan=False, default=str))
         return
     lines = [in_flags(text)] if text else []
@@ -50,7 +50,8 @@ def view_command(run: Path, data: Path | None = None) -> str:
 
 def train_command(scene: Path, method: str = "coliags", assignments: Sequence[str] = ()) -> str:
     """The command that trains a method on a scene with options ``KEY=VALUE``."""
-    return coliags("train", method, "--data", scene, *_set(assignments))
+    changes = [word for assignment in assignments for word in ("--set", assignment)]
+    return coliags("train", method, "--data", scene, *changes)
 
 
 def depth_commands(scene: Path) -> list[str]:
@@ -60,7 +61,3 @@ def depth_commands(scene: Path) -> list[str]:
         coliags("depth", "estimate", scene, "--output", with_depth),
         train_command(with_depth, ESTIMATED_DEPTH_METHOD),
     ]
-
-
-def _set(assignments: Sequence[str]) -> list[str]:
-    return [word for assignment in assignments for word in ("--set", assignment)]
