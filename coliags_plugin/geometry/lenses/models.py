@@ -28,7 +28,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 Array = NDArray[np.float64]
 
 #: Largest magnitudes of the numbers of a lens that are not terms of its distortion.
-_LIMITS = dict.fromkeys(("fx", "fy", "cx", "cy", "stretch", "origin"), bounds.PIXELS)
+_LIMITS = dict.fromkeys(("fx", "fy", "cx", "cy", "stretch"), bounds.PIXELS)
 _LIMITS |= dict.fromkeys(("width", "height"), float(bounds.IMAGE_SIDE))
 #: Terms of a polynomial up to this change nothing at any radius of an image, but overflow where one is divided by.
 _NEGLIGIBLE = 1e-100
@@ -43,10 +43,6 @@ class Lens(ABC):
     @abstractmethod
     def resized(self, width: int, height: int) -> Self:
         """The lens of the same image resampled to another size; the image's edges stay where they are."""
-
-    @abstractmethod
-    def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
-        """The lens of the part of the image whose top left pixel is (x0, y0)."""
 
     @abstractmethod
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
@@ -95,10 +91,6 @@ class PinholeLens(Intrinsics, Lens):
         """The nominal pinhole camera."""
         return Intrinsics(**vars(self))
 
-    def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
-        """The lens of the part of the image whose top left pixel is (x0, y0)."""
-        return replace(self, width=width, height=height, cx=self.cx - x0, cy=self.cy - y0)
-
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
         """Viewing directions of pixels, (column, row), with z = 1. [N, 3]"""
         pixels = np.asarray(pixels, np.float64)
@@ -114,17 +106,15 @@ class PinholeLens(Intrinsics, Lens):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedLens(Lens):
-    """A lens with distortion, seen through an image that may be a scaled or cropped copy of the calibrated one.
+    """A lens with distortion, seen through an image that may be a scaled copy of the calibrated one.
 
     The calibration itself is never rescaled: pixels are first carried back to the calibrated image, so that
-    scaling and cropping are exact for every model.
+    scaling is exact for every model.
     """
 
     width: int
     height: int
     stretch: tuple[float, float] = (1.0, 1.0)  # pixels of the calibrated image per pixel of this one, (x, y)
-    # Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
-    origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not finite or absurdly large."""
@@ -139,14 +129,9 @@ class CalibratedLens(Lens):
         x, y = self.width / width, self.height / height
         return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
 
-    def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
-        """The lens of the part of the image whose top left pixel is (x0, y0)."""
-        origin = (self.origin[0] + self.stretch[0] * x0, self.origin[1] + self.stretch[1] * y0)
-        return replace(self, width=width, height=height, origin=origin)
-
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
         """Viewing directions of pixels, (column, row), with z = 1. [N, 3]"""
-        calibrated = np.asarray(pixels, np.float64) * self.stretch + self.origin
+        calibrated = np.asarray(pixels, np.float64) * self.stretch
         xy = self._tangents(calibrated)
         return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
 
@@ -156,15 +141,14 @@ class CalibratedLens(Lens):
         z = points[:, 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
             tangents = np.where(z > 0.0, points[:, :2] / z, np.nan)
-        return (self._calibrated_pixels(tangents) - self.origin) / self.stretch
+        return self._calibrated_pixels(tangents) / self.stretch
 
     @property
     def pinhole(self) -> Intrinsics:
         """The nominal pinhole camera."""
         fx, fy, cx, cy = self._calibrated_pinhole
         x, y = 1.0 / self.stretch[0], 1.0 / self.stretch[1]
-        center = (cx - self.origin[0]) * x, (cy - self.origin[1]) * y
-        return Intrinsics(fx * x, fy * y, *center, self.width, self.height)
+        return Intrinsics(fx * x, fy * y, cx * x, cy * y, self.width, self.height)
 
     @property
     @abstractmethod

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.lenses.models import LENSES
-from coliags_plugin.geometry.lenses.vicalib import (
-    calibration_files,
-    find_calibration,
-    read_calibration,
-)
-from tests.layouts.endomapper import calibration_text
+from coliags_plugin.geometry.lenses.models import FisheyeLens
+from coliags_plugin.geometry.lenses.vicalib import Calibration, calibration_files, find_calibration, read_calibration
 
 #: As Vicalib writes it, comments and all.
 VICALIB = """<rig>
@@ -41,21 +34,11 @@ def write(folder, text, name="calibration.xml"):
     return folder / name
 
 
-def test_the_lens_is_opencvs_fisheye_with_centres_at_integers(tmp_path):
-    calibration = read_calibration(write(tmp_path, VICALIB))
-    assert (calibration.lens.width, calibration.lens.height, calibration.depth_scale) == (1440, 1080, None)
-    points = np.random.default_rng(0).uniform((-1.0, -0.8, 1.0), (1.0, 0.8, 1.0), (50, 3))
-    matrix = np.array([[717.2, 0.0, 735.4], [0.0, 717.5, 552.8], [0.0, 0.0, 1.0]])
-    terms = np.array([-0.139, -0.00124, 0.000913, -4.07e-05])
-    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, terms)
-    np.testing.assert_allclose(calibration.lens.project(points), expected[:, 0] + 0.5, atol=1e-9)
-
-
-def test_what_is_written_is_read(tmp_path):
-    lens = LENSES["fisheye"]
-    again = read_calibration(write(tmp_path, calibration_text(lens, 123.4)))
-    assert (again.lens, again.depth_scale) == (lens, 123.4)
-    assert read_calibration(write(tmp_path, calibration_text(lens))).depth_scale is None
+def test_the_lens_has_pixel_centres_half_a_pixel_further(tmp_path):
+    path = write(tmp_path, VICALIB.replace("</camera_model>", "<depth_scale> 123.4 </depth_scale></camera_model>"))
+    view = {"width": 1440, "height": 1080, "fx": 717.2, "fy": 717.5, "cx": 735.4 + 0.5, "cy": 552.8 + 0.5}
+    lens = FisheyeLens(**view, k1=-0.139, k2=-0.00124, k3=0.000913, k4=-4.07e-05)
+    assert read_calibration(path) == Calibration(path, lens, 123.4)
 
 
 @pytest.mark.parametrize(
