@@ -73,14 +73,6 @@ def test_a_comparison_is_the_references():
     assert rows[0].tests.interval[0] < rows[0].lead < rows[0].tests.interval[1]
 
 
-def test_p_values_are_adjusted_for_the_family():
-    rng = np.random.default_rng(3)
-    values = {name: one_seed(rng.normal(lead, 0.5, 8)) for name, lead in (("ours", 1.0), ("x", 0.5), ("y", 0.3))}
-    rows = {row.rival: row.tests for row in compare_with_rivals(values, "ours", True, family=3)}
-    expected = multipletests([rows["x"].wilcoxon, rows["y"].wilcoxon, 1.0], method="holm")[1]
-    assert [rows[name].wilcoxon_holm for name in ("x", "y")] == pytest.approx(expected[:2].tolist())
-
-
 def test_every_pair_is_compared_on_its_own_scenes():
     values = {
         "ours": one_seed([9.0] * 8),
@@ -104,14 +96,9 @@ def test_stars_are_those_that_so_many_scenes_and_rivals_allow(scenes, rivals, st
     leads = np.linspace(1.0, 2.0, scenes)
     values = {"ours": one_seed(leads), **{f"rival {index}": one_seed(0 * leads) for index in range(rivals)}}
     assert {row.stars for row in compare_with_rivals(values, "ours", True)} == {stars}
-
-
-def test_ties_give_no_star_below_what_is_possible():
-    """The normal approximation of six equal differences would give p = .014."""
-    values = {"ours": one_seed([2.0] * 6), "rival": one_seed([1.0] * 6)}
-    (row,) = compare_with_rivals(values, "ours", True)
-    assert row.tests.wilcoxon == pytest.approx(2 / 64)
-    assert row.stars == "*"
+    # Of equal differences, the normal approximation would give less than the smallest possible p.
+    tied = {name: one_seed([float(name == "ours")] * scenes) for name in values}
+    assert {row.stars for row in compare_with_rivals(tied, "ours", True)} == {stars}
 
 
 # Tests and effect sizes
@@ -130,18 +117,8 @@ def test_holm_is_that_of_statsmodels(p_values):
 )
 def test_smallest_p_is_reached_where_one_method_always_wins(scenes, p):
     assert smallest_p(scenes) == p
-    assert wilcoxon_p(np.arange(1.0, scenes + 1)) == pytest.approx(p)
-
-
-@pytest.mark.parametrize("size", [6, 8, 10])
-def test_wilcoxon_counts_sign_changes(size):
-    """The exact p, by enumeration of all of them."""
-    sample = np.random.default_rng(size).normal(0.3, 1.0, size)
-    signs = np.array(np.meshgrid(*[[1.0, -1.0]] * size)).reshape(size, -1)
-    ranks = stats.rankdata(np.abs(sample))
-    exact = np.mean(np.abs(ranks @ signs) >= abs((np.sign(sample) * ranks).sum()) - 1e-9)
-    assert wilcoxon_p(sample) == pytest.approx(exact)
-    assert wilcoxon_p(np.append(sample, 0.0)) == pytest.approx(exact), "zeros are dropped"
+    sample = np.arange(scenes + 1.0)
+    assert wilcoxon_p(sample) == wilcoxon_p(-sample[1:]) == pytest.approx(p), "zeros are dropped"
 
 
 @settings(deadline=None, max_examples=25)

@@ -1,24 +1,34 @@
-"""Results files: what is read is what was written, and nothing else is read."""
+"""Results files: what is read is what was written, and nothing else is read; finding and exporting them."""
 
 from __future__ import annotations
 
-import copy
+import csv
 import hashlib
 import json
 import math
+import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.results import hashing
 from coliags_plugin.results.hashing import ArraysHash, code_key, metrics_sha256, result_key
-from coliags_plugin.results.reading import means_summary, per_frame_table, read_result, write_result
-from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
-from tests.results.made import METRICS, made_result, made_set, numbers, results
+from coliags_plugin.results.reading import (
+    VALUE_COLUMNS,
+    find_results,
+    means_summary,
+    per_frame_table,
+    read_result,
+    value_rows,
+    write_csv,
+    write_result,
+)
+from coliags_plugin.results.record import VERSION, CostRecord, ProfileRecord, ProtocolRecord, Result
+from tests.commands import refused, run
+from tests.results.made import METRICS, made_result, made_set, results
 
 quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -59,29 +69,11 @@ def test_what_is_read_is_what_was_written(result, tmp_path):
 # Hash of the values
 
 
-@quick
-@given(data=st.data(), result=results())
-def test_any_change_of_one_value_is_found_out(data, result, tmp_path):
-    places = [
-        (name, metric, frame)
-        for name, part in result.sets.items()
-        for metric, values in part.values.items()
-        for frame in range(len(values))
-    ]
-    assume(places)
-    name, metric, frame = data.draw(st.sampled_from(places))
-    old = result.sets[name].values[metric][frame]
-    new = data.draw(st.none() | numbers | st.just(None if old is None else math.nextafter(old, 0.0)))
-    # 0.0 and -0.0 are equal and not the same.
-    assume(repr(new) != repr(old))
-    path = tmp_path / "result.json"
-    write_result(path, result)
-
-    def edit(content):
-        content["sets"][name]["values"][metric][frame] = new
-
-    change(path, edit)
-    assert "changed or damaged" in refusal(path)
+@pytest.mark.parametrize("value", [None, 30.0, -0.0, math.nextafter(31.5, 0.0)])
+def test_any_change_of_one_value_is_found_out(file, value):
+    write_result(file, made_result({"test": made_set(psnr=(0.0, 31.5))}))
+    change(file, lambda content: content["sets"]["test"]["values"]["psnr"].__setitem__(value != -0.0, value))
+    assert "changed or damaged" in refusal(file)
 
 
 def test_the_hash_is_of_the_documented_text_whatever_the_order_of_names():
@@ -105,28 +97,16 @@ def arrays_hash(*arrays) -> str:
     return read.hexdigest()
 
 
-def test_images_have_a_hash_of_names_shapes_and_numbers():
+def test_images_have_a_hash_of_names_shapes_and_numbers_whatever_their_memory():
     image = np.arange(6, dtype=np.float32).reshape(2, 3)
-    other = image.copy()
-    other[1, 2] = np.nextafter(other[1, 2], np.float32(0))
-    variants = [
-        [("a", "rgb", image)],
-        [("b", "rgb", image)],
-        [("a", "depth", image)],
-        [("a", "rgb", image.reshape(3, 2))],
-        [("a", "rgb", other)],
-        [("a", "rgb", image), ("b", "rgb", image)],
-        [("b", "rgb", image), ("a", "rgb", image)],
-    ]
-    assert len({arrays_hash(*arrays) for arrays in variants}) == len(variants)
-
-
-def test_the_hash_of_images_does_not_depend_on_their_memory():
-    image = np.random.default_rng(0).random((4, 5)).astype(np.float32)
     image[0, 0] = np.nan
-    odd_nan = image.copy()
+    other, odd_nan = image.copy(), image.copy()
+    other[1, 2] = np.nextafter(other[1, 2], np.float32(0))
     odd_nan.view(np.uint32)[0, 0] = 0xFFC00123
-    assert np.isnan(odd_nan[0, 0])
+    one, second = ("a", "rgb", image), ("b", "rgb", image)
+    others = [("a", "depth", image), ("a", "rgb", image.reshape(3, 2)), ("a", "rgb", other)]
+    variants = [[one], [second], *([each] for each in others), [one, second], [second, one]]
+    assert len({arrays_hash(*arrays) for arrays in variants}) == len(variants)
     same = [image, np.asfortranarray(image), image.astype(np.float64), image.astype(">f4"), odd_nan]
     assert len({arrays_hash(("a", "rgb", values)) for values in same}) == 1
 
@@ -209,6 +189,8 @@ def test_means_are_over_the_frames_that_have_a_value():
     assert means_summary(made_result({"rotation": other, "up": main_set}))["psnr"] == 20.0, (
         "the first, without one of that name"
     )
+    metrics = {**METRICS, "foreseen_seen": METRICS["lpips"]}
+    assert "foreseen_seen" in means_summary(made_result(metrics=metrics)), "it has no foreseen beside it"
 
 
 def test_the_table_has_every_frame_and_metric():
@@ -220,12 +202,6 @@ def test_the_table_has_every_frame_and_metric():
         "test,0008,31.5,,,",
         "rotation,r,20.0,,1.0,25.5",
     ]
-
-
-def test_a_protocols_own_metric_may_end_like_one_over_seen_pixels():
-    metrics = {"psnr": METRICS["psnr"], "lpips": METRICS["lpips"], "depth_mse": METRICS["depth_mse"]}
-    metrics["foreseen_seen"] = MetricRecord(unit="", direction="lower")
-    assert "foreseen_seen" in means_summary(made_result(metrics=metrics))
 
 
 # Key
@@ -240,20 +216,20 @@ KEY = {
 }
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_a_key_depends_on_what_determines_a_result_and_on_nothing_else():
+    def key(**changes):
+        return result_key(**{**KEY, **changes})
+
+    changes = [
         {"config": {"field": {"name": "anchors"}, "schedule": {"steps": 61}}},
-        {"fingerprint": "g"},
-        {"seed": 1},
-        {"code": "d"},
-        {"protocol": "authors-code"},
-        {"protocol_version": 2},
+        *({"fingerprint": "g"}, {"seed": 1}, {"code": "d"}, {"protocol": "authors-code"}, {"protocol_version": 2}),
         {"deviations": {"step": 30}},
-    ],
-)
-def test_everything_that_determines_a_result_changes_its_key(changes):
-    assert result_key(**{**KEY, **changes}) != result_key(**KEY)
+    ]
+    assert len({key(), *(key(**each) for each in changes)}) == 8
+    described = KEY["config"] | {"description": "another", "protocol": "authors-code"}
+    assert key(config=described, deviations={}) == key()
+    plain, read = {"size": (1, 2), "far": math.inf}, {"size": [1, 2], "far": "Infinity"}
+    assert key(config=plain) == key(config=read)
 
 
 def test_the_key_of_the_code_changes_with_any_letter_of_its_files(tmp_path, monkeypatch):
@@ -272,28 +248,115 @@ def test_the_key_of_the_code_changes_with_any_letter_of_its_files(tmp_path, monk
     assert of(one=b"x = 1\r\n", other=b"y = 2\r\n") == plain  # as git may check them out
 
 
-def test_what_does_not_determine_a_result_leaves_its_key():
-    other = copy.deepcopy(KEY["config"]) | {"description": "another", "protocol": "authors-code"}
-    assert result_key(**{**KEY, "config": other, "deviations": {}}) == result_key(**KEY)
-    plain, read = {"size": (1, 2), "far": math.inf}, {"size": [1, 2], "far": "Infinity"}
-    assert result_key(**{**KEY, "config": plain}) == result_key(**{**KEY, "config": read})
-
-
-def test_means_of_a_result():
+def test_a_result_has_means_and_is_shown_in_one_line_and_as_a_table():
     result = made_result({"test": made_set(), "rotation": made_set(("a",), (20.0,), (None,))})
     assert result.mean("psnr") == 30.75 and result.mean("psnr", "rotation") == 20.0
     assert result.mean("lpips") is None and result.mean("depth_mse", "rotation") is None
-    with pytest.raises(InputError, match=r"no metric 'pnsr'.*Did you mean 'psnr'"):
-        result.mean("pnsr")
-    with pytest.raises(InputError, match=r"no test set 'rotatoin'.*Did you mean 'rotation'"):
-        result.mean("psnr", "rotatoin")
-
-
-def test_a_result_in_one_line_and_as_a_table():
-    result = made_result({"test": made_set(), "rotation": made_set(("a",), (20.0,), (None,))})
+    for arguments, match in ((("pnsr",), r"metric 'pnsr'.*'psnr'"), (("psnr", "rotatoin"), r"'rotatoin'.*'rotation'")):
+        with pytest.raises(InputError, match=f"no .*{match}"):
+            result.mean(*arguments)
     assert repr(result) == "coliags on wall, seed 0, 60 steps, protocol paper v1: psnr 30.75 dB, depth_mse 0.25 mm^2"
     table = result.table()
     assert table.rows[0] == {"metric": "psnr", "unit": "dB", "test": 30.75, "rotation": 20.0}
     assert list(table.notes) == ["not shown: lpips: no weights"]
     assert "test (2 frames)  rotation (1 frames)" in str(result) == str(table)
     assert result._repr_html_() == table._repr_html_()
+
+
+ROTATION = made_set(("r",), (0.1 + 0.2,), (1e-300,))
+
+
+def other_run(**changes):
+    """Result of another method, under another protocol, with two test sets."""
+    facts = {"key": "f" * 16, "method": "ablations/none", "protocol": ProtocolRecord(name="mine", version=3)}
+    return made_result({"test": made_set(), "rotation": ROTATION}, **{**facts, **changes})
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A folder of a run folder, of a plain results file, and of much else."""
+    folder = tmp_path / "runs"
+    write_result(folder / "one/eval/paper/result.json", made_result())
+    write_result(folder / "others/any name.json", other_run())
+    (folder / "one/eval/paper/metrics.json").write_text('{"psnr": 30}')
+    (folder / "one/state.json").write_text("{")
+    (folder / "one/binary.json").write_bytes(bytes(range(256)))
+    (folder / "one/folder.json").mkdir()
+    scratch = folder / "one/eval/.paper.x7f3/result.json"
+    scratch.parent.mkdir()
+    scratch.write_text('{"format": "coliags-result", "vers')
+    return folder
+
+
+# Finding
+
+
+def test_results_are_found_in_files_and_folders_and_count_once(runs, monkeypatch):
+    assert {result.method for result in find_results([runs])} == {"coliags", "ablations/none"}
+    files = [runs / "one/eval/paper/result.json", runs / "others"]
+    assert [result.method for result in find_results(files)] == ["coliags", "ablations/none"]
+    write_result(runs / "copy.json", made_result(cost=CostRecord(device="the same", render_fps=3.0)))
+    monkeypatch.chdir(runs)
+    assert len(find_results([runs, runs / "one", runs.parent / "runs" / ".." / "runs" / "copy.json"])) == 2
+
+
+def test_what_is_missing_damaged_or_there_in_two_forms_is_named(runs, tmp_path):
+    (tmp_path / "empty").mkdir()
+    whole = (runs / "others/any name.json").read_text()
+    (tmp_path / "cut.json").write_text(whole[:900])
+    write_result(tmp_path / "copy.json", made_result({"test": made_set(psnr=(1.0, 2.0))}))
+    for name, match in (
+        ("empty", "holds no results"),
+        ("gone", "cannot read .*gone"),
+        ("cut.json", "is not JSON"),
+        ("copy.json", r"copy\.json.*results of the same run, and their values differ"),
+    ):
+        with pytest.raises(InputError, match=match):
+            find_results([runs, tmp_path / name])
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may read anything")
+def test_an_unreadable_file_is_named(runs):
+    (runs / "others/any name.json").chmod(0)
+    with pytest.raises(InputError, match="cannot be read"):
+        find_results([runs])
+
+
+# Tables
+
+
+def test_csv_has_a_row_for_every_value_with_every_digit(tmp_path):
+    expected = [row for result in (made_result(), other_run()) for row in value_rows(result)]
+    assert len(expected) == 6 + 3 * 2 + 3 * 1
+    case = ("f" * 16, "ablations/none", "wall", "every-8th", 0, "mine", 3)
+    assert expected[6] == (*case, "test", "0000", "psnr", 30.0, "dB")
+    assert expected[-1] == (*case, "rotation", "r", "depth_mse", 1e-300, "mm^2")
+    write_csv(tmp_path / "table.csv", [made_result(), other_run()])
+    with (tmp_path / "table.csv").open(newline="") as file:
+        head, *read = csv.reader(file)
+    assert tuple(head) == VALUE_COLUMNS
+    assert [float(row[10]) if row[10] else None for row in read] == [row[10] for row in expected]
+    assert read == [["" if value is None else str(value) for value in row] for row in expected]
+
+
+# Commands
+
+
+def test_show_prints_means_and_costs(runs, capsys):
+    assert run("results", "show", runs / "one/eval/paper/result.json") == 0
+    printed = capsys.readouterr().out
+    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "1 min 12 s", "1,234"):
+        assert part in printed
+    assert "processor time" not in printed, "it was not measured"
+    assert run("results", "show", runs) == 0
+
+
+def test_export_writes_csv_and_refuses_what_cannot_be_written(runs, tmp_path, capsys):
+    assert run("results", "export", runs, "--output", tmp_path / "new/table.csv") == 0
+    assert len((tmp_path / "new/table.csv").read_text().splitlines()) == 1 + 6 + 9
+    (tmp_path / "folder.csv").mkdir()
+    assert "is a folder" in refused(capsys, "results", "export", runs, "--output", tmp_path / "folder.csv")
+    under_a_file = runs / "one/state.json/table.csv"
+    assert "cannot write" in refused(capsys, "results", "export", runs, "--output", under_a_file)
+    assert "no results to export" in refused(capsys, "results", "export", "--output", tmp_path / "t.csv")
+    assert "holds no results" in refused(capsys, "results", "show", tmp_path / "folder.csv")
