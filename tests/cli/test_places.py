@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 
-import numpy as np
 import pytest
 
 from coliags_plugin import Run, report, train
@@ -88,20 +87,3 @@ def test_of_messages(tmp_path):
         f"{places[1]}: no frame of mm/s, {places[0]}/depth is empty; {tmp_path / 'Jane Doe'}/video.mp4.xml is not there"
     )
     assert without_places(text, places) == "video.mp4: no frame of mm/s, out/depth is empty; video.mp4.xml is not there"
-
-
-def test_pictures_hold_nothing_but_pixels(tmp_path):
-    from coliags_plugin.reporting.image_files import write_depth_tiff, write_png
-
-    write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
-    data, at, chunks = (tmp_path / "a.png").read_bytes(), 8, set()
-    while at < len(data):
-        chunks.add(data[at + 4 : at + 8])
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    assert chunks == {b"IHDR", b"IDAT", b"IEND"}
-    write_depth_tiff(tmp_path / "a.tiff", np.ones((4, 5), np.float32))
-    import PIL.Image
-
-    texts = {270, 271, 272, 285, 305, 306, 315, 316, 33432, 34665, 34853}  # descriptions, makers, dates, names, places
-    with PIL.Image.open(tmp_path / "a.tiff") as image:
-        assert not texts & set(image.tag_v2)

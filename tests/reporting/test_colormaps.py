@@ -54,9 +54,6 @@ def test_depth_error_image():
     np.testing.assert_array_equal(image[1, 0], table[255])  # nothing rendered where there is a truth
     np.testing.assert_array_equal(image[1, 1:3], hatch(2, 4)[1, 1:3])
     np.testing.assert_array_equal(image[1, 3], table[0])
-
-
-def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_rendered():
     error, valid = depth_error(np.array([[1.0, np.nan, np.inf]]), np.array([[np.nan, 2.0, 2.0]]))
     np.testing.assert_array_equal(error, [[0.0, np.inf, np.inf]])
     np.testing.assert_array_equal(valid, [[False, True, True]])

@@ -2,6 +2,7 @@ import struct
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import skimage.io
 import tifffile
@@ -22,13 +23,21 @@ def rgb():
     return np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
 
 
-def test_png_round_trip_and_channel_order(tmp_path, rgb):
+def test_lossless_pictures_hold_their_pixels_and_nothing_else(tmp_path, rgb):
     path = tmp_path / "new" / "folder" / "é.png"
     write_png(path, torch.from_numpy(rgb))
     np.testing.assert_array_equal(read_rgb(path), rgb)
     np.testing.assert_array_equal(skimage.io.imread(path), rgb)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
-    assert struct.unpack(">IIBB", path.read_bytes()[16:26]) == (5, 7, 8, 2)  # 8 bits of RGB
+    data, at, chunks = path.read_bytes(), 8, set()
+    assert struct.unpack(">IIBB", data[16:26]) == (5, 7, 8, 2)  # 8 bits of RGB
+    while at < len(data):
+        chunks.add(data[at + 4 : at + 8])
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    assert chunks == {b"IHDR", b"IDAT", b"IEND"}
+    data = EncodedImage.webp(rgb).data
+    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+    assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] == rgb).all()
 
 
 def test_jpeg_keeps_full_chroma(rgb):
@@ -50,6 +59,9 @@ def test_tiff_keeps_float32_nan_and_infinity(tmp_path):
     for stored in (read_depth_tiff(path), tifffile.imread(path)):
         assert stored.dtype == np.float32
         np.testing.assert_array_equal(stored, depth)
+    texts = {270, 271, 272, 285, 305, 306, 315, 316, 33432, 34665, 34853}  # descriptions, makers, dates, names, places
+    with PIL.Image.open(path) as image:
+        assert not texts & set(image.tag_v2)
     write_depth_tiff(path, np.full((2, 3), 0.1))  # float64 is rounded
     np.testing.assert_array_equal(read_depth_tiff(path), np.full((2, 3), np.float32(0.1)))
 
@@ -75,10 +87,3 @@ def test_nothing_is_converted_on_reading(tmp_path, rgb):
             read_rgb(tmp_path / name)
     with pytest.raises(InputError, match="float32"):
         read_depth_tiff(tmp_path / "deep.tiff")
-
-
-def test_webp_loses_nothing():
-    rgb = np.random.default_rng(0).integers(0, 256, (13, 17, 3), dtype=np.uint8)
-    data = EncodedImage.webp(rgb).data
-    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP"
-    assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] == rgb).all()

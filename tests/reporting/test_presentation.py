@@ -14,12 +14,10 @@ from coliags_plugin.comparison.report.report import report_page
 from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.config.options import ReportOptions
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting import html_page, text_formats
 from coliags_plugin.reporting.charts import Series
 from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
 from coliags_plugin.reporting.image_files import EncodedImage
 from coliags_plugin.reporting.model import (
-    Block,
     Bullet,
     Bullets,
     Chart,
@@ -183,12 +181,6 @@ def test_all_formats_have_the_same_numbers(report):
         assert html_cells(html_blocks([table])) == said(table)
 
 
-@pytest.mark.parametrize("kind", [block.kind for block in Block.__subclasses__()])
-def test_every_kind_of_block_is_written_in_every_format(kind):
-    writers = (text_formats._PLAIN, text_formats._MARKDOWN, text_formats._LATEX, text_formats._Values())
-    assert all(callable(getattr(writer, kind)) for writer in (*writers, html_page._Writer()._macros))
-
-
 def test_latex_is_tables_and_comments(report):
     """Text between the tables is comments alone, so that the file can be included anywhere."""
     text = latex_text(report)
@@ -213,9 +205,10 @@ def test_latex_is_tables_and_comments(report):
     )
 
 
-def test_text_for_the_terminal():
+def test_text_for_the_terminal(monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # where rich would show it, and return nothing
     printed = "A <title>\nmethod   n  psnr (dB)\na&b     12      31.46\nc        -          -\na note."
-    assert str(PLAIN) == repr(PLAIN) == printed
+    assert str(PLAIN) == repr(PLAIN) == printed and PLAIN._repr_html_() == html_blocks([PLAIN])
     text = page_text(made_page())
     assert text.startswith("length  3.142 mm²\nlong    words (a remark)\nResearch <use>\ncareful\n\nTables\nwhy <so>\n")
     lines = ["coliags 31.20 ± 0.30*", "other - [a]", "printed 30.1", "[a] no weights.", "± over scenes."]
@@ -245,14 +238,6 @@ def test_html_page(tmp_path):
     assert (tmp_path / "again.html").read_text() == text
 
 
-def test_notebooks_show_what_print_shows_and_text_shows_nothing_there(monkeypatch):
-    shown = []
-    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-    monkeypatch.setattr("rich.jupyter.display", lambda *displayed: shown.append(displayed))
-    assert "31.46" in str(PLAIN) and shown == []
-    assert PLAIN._repr_html_() == html_blocks([PLAIN])
-
-
 def test_pictures_without_room_are_written_beside_the_page(tmp_path):
     page = made_page()
     write_html(page, tmp_path / "page.html", limit=len(html_text(page)) + 450)
@@ -269,9 +254,8 @@ def test_pictures_without_room_are_written_beside_the_page(tmp_path):
 
 def test_markdown():
     text = markdown_text(made_page())
-    assert text.startswith(
-        "# A & b\n\n> Research \\<use\\>\n\n- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
-    )
+    facts = "- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
+    assert text.startswith(f"# A & b\n\n> Research \\<use\\>\n\n{facts}")
     assert "**Means** (8 scenes)\n\n| Method | PSNR ↑ \\[dB\\] |\n| --- | ---: |\n" in text
     assert "<sup>a</sup> no weights.  \n± over scenes." in text and "### Nested\n\n#### More" in text
     assert "[mesh.ply](a/mesh.ply): the mesh" in text
@@ -295,6 +279,10 @@ def test_simple_tables_and_empty_blocks():
     )
     assert terminal_text([Section("Charts", [Figures([CHART])])]) == ""
     assert "<svg" not in html_blocks([Figures([Chart([], "x", "y")])])
+    large = {str(index): index for index in range(20)}
+    assert leaves({"a": large, "b": {"c": 1}}) == [("a", large), ("b.c", 1)]
+    address = "picture:0123456789abcdef0123"
+    assert address in html_text(Page(address, []))
 
 
 @pytest.mark.parametrize(("count", "columns"), [(0, 1), (1, 1), (4, 4), (5, 3), (6, 3), (7, 4), (8, 4), (9, 3)])
@@ -302,12 +290,3 @@ def test_rows_of_pictures_are_filled_evenly(count, columns):
     assert columns_of(count) == columns
     page = html_blocks([Figures([Image(PICTURES[0], "a picture")] * count)])
     assert (f"--cells: {columns}" in page) == (count > 0)
-
-
-def test_leaves_keep_large_mappings_whole():
-    large = {str(index): index for index in range(20)}
-    assert leaves({"a": large, "b": {"c": 1}}) == [("a", large), ("b.c", 1)]
-
-
-def test_text_that_looks_like_the_address_of_a_picture_is_kept():
-    assert "picture:0123456789abcdef0123" in html_text(Page("picture:0123456789abcdef0123", []))

@@ -19,25 +19,20 @@ def read_back(path):
         return float(file.streams.video[0].average_rate), frames
 
 
+@pytest.mark.parametrize("size", [(48, 64), (47, 63)])
 @pytest.mark.parametrize("codec", video.CODECS)
-def test_frames_come_back_in_order_and_color(tmp_path, monkeypatch, codec):
+def test_frames_come_back_in_order_and_color_and_odd_sizes_lose_no_line(tmp_path, monkeypatch, codec, size):
     monkeypatch.setattr(video, "CODECS", {codec: video.CODECS[codec]})
-    frames = ramp(9, 48, 64)
-    write_video(iter(frames), tmp_path / "run 12:30" / "v.mp4", fps=12.5)
+    frames = ramp(9, *size)
+    write_video(map(torch.from_numpy, frames), tmp_path / "run 12:30" / "v.mp4", fps=12.5)
     fps, decoded = read_back(tmp_path / "run 12:30" / "v.mp4")
     assert fps == pytest.approx(12.5, rel=1e-3)
     assert len(decoded) == 9
     for wrote, read in zip(frames, decoded, strict=True):
-        assert np.abs(wrote.astype(float) - read).mean() < 6
+        assert read.shape == (48, 64, 3)
+        assert np.abs(wrote[0, 0].astype(float) - read).mean() < 6
+        assert np.abs(read[-1].astype(float) - read[20]).mean() < 6
     assert [file.name for file in (tmp_path / "run 12:30").iterdir()] == ["v.mp4"]
-
-
-def test_odd_sizes_lose_no_line(tmp_path):
-    frames = [torch.from_numpy(frame) for frame in ramp(3, 47, 63)]
-    write_video(frames, tmp_path / "v.mp4", fps=10)
-    _, decoded = read_back(tmp_path / "v.mp4")
-    assert [frame.shape for frame in decoded] == [(48, 64, 3)] * 3
-    assert np.abs(decoded[2][-1].astype(float) - decoded[2][20]).mean() < 6
 
 
 def test_an_existing_video_stays_when_frames_fail(tmp_path):
