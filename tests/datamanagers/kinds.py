@@ -78,6 +78,18 @@ def _in_order(folder: Path) -> None:
     (folder / "groundtruth.txt").write_text("".join(f"{index} {' '.join(row)}\n" for index, row in enumerate(rows)))
 
 
+def beside(*names: str) -> Spoil:
+    """Put files of a release beside those that are read."""
+
+    def spoil(folder: Path) -> None:
+        for path in (folder / name for name in names):
+            path.parent.mkdir(exist_ok=True)
+            path.write_text("not looked at")
+
+    return spoil
+
+
+_RELEASE = beside("0001_flow.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png", "diffuse/0000_x.tiff")
 _RAW = ("c3vd-raw", "c3vd", "*_color.png", "*_depth.tiff", "pose.txt")
 _RGBD = ("rgbd", "rgbd", "rgb/*.png", "depth/*.png", "groundtruth.txt", "camera.json")
 _COLMAP = ("colmap", "colmap", "images/*.png", "")
@@ -90,7 +102,7 @@ KINDS = {
         accuracy=0.001,
         groups=f"{_MATRICES} camera.json",
     ),
-    "c3vd-raw": Kind(*_RAW, accuracy=1.5, groups=_MATRICES),
+    "c3vd-raw": Kind(*_RAW, accuracy=1.5, prepare=_RELEASE, groups=_MATRICES),
     # C3VD's release under review: matrices row by row.
     "c3vd-raw-old": Kind(
         *_RAW,
@@ -98,12 +110,18 @@ KINDS = {
         prepare=change_matrices(lambda matrices: matrices.transpose(0, 2, 1)),
         groups=_MATRICES,
     ),
-    "c3vd-v2": Kind("c3vd-v2", "c3vd-v2", "rgb/*.png", "depth/*.tiff", "pose.txt", accuracy=1.6, groups=_MATRICES),
+    "c3vd-v2": Kind(
+        *("c3vd-v2", "c3vd-v2", "rgb/*.png", "depth/*.tiff", "pose.txt"),
+        accuracy=1.6,
+        prepare=_RELEASE,
+        groups=_MATRICES,
+    ),
     # A step is 0.39 mm, rounded down.
     "c3vd-endogslam": Kind(
         *("endogslam", *_ENDOGSLAM, "pose.txt"),
         params="params.npz",
         accuracy=0.4,
+        prepare=beside(*(f"{part}/0000_x.png" for part in ("color_raw", "depth_raw", "normals", "flow", "occlusion"))),
         groups="matrices paired params",
         **_MAPPED,
     ),
@@ -669,7 +687,10 @@ OWN: dict[str, list[tuple[Spoil, str]]] = {
             remove("params.npz"),
             r"data has no params.npz.*params_file=FILE`, or `datamanager.poses=ground-truth`",
         ),
-        (remove("pose.txt"), "rotation has images, but it has no pose.txt|C3VD's release there"),
+        (
+            lambda folder: [shutil.rmtree(folder / "rotation"), remove("pose.txt")(folder)],
+            "Put the sequence's pose.txt of C3VD's release there",
+        ),
         (remove("rotation/pose.txt"), "rotation has images, but it has no pose.txt"),
     ],
     "pr-endo": [

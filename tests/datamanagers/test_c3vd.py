@@ -15,7 +15,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd import CANDIDATE_LENS, ORDER, C3VDSettings, read_camera_intrinsics
-from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.geometry.lenses.models import LENSES
 from tests.datamanagers.kinds import remove, repaint
 from tests.datamanagers.wall_scenes import (
@@ -34,15 +33,6 @@ def load(folder: Path, name: str = "c3vd", **options) -> Scene:
     return manager(name, **options).load(folder)
 
 
-# Depth
-
-
-def test_simcol_depth_is_read_whole(shared_data):
-    steps = C3VD_DEPTH.read(shared_data / "simcol3d_frames" / "Depth_0000.png")
-    assert steps.shape == (475, 475)
-    assert (steps.min(), steps.max()) == (2048, 43520)
-
-
 # Lenses
 
 
@@ -57,15 +47,6 @@ def test_undistorted_geometry_is_right_through_every_lens_and_no_other(tmp_path,
     assert np.abs(scene.points.colors.numpy().astype(int) - colors(points)).max() < 12
     other = "omnidirectional" if name == "legacy-pinhole" else "legacy-pinhole"
     assert worst_off_wall(load(folder, width=90, height=72, lens=other).train[0]) > 0.3
-
-
-@pytest.mark.parametrize(("layout", "name"), [("c3vd-raw", "c3vd"), ("c3vd-v2", "c3vd-v2")])
-def test_other_files_of_the_release_are_left_alone(tmp_path, layout, name):
-    folder = write_wall(tmp_path, layout, 3, 45, 36)
-    for other in ("0001_flow.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png", "diffuse/0000_x.tiff"):
-        (folder / other).parent.mkdir(exist_ok=True)
-        (folder / other).write_bytes(b"")
-    assert len(load(folder, name).video) == 3
 
 
 # C3VDv2's lens
@@ -213,10 +194,11 @@ def test_points_come_from_the_scenes_ply_where_there_is_no_depth(mine, colored):
 
 
 def test_points_come_from_a_named_file(mine, tmp_path):
-    positions = np.random.default_rng(0).random((50, 3))
-    np.savez(mine / "cloud.npz", positions=positions)
+    positions, colors = np.random.default_rng(0).random((50, 3)), np.arange(150, dtype=np.uint8).reshape(50, 3)
+    np.savez(mine / "cloud.npz", positions=positions, colors=colors)
     scene = load(mine, initial_points="file", points_file="cloud.npz")
     np.testing.assert_allclose(scene.points.positions, positions, atol=1e-7)
+    np.testing.assert_array_equal(scene.points.colors, colors)
     elsewhere = (mine / "cloud.npz").rename(tmp_path / "elsewhere.npz")
     other = load(mine, initial_points="file", points_file=str(elsewhere), points_count=7)
     assert len(other.points) == 7 and other.provenance.points.source == "elsewhere.npz"

@@ -21,8 +21,7 @@ from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.reading.files import sidecar_files
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.geometry.poses import colmap as colmap_poses
-from tests.datamanagers.kinds import change_model
+from tests.datamanagers.kinds import change_lines, change_model
 from tests.datamanagers.wall_scenes import colors, load_scene, look, manager, off_wall, poses, seen_from
 
 WIDTH, HEIGHT, COUNT = 64, 48, 5
@@ -64,8 +63,8 @@ def taken(cam: pycolmap.Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return look(pose, directions)
 
 
-def wall_model(cameras: list[pycolmap.Camera], names: list[str], unit: float = 1.0) -> pycolmap.Reconstruction:
-    """Image i is taken from pose i by camera i, round and round; lengths in units of ``unit`` mm."""
+def wall_model(cameras: list[pycolmap.Camera], names: list[str]) -> pycolmap.Reconstruction:
+    """Image i is taken from pose i by camera i, round and round."""
     model = pycolmap.Reconstruction()
     for cam in cameras:
         model.add_camera_with_trivial_rig(cam)
@@ -83,10 +82,10 @@ def wall_model(cameras: list[pycolmap.Camera], names: list[str], unit: float = 1
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in pixels_seen[inside]])
         for place, number in enumerate(np.flatnonzero(inside)):
             tracks[number].append(pycolmap.TrackElement(index + 1, place))
-        world_to_camera = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:3, 3] / unit)
+        world_to_camera = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:3, 3])
         model.add_image_with_trivial_frame(image, world_to_camera)
     for point, color, track in zip(points, colors(points), tracks, strict=True):
-        model.add_point3D(point / unit, pycolmap.Track(track), color)
+        model.add_point3D(point, pycolmap.Track(track), color)
     return model
 
 
@@ -96,11 +95,10 @@ def write_colmap(
     names: list[str] = NAMES,
     place: str = "sparse/0",
     text: bool = False,
-    unit: float = 1.0,
 ) -> Path:
     """The wall, its model in ``place`` and its images in ``images``."""
     cameras = cameras or [camera()]
-    model = wall_model(cameras, names, unit)
+    model = wall_model(cameras, names)
     (folder / place).mkdir(parents=True, exist_ok=True)
     (model.write_text if text else model.write_binary)(str(folder / place))
     for index, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
@@ -184,15 +182,7 @@ def test_a_rig_of_two_cameras(tmp_path):
 
 @pytest.mark.parametrize(
     "pattern",
-    [
-        "masks/{}.png.png",
-        "masks/{}.png",
-        "mask/{}.png",
-        "masks/{}.PNG",
-        "masks/{}.png.JPG",
-        "masks/{}.jpg",
-        "mask/{}.tif",
-    ],
+    ["masks/{}.png.png", "masks/{}.png", "mask/{}.PNG", "masks/{}.png.JPG", "masks/{}.jpg", "mask/{}.tif"],
 )
 def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -207,20 +197,6 @@ def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     assert f"1 of {COUNT} frames have a mask; 1 other files beside the masks" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
     assert scene.train[1].mask is None and scene.provenance.masks == 1
-
-
-def test_masks_and_alpha_hide_both(mine):
-    (mine / "masks").mkdir()
-    mask, alpha = np.full((2, HEIGHT, WIDTH), 255, np.uint8)
-    mask[:, :8], alpha[:8] = 0, 0
-    cv2.imwrite(str(mine / "masks/1.png"), mask)
-    image = cv2.imread(str(mine / "images/1.png"))
-    cv2.imwrite(str(mine / "images/1.png"), np.dstack([image, alpha]))
-    # Of a file that is misnamed, too.
-    (mine / "images/2.png").write_bytes(cv2.imencode(".webp", np.dstack([image, alpha]))[1].tobytes())
-    first, second = load(mine).train[:2]
-    np.testing.assert_array_equal(first.mask.numpy(), np.minimum(mask, alpha) > 0)
-    np.testing.assert_array_equal(second.mask.numpy(), alpha > 0)
 
 
 def test_files_of_images_with_names_of_windows(tmp_path):
@@ -341,56 +317,43 @@ def test_observations_that_poses_do_not_explain_are_counted(mine):
 
 
 def test_depth_only_of_points_that_are_seen_often_and_fall_where_they_were_seen(mine):
-    model = wall_model([camera()], NAMES)
-    moved, rare, twice = [number for number, point in model.points3D.items() if point.track.length() == COUNT][:3]
+    def counts(**options) -> np.ndarray:
+        return np.array([len(shot.sparse_depth.depth) for shot in opened(mine, **options).shots])
 
-    def place(number: int, image: int) -> int:
-        return next(e.point2D_idx for e in model.point3D(number).track.elements if e.image_id == image)
+    def change(model: pycolmap.Reconstruction) -> None:
+        moved, rare, often = [number for number, point in model.points3D.items() if point.track.length() == COUNT][:3]
 
-    point = model.image(2).points2D[place(moved, 2)]
-    point.xy = point.xy + np.array([1.5, -2.0])
-    for number, images in ((rare, (1, 2, 3)), (twice, (1, 2))):
-        for image in images:
-            model.delete_observation(image, place(number, image))
-    model.write_binary(str(mine / "sparse/0"))
+        def place(number: int, image: int) -> int:
+            return next(e.point2D_idx for e in model.point3D(number).track.elements if e.image_id == image)
 
-    def counts(**options) -> list[int]:
-        return [len(shot.sparse_depth.depth) for shot in opened(mine, **options).shots]
+        point = model.image(2).points2D[place(moved, 2)]
+        point.xy = point.xy + np.array([1.5, -2.0])
+        for number, images in ((rare, (1, 2, 3)), (often, (1, 2))):
+            for image in images:
+                model.delete_observation(image, place(number, image))
 
-    def seen(least: int, less: int = 0) -> list[int]:
-        """Points of each image with tracks of so many images, one less in the second."""
-        lengths = {number: found.track.length() for number, found in model.points3D.items()}
-        per_image = [
-            sum(lengths[p.point3D_id] >= least for p in image.get_observation_points2D())
-            for _, image in sorted(model.images.items())
-        ]
-        return [number - less * (index == 1) for index, number in enumerate(per_image)]
-
-    assert counts(max_reprojection_error=2.6, min_track_length=2) == seen(2)
-    assert counts(min_track_length=2) == seen(2, less=1)
-    assert counts() == seen(3, less=1)
-    assert counts(min_track_length=4) == seen(4, less=1)
-    assert sum(seen(2)) > sum(seen(3)) > sum(seen(4))
+    before = {least: counts(min_track_length=least) for least in (2, 3, 4)}
+    change_model(change)(mine)
+    for least, options, lost in (
+        (2, {"min_track_length": 2, "max_reprojection_error": 2.6}, [2, 2, 1, 0, 0]),
+        (2, {"min_track_length": 2}, [2, 3, 1, 0, 0]),
+        (3, {}, [2, 3, 1, 1, 1]),
+        (4, {"min_track_length": 4}, [2, 3, 2, 2, 2]),
+    ):
+        np.testing.assert_array_equal(before[least] - counts(**options), lost)
     assert len(load(mine).points) == POINTS
 
 
-def test_a_point_seen_twice_in_an_image_has_one_depth(mine):
-    before = opened(mine).shots[0].sparse_depth
-    model, doubled = wall_model([camera()], NAMES), pycolmap.Reconstruction()
-    doubled.add_camera_with_trivial_rig(camera())
-    points = model.image(1).points2D
-    tracks = {number: list(point.track.elements) for number, point in model.points3D.items()}
-    tracks[points[0].point3D_id].append(pycolmap.TrackElement(1, len(points)))
-    for number, image in sorted(model.images.items()):
-        places = [point.xy for point in image.points2D] + [points[0].xy + 0.5] * (number == 1)
-        copied = pycolmap.Image(name=image.name, camera_id=1, image_id=number)
-        copied.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in places])
-        doubled.add_image_with_trivial_frame(copied, image.cam_from_world())
-    for number, track in sorted(tracks.items()):
-        doubled.add_point3D(model.point3D(number).xyz, pycolmap.Track(track), model.point3D(number).color)
-    doubled.write_binary(str(mine / "sparse/0"))
-    assert doubled.image(1).num_points3D == len(points) + 1
-    after = opened(mine).shots[0].sparse_depth
+def test_a_point_seen_twice_in_an_image_has_one_depth(copied):
+    def again(rows: list[str]) -> list[str]:
+        place = next(index for index, row in enumerate(rows) if row.endswith("0000.png")) + 1
+        x, y, point = rows[place].split()[:3]
+        return [*rows[:place], f"{rows[place]} {float(x) + 0.5} {float(y) + 0.5} {point}", *rows[place + 1 :]]
+
+    folder = copied("colmap-text")
+    before = opened(folder).shots[0].sparse_depth
+    change_lines("sparse/0/images.txt", again)(folder)
+    after = opened(folder).shots[0].sparse_depth
     torch.testing.assert_close(after.pixels.sort(dim=0).values, before.pixels.sort(dim=0).values)
 
 
@@ -435,27 +398,6 @@ def test_binary_goes_before_text_and_images_may_be_elsewhere(mine, tmp_path):
         load(mine)
 
 
-# A real model, before and after COLMAP undistorted it
-
-
-@pytest.mark.parametrize("place", ["sparse", "distorted_sparse"])
-def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
-    folder = shared_data / "colmap_23img" / place
-    model = read_model(folder)
-    errors = []
-    for image, pose in zip(model.images, model.camera_to_world, strict=True):
-        local = (model.positions[image.points] - pose[:3, 3]) @ pose[:3, :3]
-        errors.append(np.linalg.norm(model.cameras[image.camera].project(local) - image.observed, axis=1))
-    by_point = np.concatenate([image.points for image in model.images])
-    mean = (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
-    reference = pycolmap.Reconstruction(str(folder))
-    stored = reference.compute_mean_reprojection_error()
-    reference.update_point_3d_errors()
-    assert mean == pytest.approx(reference.compute_mean_reprojection_error(), rel=1e-9)
-    if place == "distorted_sparse":  # the other model keeps the figure from before it was undistorted
-        assert mean == pytest.approx(stored, rel=1e-9)
-
-
 @pytest.mark.thorough
 def test_undistorting_is_what_colmap_did(shared_data):
     """Features of the SIMPLE_RADIAL model through our lens are the PINHOLE model's, which COLMAP undistorted."""
@@ -465,17 +407,3 @@ def test_undistorting_is_what_colmap_did(shared_data):
         directions = before.cameras[distorted.camera].unproject(distorted.observed)[:, :2]
         pixels = directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
         np.testing.assert_allclose(pixels, other.observed, rtol=0, atol=1e-6)
-
-
-def test_a_real_scene_loads(shared_data):
-    folder = shared_data / "colmap_23img"
-    assert find_format(folder) == "colmap"
-    scene = load(folder)
-    assert [frame.name for frame in scene.test_sets["test"]] == ["DSC_5283", "DSC_5291", "DSC_5299"]
-    assert len(scene.train) == 20 and len(scene.points) == 1443
-    assert scene.provenance.sparse_depths > 5500
-    for frame in scene.train:
-        assert frame.image.shape[:2] == (frame.camera.height, frame.camera.width)
-        assert len(frame.sparse_depth.depth) > 150
-    loaded = torch.stack([frame.camera.camera_to_world for frame in scene.video]).numpy()
-    np.testing.assert_allclose(loaded, colmap_poses.read(folder / "sparse").camera_to_world, atol=1e-6)

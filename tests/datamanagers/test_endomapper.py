@@ -43,23 +43,6 @@ def test_depth_is_read_to_the_bit(walls):
     assert scene.provenance.intrinsics_from == "calibration.xml"
 
 
-def test_more_of_the_field_of_view_is_kept_without_its_dark_surroundings(walls):
-    folder = walls("endomapper")
-    frame = load(folder, focal_scale=0.25).train[0]
-    lit = cv2.imread(str(folder / f"mask/{frame.name}.png"), cv2.IMREAD_UNCHANGED) > 0
-    assert 0.5 < lit.mean() < 1.0
-    pixels = stored_pixels(frame.camera, folder)
-    inside = ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all(axis=-1)
-    is_lit = np.zeros(inside.shape, bool)
-    is_lit[inside] = lit[pixels[inside, 1], pixels[inside, 0]]
-    assert 0.2 < is_lit.mean() < 0.95
-    # Colour is averaged over an area, so that pixels at the rim are left out.
-    mask = frame.mask.numpy()
-    assert not (mask & ~is_lit).any() and mask.sum() > 0.9 * is_lit.sum()
-    assert (frame.image.numpy()[mask].max(axis=1) > 0).all()
-    assert not np.isfinite(frame.depth.numpy()[~mask]).any()
-
-
 def test_another_camera_file_makes_it_an_rgbd_folder(mine):
     assert recognised(mine) == {"endomapper": "the TUM trajectory trajectory.txt beside rgb/"}
     (mine / "intrinsics.txt").write_text("20 20 19.5 15.5")

@@ -19,8 +19,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens, OpenCVLens
-from coliags_plugin.geometry.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
 from tests.datamanagers.wall_scenes import PINHOLE, load_scene, look, manager, off_wall, poses, rays, seen_from
@@ -138,16 +137,6 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, mi
     assert any("undone" in remark for remark in after.provenance.pose_convention["remarks"])
 
 
-def test_the_unit_of_depth_is_the_options_or_the_files_or_a_millimetre(copied):
-    folder = copied("nerfstudio")
-    depth = load(folder).train[1].depth
-    assert load(folder).provenance.depth_unit == 0.01
-    torch.testing.assert_close(load(folder, depth_unit_scale_factor=0.05).train[1].depth, 5.0 * depth, equal_nan=True)
-    change_json(FILE, depth_unit_scale_factor=None)(folder)
-    for unit in ("mm", "m"):  # of the poses
-        torch.testing.assert_close(load(folder, unit=unit).train[1].depth, 100.0 * depth, equal_nan=True)
-
-
 NGP, UNREAD, DEFAULT = {"integer_depth_scale": 0.02}, "no depth is read from depth_path", "0.001 units a step"
 
 
@@ -157,6 +146,9 @@ NGP, UNREAD, DEFAULT = {"integer_depth_scale": 0.02}, "no depth is read from dep
         ("depth_file_path", {}, {"unit": "unknown"}, 0.1, DEFAULT),
         ("depth_file_path", {}, {"unit": "unknown", "scale": 3.0}, 0.3, DEFAULT),
         ("depth_file_path", {"depth_unit_scale_factor": 0.02}, {"unit": "unknown", "scale": 3.0}, 6.0, ""),
+        ("depth_file_path", {}, {"unit": "mm"}, 100.0, ""),
+        ("depth_file_path", {}, {"unit": "m"}, 100.0, ""),
+        ("depth_file_path", {"depth_unit_scale_factor": 0.02}, {"depth_unit_scale_factor": 0.05}, 5.0, ""),
         ("depth_path", NGP, {"unit": "unknown"}, 2.0, ""),
         (
             "depth_path",
@@ -245,46 +237,7 @@ def test_a_scene_whose_images_lie_elsewhere_has_to_be_trusted(mine, tmp_path, st
     assert len(load(mine, outside_files=True).train) == 7
 
 
-def test_what_is_missing_for_training(mine):
-    change_json(FILE, w=None, h=None)(mine)
-    (mine / "points3D.ply").unlink()
-    with pytest.raises(InputError, match=r"neither depth files nor points3D\.ply.*initial_points=file"):
-        load(mine)
-    cv2.imwrite(str(mine / "images/frame_00004.png"), np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match=r"frame_00004\.png is 32 x 24"):
-        load(mine)
-
-
 # The real sequence
-
-
-def real_lens(shared_data: Path) -> FisheyeLens:
-    """The lens of the 800 x 800 crops, as their frames.json gives it, pixel centres at integers."""
-    data = json.loads((shared_data / "c3vd_cecum_t1_a" / "frames.json").read_text())
-    bends = {name: data[name] for name in ("k1", "k2", "k3", "k4")}
-    size = {"width": data["w"], "height": data["h"]}
-    return FisheyeLens(**size, fx=data["fl_x"], fy=data["fl_y"], cx=data["cx"] + 0.5, cy=data["cy"] + 0.5, **bends)
-
-
-def test_the_real_sequence_opens_with_the_poses_and_the_lens_of_its_other_file(shared_data):
-    folder = shared_data / "c3vd_cecum_t1_a"
-    assert find_format(folder) == "nerfstudio"
-    recording = opened(folder, pixel_centers="integer")
-    data = json.loads((folder / "frames.json").read_text())
-    assert len(recording.shots) == 276
-    for shot, frame in zip(recording.shots, data["frames"], strict=True):
-        assert shot.image.name == frame["file_path"]
-        np.testing.assert_allclose(shot.camera_to_world, frame["c2w"], atol=1e-12)
-    rectification = recording.shots[0].rectification
-    assert rectification.lens == real_lens(shared_data)
-    pixels = np.array([[0, 0], [400, 100], [799, 799]])
-    whole = LENSES["fisheye"].unproject(pixels + np.array([275, 140]))
-    np.testing.assert_allclose(real_lens(shared_data).unproject(pixels), whole, atol=1e-12)
-    assert (rectification.width, rectification.height) == (270, 270)
-    undistortion = Undistortion(real_lens(shared_data), rectification.pinhole)
-    image = read_rgb(recording.shots[100].image)
-    np.testing.assert_array_equal(rectification.image(image), undistortion.image(image))
-    assert rectification.valid is None
 
 
 def test_the_real_sequence_loads_once_it_has_points(shared_data, tmp_path):

@@ -15,7 +15,7 @@ import torch
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.lenses.undistortion import undistortion_map
 from tests.datamanagers.kinds import change_frames, remove
-from tests.datamanagers.wall_scenes import FAR, load_scene, look, manager, names, poses, write_wall
+from tests.datamanagers.wall_scenes import load_scene, manager, names, poses, write_wall
 
 WIDTH, HEIGHT, FRAMES = 90, 72, 27
 LENS = LENSES["fisheye"].resized(WIDTH, HEIGHT)
@@ -83,19 +83,6 @@ def test_stored_poses_are_normalised_and_opengl(folder):
     np.testing.assert_allclose(stored[:, :3, 2], -poses(FRAMES)[:, :3, 2], atol=1e-12)
     shift = np.array(content["scene_T"])[:3, 3]
     np.testing.assert_allclose(stored[:, :3, 3] / content["scene_scale"] - shift, poses(FRAMES)[:, :3, 3], atol=1e-9)
-
-
-def test_stored_distances_end_on_the_wall(folder):
-    """Half a step along the ray: no resampling between file and wall."""
-    stored = cv2.imread(str(folder / "distmaps" / "0010_color.png"), cv2.IMREAD_UNCHANGED)
-    row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = LENS.unproject(np.stack([column.ravel(), row.ravel()], 1)).reshape(HEIGHT, WIDTH, 3)
-    expected, _ = look(poses(FRAMES)[10], rays)
-    measured = (stored > 0) & (expected < FAR)
-    assert measured.sum() > 3000
-    np.testing.assert_allclose(
-        (stored * step(folder) * cosines())[measured], expected[measured], atol=0.51 * step(folder)
-    )
 
 
 def test_working_depth_is_that_of_the_nearest_stored_pixel(folder, scene):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from pathlib import Path
 
 import numpy as np
@@ -62,27 +60,3 @@ def test_a_stated_unit_is_read_back_and_else_that_of_the_format(tmp_path: Path) 
 
 
 # What the page says of C3VD's sequences, against the lists that its authors publish
-
-
-PAGE = Path(__file__).parents[2] / "docs/layouts/c3vd.md"
-SEGMENTS = {"desc": "descending", "trans": "transverse"}
-
-
-def told() -> dict[str, tuple[int, int]]:
-    """Frames and test frames of every sequence in the page's table."""
-    rows = re.findall(r"(\w+_t\d_[a-z]) \| (\d+) \| (\d+)", PAGE.read_text())
-    return {name: (int(frames), int(test)) for name, frames, test in rows}
-
-
-def test_sequences_frames_and_names_are_the_official_ones(shared_data):
-    path = shared_data / "c3vd_summary_csv" / "C3VD_data_summary_registered.csv"
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        official = [row for row in csv.DictReader(file) if row["Video Name"]]
-    frames = {row["Old Name"]: int(row["Num_frames"]) for row in official}
-    assert len(official) == 22
-    assert told() == {name: (count, held_out("every-8th", count).sum()) for name, count in frames.items()}
-    for row in official:
-        segment, texture, letter = row["Old Name"].split("_")
-        number = "abc".index(letter) + 1
-        assert row["Video Name"] == f"c0_{SEGMENTS.get(segment, segment)}_{texture}_v{number}"
-    assert "`c0_transverse_t2_v2`" in PAGE.read_text()

@@ -198,18 +198,3 @@ def test_nothing_is_lost(seeds, run, tmp_path, writer):
             status, log = run(f"{words} {again}", tmp_path)
             assert status == 0, log
             assert not list(wrong(files(out), {}, new)) and not scratch(out)
-
-
-@pytest.mark.parametrize(
-    ("found", "is_lost"),
-    [
-        ({"run/a.json": b"{}\n# old\n", "run/b.png": b"1"}, []),
-        ({"run/a.json": b"{}\n", "run/b.png": b"22"}, []),
-        ({"run/a.json": b"{}\n"}, ["run/b.png"]),
-        ({"run/a.json": b"{}\n", "run/b.png": b""}, ["run/b.png"]),
-        ({"run/a.json": b"{", "run/b.png": b"22"}, ["run/a.json"]),
-    ],
-)
-def test_what_is_lost_or_mixed_is_seen(found, is_lost):
-    old = {"run/a.json": b"{}\n# old\n", "run/b.png": b"1"}
-    assert list(wrong(found, old, {"run/a.json": b"{}\n", "run/b.png": b"22"})) == is_lost
