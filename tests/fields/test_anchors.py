@@ -13,15 +13,12 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.fields.mlp import cosine_embedding
 from coliags_plugin.fields.points import neighbour_log_scales, spheres_in_frustum, voxelize
 from tests.fields.made import make_field
 from tests.scenes import camera_at, wall_scene
 
 COLIAGS = {"name": "anchors", "geometry_head": "imve", "appearance_head": "imia"}
 SCAFFOLD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
-#: The embedding of cos theta = 0.5 with five frequencies, computed by hand from the definition.
-HALF = [0.5, 0.479426, 0.877583, 0.841471, 0.540302, 0.909297, -0.416147, -0.756802, -0.653644, 0.989358, -0.145500]
 
 
 def make(node, seed=0, **options):
@@ -63,11 +60,6 @@ def test_imve_without_frequencies_decodes_as_the_plain_head():
     second = make(SCAFFOLD)
     camera = camera_at(0.0, 0.0, 0.0)
     assert torch.equal(first.gaussians(camera).scales, second.gaussians(camera).scales)
-
-
-def test_imia_embedding_of_one_half():
-    embedded = cosine_embedding(torch.tensor([[0.5]], dtype=torch.float64), 5)
-    assert embedded.tolist() == [pytest.approx(HALF, abs=5e-7)]
 
 
 def test_decoding_step_by_step():
@@ -132,12 +124,7 @@ def test_initial_scales_are_root_mean_square_neighbour_distances():
     distances = np.sort(np.linalg.norm(points[:, None].numpy() - points[None].numpy(), axis=2), axis=1)[:, 1:4]
     expected = np.log(np.sqrt((distances**2).mean(axis=1)))
     np.testing.assert_allclose(neighbour_log_scales(points).numpy(), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_points_get_finite_scales(count):
-    points = torch.arange(3.0 * count).reshape(count, 3)
-    assert torch.isfinite(neighbour_log_scales(points)).all()
+    assert all(neighbour_log_scales(points[:count]).isfinite().all() for count in (1, 2, 3))
 
 
 def test_default_voxel_is_two_pixels_on_the_surface():
@@ -211,12 +198,3 @@ def test_a_head_that_does_not_see_the_distance_expects_nothing():
     starts = ("scene_distances", "pytorch")
     plain, other = (make(SCAFFOLD, appearance_head={"name": "plain", "bias_init": start}) for start in starts)
     assert torch.equal(plain.appearance_head.color_mlp[0].bias, other.appearance_head.color_mlp[0].bias)
-
-
-def test_coliags_with_plain_heads_is_scaffold_to_the_bit():
-    plain = {"geometry_head": {"name": "plain"}, "appearance_head": {"name": "plain"}}
-    ours, theirs = make({**COLIAGS, **plain}), make(SCAFFOLD)
-    camera = camera_at(1.0, 0.5, 2.0)
-    first, second = ours.gaussians(camera), theirs.gaussians(camera)
-    for name in ("means", "quats_wxyz", "scales", "opacities", "colors", "source_index", "visible_sources"):
-        assert torch.equal(getattr(first, name), getattr(second, name))

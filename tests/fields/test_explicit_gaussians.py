@@ -14,7 +14,6 @@ from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.tensors import point_normals, wall_normals
-from coliags_plugin.fields.explicit_field import ReferenceNormals
 from coliags_plugin.fields.explicit_gaussians import AttenuatedGaussians
 from coliags_plugin.fields.numba_kernels import spherical_harmonics as kernel
 from coliags_plugin.fields.spherical_harmonics import Y0, basis, colors
@@ -134,10 +133,6 @@ def test_gradients_of_logarithms_and_logits():
     torch.testing.assert_close(field.opacities.grad[rows], 3.0 * gaussians.opacities * (1.0 - gaussians.opacities))
 
 
-def test_parameter_groups_are_named_as_in_gsplat():
-    assert list(make().parameter_groups()) == ["means", "scales", "quats", "opacities", "sh0", "shN"]
-
-
 # Surfels
 
 
@@ -215,19 +210,6 @@ def test_normals_of_a_noisy_wall(count):
         assert normals[:, 2].abs().min() > math.cos(math.radians(1.5))
 
 
-def test_new_gaussians_take_the_normal_of_the_nearest_initial_point_and_keep_it():
-    points, outward = cylinder()
-    references = ReferenceNormals.of_points(points.float(), 10)
-    born = points[[5, 700]] + 0.1 * outward[[5, 700]]
-    references.extend(born.float())
-    torch.testing.assert_close(references.of_rows[-2:], references.normals[[5, 700]])
-    keep = torch.ones(len(points) + 2, dtype=torch.bool)
-    keep[:700] = False
-    references.keep(keep)
-    torch.testing.assert_close(references.of_rows[0], references.normals[700])
-    torch.testing.assert_close(references.of_rows[-2:], references.normals[[5, 700]])
-
-
 # The basis against scipy's complex spherical harmonics, and the kernel against torch
 
 
@@ -252,13 +234,6 @@ def test_real_harmonics_from_scipys_complex_ones():
         torch.testing.assert_close(basis(points, degree), torch.from_numpy(functions))
     with pytest.raises(ValueError, match="degree 4: expected 0 to 3"):
         basis(points, 4)
-
-
-def test_degree_zero_is_a_colour_and_negative_ones_are_cut():
-    coefficients = torch.zeros(3, 16, 3, dtype=torch.float64)
-    coefficients[:, 0] = (torch.tensor([0.2, 0.5, -0.3]) - 0.5) / Y0
-    coefficients[:, 5] = 9.0  # of degree 2
-    torch.testing.assert_close(colors(coefficients, directions(3), 1)[1], torch.tensor([0.2, 0.5, 0.0]).double())
 
 
 # --- the kernel -------------------------------------------------------------------------------------------------------

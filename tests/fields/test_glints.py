@@ -74,7 +74,9 @@ def test_a_tilted_facet_glints_beside_the_normal():
         head.tilt_layer.bias.copy_(torch.atanh(torch.tensor([0.3, -0.1]) / MAX_TILT))
     facing = torch.tensor([[0.3, -0.1, math.sqrt(0.9)]])
     torch.testing.assert_close(embedded(head, facing, normal)[:, 5 : 5 + len(WIDTHS)], torch.ones(1, len(WIDTHS)))
-    assert embedded(head, normal, normal)[0, 5].item() < 1e-4
+    beside = embedded(head, normal, normal)[0, 5 : 5 + len(WIDTHS)]
+    beside.sum().backward()
+    assert beside[0].item() < 1e-4 and head.tilt_layer.bias.grad.all()  # it can be learned
 
 
 @pytest.mark.parametrize(
@@ -95,29 +97,6 @@ def test_a_field_keeps_the_normals_of_the_wall_for_heads_that_see_them(appearanc
     assert all(gradient.isfinite().all() for gradient in gradients)
     without = make_field("anchors", geometry_head="plain", appearance_head="plain")
     assert without.normals is None and "normals" not in without.state_dict()
-
-
-@pytest.mark.thorough
-def test_a_glint_beside_the_normal_is_learned():
-    """One anchor that glints about a direction 10 degrees off the wall's normal: IMIA finds none of it."""
-    generator = torch.Generator().manual_seed(0)
-    offsets = 0.5 * torch.rand(150, 2, generator=generator) - 0.25
-    directions = torch.cat([offsets, (1.0 - offsets.square().sum(1, keepdim=True)).sqrt()], dim=1)
-    glint = torch.exp(-(offsets - torch.tensor([0.17, 0.0])).square().sum(1) / 0.06**2)
-    normals = unit((0.0, 0.0, 1.0)).expand(150, 3)
-    errors = {}
-    for name in ("imia", "imia-glints"):
-        head = make_head(name)
-        head.init_from_distances(torch.linspace(5.0, 9.0, 5))
-        fit = torch.optim.Adam(head.parameters(), lr=0.02)
-        for _ in range(400):
-            fit.zero_grad()
-            colors = head(seen(directions, normals))
-            error = (colors - (0.3 + 0.6 * glint)[:, None, None]).square().mean()
-            error.backward()
-            fit.step()
-        errors[name] = float(error.detach())
-    assert errors["imia-glints"] < 0.75 * errors["imia"]
 
 
 # The law of attenuation: closed forms, and that other heads are left as they are
@@ -212,30 +191,3 @@ def test_colors_do_not_move_gaussians():
     field = make_anchors(appearance_head={"name": "attenuated", "head": "plain"})
     field.gaussians(camera_at(0.0, 0.0, 0.0)).colors.sum().backward()
     assert not field.offsets.grad.any() and field.appearance_head.exponents.grad.abs().max() > 0
-
-
-@pytest.mark.thorough
-def test_the_law_of_a_lamp_is_found():
-    """Gaussians of one albedo under an inverse-square lamp 3.6 mm behind the lens, spread as cos^1.2, at gamma 2.2."""
-    generator = torch.Generator().manual_seed(0)
-    camera, head = camera_at(0, 0, 0).to("cpu", torch.float32), make_attenuated(cosine_exponent=0.0)
-    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 40.0]) + torch.tensor([-8.0, -8, 5])
-    distances = (points - torch.tensor([0.0, 0.0, -3.6])).norm(dim=1)
-    true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * ((points[:, 2] + 3.6) / distances) ** (1.2 / 2.2)
-    head.init_from_distances(torch.tensor([20.0]))
-    albedo = torch.tensor(0.3, requires_grad=True)
-    fit = torch.optim.LBFGS([head.exponents, head.lamp_offset, albedo], max_iter=200, line_search_fn="strong_wolfe")
-
-    def error() -> torch.Tensor:
-        fit.zero_grad()
-        lit = head.apply_light(albedo.expand(2000, 3), points, None, camera, None)
-        value = (lit[:, 0].log() - true.log()).square().mean()
-        value.backward()
-        return value
-
-    for _ in range(3):
-        fit.step(error)
-    learned = head.learned
-    assert learned["distance_exponent"][0] == pytest.approx(-2 / 2.2, rel=0.02)
-    assert learned["cosine_exponent"][0] == pytest.approx(1.2 / 2.2, rel=0.05)
-    assert learned["lamp_offset"] == pytest.approx([0.0, 0.0, -3.6], abs=0.2)

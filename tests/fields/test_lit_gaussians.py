@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
-from coliags_plugin.fields.cook_torrance import Cosines, facet_density, fresnel, lambert, specular
+from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.lit_gaussians import _ROWS, GAMMA, PINK, THICKNESS, DiffuseNetwork
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.made import colored_wall, make_field
@@ -90,13 +90,7 @@ def test_colours_are_the_closed_form_under_the_camera_s_lamp_and_another():
     expected = expected_colors(field, lit, camera, position, lambda out: 1.5 * max(out @ axis, 0.0) ** 6.0)
     torch.testing.assert_close(lit.colors, expected, rtol=2e-4, atol=1e-5)
     assert not torch.allclose(lit.colors, gaussians.colors, atol=0.05)
-
-
-def test_another_lamp_leaves_the_field_itself_alone():
-    field, camera = varied(), camera_at(0, 0, 0)
-    before, brighter = field.gaussians(camera).colors, field.with_lamp(Lamp(intensity=2.0))
-    torch.testing.assert_close(brighter.gaussians(camera).colors, before * 2 ** (1 / GAMMA), rtol=1e-5, atol=0)
-    assert torch.equal(field.gaussians(camera).colors, before) and brighter.albedos is field.albedos
+    assert torch.equal(field.gaussians(camera).colors, gaussians.colors)
 
 
 def test_a_lamp_that_shines_away_lights_nothing():
@@ -284,10 +278,9 @@ def test_padding_of_reduced_products_changes_no_gradient():
     assert padded[-1].tolist() == [50.0] * 3
 
 
-# Reflectance: the published formulas, reciprocity, and facets that cover the surface once
+# Reflectance: the published formulas and reciprocity
 
 
-ROUGHNESS = (0.05, 0.1, 0.3, 0.5, 0.7)
 UP = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
@@ -330,26 +323,6 @@ def test_the_published_formulas_and_reciprocity(view_polar, view_azimuth, lamp_p
     expected = np.array(by_hand(view[0].numpy(), lamp[0].numpy(), UP[0].numpy(), roughness, f0))
     assert there == pytest.approx(expected / math.cos(lamp_polar), rel=1e-6)
     assert there == pytest.approx(brdf(lamp, view, roughness, f0), rel=1e-9)
-
-
-def test_a_lamp_at_the_viewer_is_the_general_case():
-    view = direction(0.7, 0.3)
-    cosines = Cosines.retroreflected((UP * view).sum(1))
-    reflected = fresnel(cosines, double(0.02))
-    assert reflected.item() == 0.02
-    ours = [
-        term.item() / math.cos(0.7) for term in (lambert(cosines, reflected), specular(cosines, reflected, double(0.4)))
-    ]
-    assert ours == pytest.approx(brdf(view, view, 0.4, 0.02), rel=1e-9)
-
-
-@pytest.mark.parametrize("roughness", ROUGHNESS)
-def test_facets_cover_the_surface_once(roughness):
-    """The projected area of all facets is 1: the integral over the hemisphere of D <N, H>, with t = <N, H>^2."""
-    edges = 1.0 - torch.logspace(-14, 0, 200_001, dtype=torch.float64)
-    middles = (edges[1:] + edges[:-1]) / 2
-    area = facet_density(middles.sqrt(), torch.full_like(middles, roughness)) * math.pi * (edges[:-1] - edges[1:])
-    assert area.sum().item() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_gradients_are_those_of_finite_differences_and_finite_at_grazing_angles():

@@ -215,12 +215,6 @@ def trainer(folder, overrides=(), scene=None, steps=20):
     return Trainer(method, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
 
 
-def test_without_the_lamp_the_method_is_nerf(tmp_path):
-    plain = trainer(tmp_path / "run", ["field.light=false"])
-    assert plain.model.field.fine_network.color.in_features == SMALL["width"] + 27
-    assert math.isfinite(plain.take_step()["loss"])
-
-
 def test_noise_and_jitter_are_of_training_alone(tmp_path):
     even = ["renderer.jitter=false", "field.render_precision=float32"]
     run = trainer(tmp_path / "run", even)

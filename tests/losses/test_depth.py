@@ -245,13 +245,6 @@ def test_relative_differences_need_no_unit(at_points, rendered, points):
         assert values == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
 
 
-def test_a_point_on_a_pixel_centre_is_that_pixel(at_points, rendered):
-    term = at_points(rendered, [[3.5, 2.5]], [0.0])
-    term.backward()
-    assert term.item() == rendered[2, 3].item()
-    assert rendered.grad.nonzero().tolist() == [[2, 3]]
-
-
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (1, 1), (1, 6), (5, 1)])
 @pytest.mark.parametrize("place", [(0.0, 0.0), (1.0, 1.0), (0.02, 0.98), (0.999, 0.0)])
 def test_edges_of_the_image_take_the_outermost_pixels(at_points, size, place):

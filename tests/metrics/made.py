@@ -6,7 +6,6 @@ import torch
 
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
-from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import TAPS
 
@@ -28,11 +27,6 @@ def depths(depth, true_depth, valid=None):
     grey = torch.zeros(*depth.shape, 3)
     everywhere = torch.ones(depth.shape, dtype=torch.bool)
     return Comparison(grey, grey, everywhere, depth, true_depth, torch.isfinite(true_depth) if valid is None else valid)
-
-
-def make_output(rgb, **maps):
-    """A RenderOutput of these colours and maps."""
-    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps)
 
 
 # Random weights in the files of LPIPS's networks

@@ -18,7 +18,8 @@ from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.metrics.depth import depth_steps, dilated
-from tests.metrics.made import depths, images, make, make_output
+from tests.losses.terms import make_output
+from tests.metrics.made import depths, images, make
 from tests.scenes import plain_frame as make_frame
 
 ALL = ["depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error", "depth_abs_rel"]
@@ -82,23 +83,21 @@ def two_walls(near_mm=20.0, far_mm=30.0):
     return truth
 
 
-def test_a_step_marks_both_sides_and_the_margin_two_more():
-    truth = two_walls()
+def test_a_step_marks_both_sides_and_the_margin_two_more_and_both_are_settings():
+    def error(rendered, **options):
+        return make("depth_mse_inner", **options)(depths(rendered, truth))
 
+    truth = two_walls()
     rendered = truth.clone()
     rendered[:, 7:13] += 100.0
-    assert make("depth_mse_inner")(depths(rendered, truth)) == 0.0
+    assert error(rendered) == 0.0
     rendered[:, 6] += 1.0
-    assert make("depth_mse_inner")(depths(rendered, truth)) == pytest.approx(1 / 14)
-
-
-def test_threshold_and_margin_are_settings():
-    truth = two_walls()
+    assert error(rendered) == pytest.approx(1 / 14)
     rendered = truth.clone()
     rendered[:, 9:11] += 3.0
-    assert make("depth_mse_inner", relative_step=0.6)(depths(rendered, truth)) == pytest.approx(0.9)
+    assert error(rendered, relative_step=0.6) == pytest.approx(0.9)
     rendered[:, 8] += 1.0
-    assert make("depth_mse_inner", margin=0)(depths(rendered, truth)) == pytest.approx(1 / 18)
+    assert error(rendered, margin=0) == pytest.approx(1 / 18)
 
 
 def test_inner_mse_is_unavailable_where_every_pixel_is_near_a_step():

@@ -35,15 +35,8 @@ def test_psnr_with_a_fitted_gain_is_that_of_the_best_factor(pair, mask):
 
     best = minimize_scalar(negative, bounds=(0.0, 3.0), method="bounded", options={"xatol": 1e-9})
     assert make("psnr_gain_fitted")(images(*pair, mask)) == pytest.approx(-best.fun, abs=1e-9)
-
-
-def test_a_wrong_exposure_does_not_change_psnr_with_a_fitted_gain(pair):
-    a, b = pair
-    fitted = make("psnr_gain_fitted")
-    assert fitted(images(0.5 * a, b)) == pytest.approx(fitted(images(a, b)), abs=1e-5)
-    assert fitted(images(a, b)) >= make("psnr")(images(a, b)) > make("psnr")(images(0.5 * a, b))
-    black = torch.zeros_like(a)
-    assert fitted(images(black, b)) == make("psnr")(images(black, b))
+    black = images(torch.zeros_like(pair[0]), pair[1])
+    assert make("psnr_gain_fitted")(black) == make("psnr")(black)
 
 
 def test_ssim_is_the_masked_flavour_in_double_precision(pair, mask):

@@ -5,7 +5,7 @@ import torch
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.metrics import lpips
 from coliags_plugin.metrics.lpips import TAPS, LPIPSNetwork, features
-from tests.metrics.made import TORCHVISION, images, lay_out, make, random_backbone, random_heads
+from tests.metrics.made import images, lay_out, make, random_backbone, random_heads
 
 NETS = ["vgg", "alex", "squeeze"]
 
@@ -34,37 +34,19 @@ def test_unmapped_images_give_other_values_in_the_same_order_and_direction(squee
     assert abs(blurred - mapped) > 0.001
 
 
-def test_ignored_pixels_do_not_change_lpips(squeeze, examples):
-    mask = torch.ones(64, 64, dtype=torch.bool)
-    mask[:, 40:] = False
-    hidden, truth = examples["p1"].clone(), examples["ref"].clone()
-    hidden[~mask], truth[~mask] = torch.nan, 7.0
-    masked = squeeze()(images(examples["p1"], examples["ref"], mask))
-    assert squeeze()(images(hidden, truth, mask)) == masked
-    assert masked != squeeze()(images(examples["p1"], examples["ref"]))
-
-
-def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, examples):
-    """Only the left half differs, so leaving out the right half raises the mean."""
-    rendered = examples["ref"].clone()
-    rendered[:, :32] = examples["p0"][:, :32]
-    left = torch.zeros(64, 64, dtype=torch.bool)
-    left[:, :32] = True
-    everywhere = squeeze()(images(rendered, examples["ref"]))
-    assert squeeze()(images(rendered, examples["ref"], left)) > 1.2 * everywhere
+def test_ignored_pixels_do_not_change_lpips_and_are_left_out_of_its_mean(squeeze, examples):
+    left = torch.ones(64, 64, dtype=torch.bool)
+    left[:, 32:] = False
+    truth, rendered = examples["ref"], torch.where(left[..., None], examples["p0"], examples["ref"])
+    hidden, other = (
+        torch.where(left[..., None], image, value) for image, value in ((rendered, torch.nan), (truth, 7.0))
+    )
+    masked = squeeze()(images(rendered, truth, left))
+    assert squeeze()(images(hidden, other, left)) == masked
+    assert masked > 1.2 * squeeze()(images(rendered, truth))  # only the left half differs
 
 
 # ------------------------------------------------------------------------------------------------------ architectures
-
-
-@pytest.mark.parametrize("net", NETS)
-def test_layers_are_numbered_and_shaped_as_torchvision_s(net):
-    with torch.device("meta"):
-        state = features(net).state_dict()
-    expected = {}
-    for key, (outputs, inputs, size) in TORCHVISION[net].items():
-        expected |= {f"{key}.weight": (outputs, inputs, size, size), f"{key}.bias": (outputs,)}
-    assert {key: tuple(value.shape) for key, value in state.items()} == expected
 
 
 @pytest.mark.parametrize(

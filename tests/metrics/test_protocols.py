@@ -1,5 +1,5 @@
 import platform
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ from coliags_plugin.config import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.metrics.protocols import through_8_bit, through_16_bit
-from tests.metrics.made import make, make_output
+from tests.losses.terms import make_output
+from tests.metrics.made import make
 from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 12, 15
@@ -57,13 +58,6 @@ def test_what_a_protocol_promises(name):
         assert made.metrics["lpips"] == ("lpips", {"net": "vgg", "input_range": "zero-one"})
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_nothing_compared_carries_a_graph(name, scene):
-    comparison = protocol(name).compare(*scene)
-    values = [getattr(comparison, field.name) for field in fields(comparison)]
-    assert not any(value.requires_grad for value in values if isinstance(value, torch.Tensor))
-
-
 @pytest.mark.parametrize(("name", "kind"), [("expected-depth", "depth_expected"), ("median-depth", "depth_median")])
 def test_each_kind_of_depth_has_its_protocol(name, kind, scene):
     output, frame = scene
@@ -75,8 +69,10 @@ def test_each_kind_of_depth_has_its_protocol(name, kind, scene):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_frame_without_depth_has_images_only(name, scene):
+def test_nothing_compared_carries_a_graph_and_a_frame_without_depth_has_images_only(name, scene):
     output, frame = scene
+    values = vars(protocol(name).compare(output, frame)).values()
+    assert not any(value.requires_grad for value in values if isinstance(value, torch.Tensor))
     comparison = protocol(name).compare(output, frame.with_maps(depth=None))
     assert comparison.depth is comparison.true_depth is comparison.depth_valid is None
     assert score(name, "psnr", comparison) > 0
@@ -150,21 +146,7 @@ def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(scene):
     comparison = protocol("authors-code").compare(output, frame)
     assert not comparison.depth[:3].any()
     # 20 mm over 150 is level 8738 (20 mm) or, truncated in float32, one less
-    drawn, truth = comparison.depth[3, 0].item(), comparison.true_depth[0, 0].item()
-    assert drawn == pytest.approx(20.0, abs=0.0023)
-    expected = ((3 * WIDTH - 1) * truth**2 + 9 * WIDTH * (drawn - truth) ** 2) / (HEIGHT * WIDTH)
-    assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
-
-
-def test_authors_code_wraps_surfaces_beyond_150_mm_and_true_depth_beyond_100_mm(scene):
-    _, frame = scene
-    frame = frame.with_maps(depth=torch.full((HEIGHT, WIDTH), 101.0))
-    far = torch.full((HEIGHT, WIDTH), 1 / 160.0)
-    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=far)
-    comparison = protocol("authors-code").compare(output, frame)
-    # 160 / 150 * 65535 = 69904, less 65536; 101 / 100 * 65535 = 66190.35, less 65536
-    assert comparison.depth[0, 0].item() == pytest.approx(4368 / 65535 * 150, abs=0.0024)
-    assert comparison.true_depth[0, 0].item() == pytest.approx(654 / 65535 * 100, abs=1e-5)
+    assert comparison.depth[3, 0].item() == pytest.approx(20.0, abs=0.0023) and comparison.depth_valid.all()
 
 
 # -------------------------------------------------------------------------------------------------------- quantisation

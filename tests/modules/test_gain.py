@@ -20,7 +20,6 @@ from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.modules.gain import FrameGain, FrameGainSettings
 from coliags_plugin.modules.response import CameraResponse, ResponseSettings
-from coliags_plugin.phantom.response import encode
 from tests.pretended_cuda import PretendedCuda
 from tests.scenes import wall_scene
 
@@ -244,11 +243,12 @@ def make_response(**options):
     return CameraResponse.from_scene(wall_scene(), ResponseSettings(**options), torch.Generator())
 
 
-def test_it_begins_as_the_identity_for_every_view():
+def test_it_begins_as_the_identity_for_every_view_and_colours_that_are_not_finite_stay_so():
     module = make_response()
     output = RenderOutput(2.0 * torch.rand(4, 5, 3), torch.rand(4, 5), None, {})
+    output.rgb[0, 0] = torch.tensor([torch.nan, torch.inf, 0.25])
     for view in (None, View("0001", 1.0, True), View("0000", 0.0, False)):
-        torch.testing.assert_close(module.shade(output, view).rgb, output.rgb)
+        torch.testing.assert_close(module.shade(output, view).rgb, output.rgb, equal_nan=True)
 
 
 def test_it_is_numpys_interpolation_of_its_points():
@@ -280,12 +280,6 @@ def test_the_curve_of_a_device_is_that_of_the_cpu():
         torch.testing.assert_close(of_device, of_cpu, atol=2e-6, rtol=2e-6)
 
 
-def test_colours_that_are_not_finite_stay_so():
-    values = make_response().curve(torch.tensor([float("nan"), float("inf"), 0.25]))
-    assert values.isnan().tolist() == [True, False, False]
-    assert values[1].isinf() and values[2] == 0.25
-
-
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3), st.floats(0.0, 3.0), st.floats(1e-3, 3.0))
 def test_it_increases(slopes, color, more):
     module = CameraResponse(ResponseSettings(segments=3))
@@ -306,28 +300,3 @@ def test_its_gradient_is_that_of_differences():
         return torch.func.functional_call(module, {"log_slope": slope}, (colors,))
 
     assert torch.autograd.gradcheck(curve, (colors, module.log_slope.detach().clone().requires_grad_()))
-
-
-@pytest.mark.thorough
-def test_a_known_shoulder_is_found():
-    """Colours under five gains through the phantom's tone curve: the curve is found to half a percent."""
-    generator = torch.Generator().manual_seed(0)
-    colors = torch.rand(400, 1, generator=generator) * 0.9
-    gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.5])
-    rendered = torch.from_numpy(encode(((colors * gains).numpy()) ** 2.2, 2.2)).float()
-    module = make_response()
-    log_colors, log_gains = (torch.zeros(shape, requires_grad=True) for shape in (colors.shape, gains.shape))
-    with torch.no_grad():
-        log_colors.copy_(rendered[:, 2:3].clamp_min(1e-3).log())
-    adam = torch.optim.Adam([log_colors, log_gains, module.log_slope], lr=0.02)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, 800)
-    for _ in range(800):
-        adam.zero_grad()
-        drawn = log_colors.exp() * (log_gains - log_gains[2]).exp()
-        (module.curve(drawn) - rendered).abs().mean().backward()
-        adam.step()
-        schedule.step()
-    calls = torch.linspace(0.1, 1.3, 25)
-    expected = encode(calls.numpy() ** 2.2, 2.2)
-    np.testing.assert_allclose(module.curve(calls).detach(), expected, atol=0.005)
-    np.testing.assert_allclose((log_gains - log_gains[2]).exp().detach(), gains, rtol=0.005)

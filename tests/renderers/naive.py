@@ -68,8 +68,8 @@ class View:
         return {**self.sums, "rgb": rgb, "depth_expected": expected}
 
 
-def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, eps2d=0.3):
-    """All outputs of one view of 3D Gaussians, by name, and the projected centres."""
+def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, eps2d=0.3, shifts=None):
+    """All outputs of one view of 3D Gaussians, by name, and the projected centres; ``shifts`` moves these. [N, 2]"""
     view = View(gaussians, camera)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     low, high = ((end - view.principal + side * size) / view.focal for end, side in ((0, -0.15), (size, 0.15)))
@@ -78,7 +78,7 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, eps2d=0
         jacobian = torch.cat([torch.diag(view.focal), -(view.focal * slopes)[:, None]], dim=1) / place[2]
         covariance = rotation @ torch.diag(view.scales[i] ** 2) @ rotation.T
         flat = jacobian @ covariance @ jacobian.T + eps2d * torch.eye(2, dtype=torch.float64)
-        offset = view.pixels - view.centers[i]
+        offset = view.pixels - view.centers[i] - (0.0 if shifts is None else shifts[i])
         power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(flat), offset)
         view.add(i, power, place[2], rotation[:, int(view.scales[i].argmin())])
     return view.outputs(background), view.centers

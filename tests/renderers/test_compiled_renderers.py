@@ -24,7 +24,7 @@ from coliags_plugin.renderers.torch_renderer import TorchRendererSettings
 from tests.renderers import test_surfels as surfels
 from tests.renderers import test_torch_renderer as solids
 from tests.renderers.test_surfels import as_surfels, make_surfels, outputs_of
-from tests.renderers.test_torch_renderer import INPUTS, cast, make, pinhole, random_gaussians, relative
+from tests.renderers.test_torch_renderer import INPUTS, cast, pinhole, random_gaussians, relative
 
 PRIMITIVES = ("gaussians3d", "surfels")
 of_each = pytest.mark.parametrize("primitive", PRIMITIVES)
@@ -197,19 +197,6 @@ def test_agrees_with_the_definition_in_float64(renderer, primitive, name):
         ours.splats.means2d.detach().cpu().double()[shown], true.splats.means2d.detach()[shown], **tolerance
     )
     assert int((ours.splats.radii.cpu().double() != true.splats.radii).sum()) <= len(gaussians) // 1000
-
-
-@pytest.mark.parametrize(
-    ("depths", "opacity"),
-    [
-        ([5.0], (1 + 1e-5) / 255),
-        ([4.0, 5.0], 0.99),  # leave a hundredth of a hundredth
-    ],
-    ids=["alpha", "transmittance"],
-)
-def test_pixels_on_a_cutoff_are_found(depths, opacity):
-    gaussians = make([[0, 0, depth] for depth in depths], 0.2, opacity)
-    assert on_a_cutoff(gaussians, pinhole()).nonzero().tolist() == [[3, 4]]
 
 
 @by_each_at_length

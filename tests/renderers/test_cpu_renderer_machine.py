@@ -109,15 +109,6 @@ def cache(tmp_path, monkeypatch, caplog):
     return tmp_path / "cache"
 
 
-def test_compiled_kernels_are_kept(cache, caplog):
-    assert compilation.kernel(twice)(4) == 8
-    again = compilation.kernel(twice)
-    assert again(4) == 8
-    assert sum(again.stats.cache_hits.values()) == 1
-    assert [record.levelname for record in caplog.records] == ["INFO"]
-    assert str(cache) in caplog.text
-
-
 @compilation.part
 def plus(number, more):
     return number + more
@@ -148,8 +139,9 @@ def test_a_cache_that_fails_costs_nothing_but_time(cache, caplog, monkeypatch, t
         for file in [path for path in cache.rglob("*") if path.is_file()]:
             file.write_bytes(file.read_bytes()[:20])
         kernel = compilation.kernel(twice)
-    assert kernel(4) == 8
+    assert kernel(4) == 8 and compilation.kernel(plus_three)(4) == 7
     assert re.search(told, caplog.text, re.DOTALL)
+    assert caplog.text.count("nowhere to keep them") == told.startswith("nowhere")  # once for all kernels
 
 
 def factory(step):
@@ -172,11 +164,12 @@ def ten_more(number):
     return number + 10
 
 
-def test_kernels_of_one_factory_are_kept_apart(cache):
+def test_compiled_kernels_are_kept_and_those_of_one_factory_apart(cache, caplog):
     for _ in range(2):
         kernels = [factory(step) for step in (one_more, ten_more)]
         assert [kernel(4) for kernel in kernels] == [5, 14]
     assert [sum(kernel.stats.cache_hits.values()) for kernel in kernels] == [1, 1]
+    assert {record.levelname for record in caplog.records} == {"INFO"} and str(cache) in caplog.text
 
 
 def run_python(code, **environment):
@@ -186,20 +179,6 @@ def run_python(code, **environment):
     return subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, timeout=600
     )
-
-
-@pytest.mark.thorough
-def test_all_kernels_load_where_nothing_can_be_kept(tmp_path):
-    (tmp_path / "file").touch()
-    code = """
-import logging, numba.core.caching
-logging.basicConfig(level=logging.INFO)
-numba.core.caching.CacheImpl._locator_classes = numba.core.caching.CacheImpl._locator_classes[:1]
-from coliags_plugin.renderers.numba_kernels import pipeline
-"""
-    process = run_python(code, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
-    assert process.returncode == 0, process.stderr
-    assert process.stderr.count("nowhere to keep them") == 1
 
 
 def with_another_release(expression):
