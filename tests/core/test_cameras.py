@@ -1,4 +1,4 @@
-"""The camera's arithmetic, the numbers of its pixels, and maps."""
+"""The camera's arithmetic and the bounds of its numbers, the numbers of its pixels, and maps."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from coliags_plugin.core.arrays import dilated, eroded
-from coliags_plugin.core.scenes import concatenate_targets
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.scenes import PointCloud, concatenate_targets
 from coliags_plugin.core.tensors import bilinear, fixed_uniform, masked_mean, pixel_ids, zero_outside
+from coliags_plugin.datamanagers.fusion import subsampled
+from coliags_plugin.geometry.lenses.models import FisheyeLens, OpenCVLens
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.scenes import camera_at, wall_scene
 
 
@@ -55,12 +60,9 @@ def splitmix64(state):
     return state ^ (state >> 31)
 
 
-def test_the_reference_is_splitmix64():
-    assert splitmix64(0) == 0xE220A8397B1DCDAF  # its first published output for seed 0
-
-
 @given(frame=st.integers(0, 100_000), pixel=st.integers(0, 2**32 - 1), seed=st.integers(0, 2**31))
 def test_numbers_are_splitmix64_of_frame_pixel_and_seed(frame, pixel, seed):
+    assert splitmix64(0) == 0xE220A8397B1DCDAF  # its first published output for seed 0
     ids = pixel_ids(frame, torch.tensor([[pixel]]))
     assert ids.item() == frame * 2**32 + pixel
     assert fixed_uniform(ids, seed).item() == (splitmix64(ids.item() ^ splitmix64(seed)) >> 11) / 2**53
@@ -114,6 +116,45 @@ def test_samples_are_scipys_also_beyond_the_edge():
         torch.testing.assert_close(samples[..., channel], torch.from_numpy(expected), atol=1e-5, rtol=0.0)
 
 
-def test_pixel_centres_are_at_halves():
-    image = torch.arange(6.0).view(2, 3, 1)
-    assert bilinear(image, torch.tensor([[[2.5, 1.5]]])).item() == 5.0
+# Numbers that are finite in a file and useless in a computation
+
+
+@pytest.mark.parametrize("far", [1e7, 1e38, 1e308, np.inf, np.nan])
+@pytest.mark.parametrize("axis", [0, 2])
+def test_cameras_far_away_are_refused(far, axis):
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, axis, 3] = far
+    with pytest.raises(InputError, match=r"^pose 1: "):
+        Trajectory(poses)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (1e8, 100, 50, 50, 100, 100),
+        (1e-9, 100, 50, 50, 100, 100),
+        (100, 100, -1e30, 50, 100, 100),
+        (100, 100, float("nan"), 50, 100, 100),
+        (100, 100, 50, 50, 100_000, 100),
+        (100, 100, 50, 50, 100, 0),
+    ],
+)
+def test_intrinsics_out_of_bounds_are_refused(values):
+    with pytest.raises(InputError, match=r"^intrinsics fx"):
+        Intrinsics(*values)
+
+
+@pytest.mark.parametrize("lens", [FisheyeLens, OpenCVLens])
+@pytest.mark.parametrize(("term", "value"), [("k1", 1e5), ("k2", -1e300), ("k3", float("inf")), ("fx", 1e9)])
+def test_lens_terms_out_of_bounds_are_refused(lens, term, value):
+    terms = {"fx": 100.0, "fy": 100.0, "cx": 50.0, "cy": 40.0, **{f"k{number}": 0.0 for number in range(1, 5)}}
+    assert lens(width=100, height=80, **terms).pinhole.width == 100
+    with pytest.raises(InputError, match=f"^a lens with {term} "):
+        lens(width=100, height=80, **{**terms, term: value})
+
+
+def test_points_far_away_are_left_out(caplog):
+    positions = torch.tensor([[0.0, 0, 1], [1e7, 0, 0], [0, float("inf"), 0], [0, 0, float("nan")], [1, 1, 1]])
+    points = subsampled(PointCloud(positions), 10, np.random.default_rng(0), None)
+    assert points.positions.tolist() == [[0, 0, 1], [1, 1, 1]]
+    assert "3 of 5 points are not finite, or beyond 1e+06" in caplog.text

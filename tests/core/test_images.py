@@ -15,28 +15,24 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import decode_image, encode_image, sizes_text, write_image, write_mask
+from coliags_plugin.core.images import decode_image, encode_image, write_image, write_mask
 from coliags_plugin.core.libraries import decoder_messages
 from tests.layouts.rotatecolon import write_exr
 
 
-def read(path):
-    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tiff"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_lossless_images_keep_their_numbers(suffix, dtype, tmp_path):
-    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (5, 7, 3)).astype(dtype)
-    write_image(tmp_path / "folder" / f"rgb{suffix}", pixels)
-    np.testing.assert_array_equal(read(tmp_path / "folder" / f"rgb{suffix}")[..., ::-1], pixels)
-    write_image(tmp_path / f"grey{suffix}", pixels[..., 0])
-    np.testing.assert_array_equal(read(tmp_path / f"grey{suffix}"), pixels[..., 0])
-
-
-def test_masks_are_black_and_white(tmp_path):
-    write_mask(tmp_path / "mask.png", np.array([[True, False]]))
-    assert read(tmp_path / "mask.png").tolist() == [[255, 0]]
+@pytest.mark.parametrize(("suffix", "bits"), [(".png", 8), (".png", 16), (".tiff", 8), (".tiff", 16), (".bmp", 8)])
+def test_lossless_images_keep_their_numbers_and_masks_are_black_and_white(suffix, bits, tmp_path):
+    path = tmp_path / "folder" / f"a{suffix}"
+    pixels = np.random.default_rng(0).integers(0, 2**bits, (5, 7, 3)).astype(f"u{bits // 8}")
+    write_image(path, pixels)
+    path.write_bytes(path.read_bytes() + b"behind the end")
+    for read in (decode_image, lambda file: cv2.imread(str(file), cv2.IMREAD_UNCHANGED)):
+        np.testing.assert_array_equal(read(path)[..., ::-1], pixels)
+        write_image(tmp_path / f"grey{suffix}", pixels[..., 0])
+        np.testing.assert_array_equal(read(tmp_path / f"grey{suffix}"), pixels[..., 0])
+        write_mask(tmp_path / f"mask{suffix}", np.array([[True, False]]))
+        assert read(tmp_path / f"mask{suffix}").tolist() == [[255, 0]]
+    assert decode_image(path, cv2.IMREAD_GRAYSCALE).shape == (5, 7)
 
 
 def test_what_a_format_cannot_hold_is_refused():
@@ -49,17 +45,6 @@ def test_what_a_format_cannot_hold_is_refused():
 def chunk(kind, data, length=None):
     length = len(data) if length is None else length
     return length.to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
-
-
-def test_images_are_decoded_as_stored(tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8)
-    for suffix in (".png", ".tiff", ".bmp"):
-        write_image(tmp_path / f"a{suffix}", pixels)
-        np.testing.assert_array_equal(decode_image(tmp_path / f"a{suffix}")[..., ::-1], pixels)
-    assert decode_image(tmp_path / "a.png", cv2.IMREAD_GRAYSCALE).shape == (5, 7)
-    whole = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(whole + b"behind the end")
-    np.testing.assert_array_equal(decode_image(tmp_path / "a.png")[..., ::-1], pixels)
 
 
 def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
@@ -91,11 +76,6 @@ def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, name  # KiB
     with pytest.raises(InputError, match="cannot read"):
         decode_image(tmp_path / "missing.png")
-
-
-def test_sizes_as_text():
-    assert sizes_text([(338, 223), (338, 223)]) == "338 x 223"
-    assert sizes_text([(338, 223), (338, 224), (338, 222)]) == "338 x 222 to 338 x 224"
 
 
 # What decoders in C print: nothing on the terminal, and a warning where no error tells it

@@ -202,8 +202,5 @@ def test_what_is_flat_or_faces_away_gets_nothing():
     assert Cavity.of(flat, up).indirect(direct, 0.5).abs().max() == 0.0
     points, normals = sphere(400, 10.0)
     assert Cavity.of(points, -normals).indirect(direct, 0.5).abs().max() == 0.0
-
-
-def test_few_points():
     points, normals = sphere(3, 10.0)
-    assert Cavity.of(points, normals).indirect(torch.ones(3, 1, dtype=torch.float64), 0.5).isfinite().all()
+    assert Cavity.of(points, normals).indirect(direct[:3], 0.5).isfinite().all()

@@ -3,7 +3,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import correlate1d
 
 from coliags_plugin.core.ssim import _blur_by_kornia, _blur_by_opencv, _window, ssim, ssim_map
 
@@ -23,23 +22,6 @@ def window():
     return weights / weights.sum()
 
 
-def reference_map(a, b):
-    """Wang et al. 2004 from scipy's correlation, zero padding."""
-
-    def blur(image):
-        return correlate1d(correlate1d(image, window(), 0, mode="constant"), window(), 1, mode="constant")
-
-    mean_a, mean_b = blur(a), blur(b)
-    var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
-    return ((2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)) / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 50), (31, 32), (33, 64), (65, 97)])
-def test_whole_map_against_scipy_at_every_size(size):
-    a, b = images(*size)
-    np.testing.assert_allclose(ssim_map(a, b).numpy(), reference_map(a.numpy(), b.numpy()), atol=1e-12)
-
-
 @pytest.mark.parametrize("with_mask", [False, True])
 def test_gradients(with_mask):
     a, b = images(4, 7, channels=2)
@@ -52,7 +34,7 @@ def test_gradients(with_mask):
 
 
 def brute_force(a, b, mask):
-    """Pixel by pixel: moments over the window's valid pixels, weighted to the window's total within the image."""
+    """Wang et al. 2004 at valid pixels: moments over the window's valid ones, weighted to its total in the image."""
     height, width = mask.shape
     total = []
     weights = np.outer(window(), window())
@@ -71,16 +53,18 @@ def brute_force(a, b, mask):
             * (2 * covariance + 9e-4)
             / ((mean_x**2 + mean_y**2 + 1e-4) * (variances + 9e-4))
         )
-    return float(np.mean(total))
+    return np.array(total)
 
 
 @few
-@given(height=st.integers(1, 36), width=st.integers(1, 20), share=st.floats(0.05, 0.95), seed=st.integers(0, 99))
-def test_masked_value_against_brute_force(height, width, share, seed):
+@given(height=st.integers(1, 36), width=st.integers(1, 20), share=st.floats(0.05, 1.0), seed=st.integers(0, 99))
+def test_values_against_brute_force(height, width, share, seed):
     a, b = images(height, width, seed)
     mask = torch.rand(height, width, generator=torch.Generator().manual_seed(seed)) < share
     mask[0, 0] = True
-    assert ssim(a, b, mask).item() == pytest.approx(brute_force(a.numpy(), b.numpy(), mask.numpy()), abs=1e-10)
+    expected = brute_force(a.numpy(), b.numpy(), mask.numpy())
+    np.testing.assert_allclose(ssim_map(a, b, mask)[mask].numpy(), expected, atol=1e-10)
+    assert ssim(a, b, mask).item() == pytest.approx(expected.mean(), abs=1e-10)
 
 
 @few
@@ -137,11 +121,6 @@ def test_the_kernels_give_the_same_bits_on_any_number_of_threads():
         found.square().sum().backward()
         results.append((found, rendered.grad))
     assert all(torch.equal(x, y) for result in results[1:] for x, y in zip(result, results[0], strict=True))
-
-
-def test_single_precision_is_good_enough_for_training():
-    a, b = images(270, 338, dtype=torch.float32)
-    assert ssim(a, b).item() == pytest.approx(ssim(a.double(), b.double()).item(), abs=1e-6)
 
 
 def test_the_kept_weights_survive_a_first_use_in_inference_mode():

@@ -26,16 +26,13 @@ def test_constants_are_of_the_dtype_and_device_and_made_once():
     (torch.ones(1, requires_grad=True) * first).sum().backward()  # not an inference tensor
 
 
-def test_constants_stay_on_the_device():
+def test_constants_and_what_is_sent_stay_on_the_device():
     with PretendedCuda():
         there = torch.zeros(2, device="cuda")
         tensor = constant((7.0, 8.0), there)
         assert tensor.device == CUDA and constant((7.0, 8.0), torch.zeros(2)).device == torch.device("cpu")
     with PretendedCuda():
         assert (constant((7.0, 8.0), torch.zeros(2, device="cuda")) + 1.0).tolist() == [8.0, 9.0]
-
-
-def test_sent_tensors_are_where_they_should_be():
     here = torch.arange(6.0)
     assert sent(here, "cpu") is here
     with PretendedCuda():

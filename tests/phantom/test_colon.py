@@ -11,7 +11,7 @@ from coliags_plugin.phantom.mucosa import paint_mucosa
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
-from coliags_plugin.phantom.trajectory import NEAREST, camera_path, rotation, rotation_about, turn_away
+from coliags_plugin.phantom.trajectory import NEAREST, camera_path, turn_away
 from tests.phantom.test_light import plane_at
 
 COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}
@@ -47,13 +47,6 @@ def test_normals_point_into_the_lumen_as_the_triangles_turn(colon):
     turning = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     smooth = surface.normals[surface.triangles[: 40 * surface.columns, 0]]
     assert ((turning * smooth).sum(axis=1) > 0.0).all()
-
-
-def test_rotation_minimising_frames_are_rotations(colon):
-    anatomy, _, _ = colon
-    frames = anatomy.centre_line.at(np.linspace(0.0, 230.0, 77))[1]
-    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-9)
-    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
 
 
 def test_grid_place_agrees_with_barycentric_interpolation(colon):
@@ -149,13 +142,6 @@ def test_where_the_camera_scans_rotation_views_go_on_outwards(colon):
     for view in turn_away(poses, chosen):
         before, after = poses[view.frame, :3, 2] @ middle, view.camera_to_world[:3, 2] @ middle
         assert np.degrees(np.arccos(after) - np.arccos(before)) == pytest.approx(view.turn, abs=1e-3)
-
-
-def test_rotation_conventions():
-    # Yaw turns the look to the right (+x), pitch upwards (-y).
-    assert rotation(0.1, 0.0, 0.0)[0, 2] > 0.0
-    assert rotation(0.0, 0.1, 0.0)[1, 2] < 0.0
-    np.testing.assert_allclose(rotation_about(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
 
 
 def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():

@@ -18,7 +18,7 @@ from coliags_plugin.phantom.colon import CentreLine, build_surface, grow_anatomy
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.phantom.tracing import Tracer
-from coliags_plugin.phantom.trajectory import APPROACHES, NEAREST, camera_path, nearness, resting
+from coliags_plugin.phantom.trajectory import APPROACHES, NEAREST, camera_path
 
 #: The far stops fall on frames 0, 40, 80, 120, and the near ones on 20, 60, 100.
 FRAMES = 121
@@ -36,21 +36,17 @@ class Colon:
     paths: dict[str, np.ndarray]
 
 
-def colon_of(seed: int, **settings) -> Colon:
-    chosen = PhantomSettings(**{**COARSE, "seed": seed, **settings})
-    anatomy = grow_anatomy(chosen)
-    colon = Colon(chosen, anatomy.centre_line, Tracer(build_surface(anatomy, chosen)), {})
-    colon.paths.update({light: path_of(colon, light=light) for light in PRESETS})
-    return colon
-
-
 def path_of(colon: Colon, **changes) -> np.ndarray:
     return camera_path(colon.centre_line, colon.settings.model_copy(update=changes), colon.tracer)
 
 
 @pytest.fixture(scope="module", params=[1, 4])
 def colon(request):
-    return colon_of(request.param)
+    chosen = PhantomSettings(**COARSE, seed=request.param)
+    anatomy = grow_anatomy(chosen)
+    colon = Colon(chosen, anatomy.centre_line, Tracer(build_surface(anatomy, chosen)), {})
+    colon.paths.update({light: path_of(colon, light=light) for light in PRESETS})
+    return colon
 
 
 def distances_in_the_middle(tracer: Tracer, pose: np.ndarray) -> np.ndarray:
@@ -100,17 +96,6 @@ def test_it_is_smooth(colon):
         np.testing.assert_allclose(finer[::2], poses, atol=1e-9)
         for of in (lambda path: np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1), turns):
             assert of(finer).max() == pytest.approx(0.5 * of(poses).max(), rel=0.03)
-
-
-def test_a_curve_that_rests_goes_through_its_values_and_stands_still_there():
-    values = np.array([[0.0, 3.0], [2.0, -1.0], [2.0, 5.0]])
-    np.testing.assert_array_equal(resting(values, np.array([0.0, 0.5, 1.0])), values)
-    np.testing.assert_allclose(resting(values, np.array([0.25, 0.75])), 0.5 * (values[:-1] + values[1:]))
-    step = 1e-3
-    before, at, after = resting(values, np.array([0.5 - step, 0.5, 0.5 + step]))
-    # Third order: 10 x^3 of the difference, x being twice the time.
-    assert np.abs(np.stack([before - at, after - at])).max() < 6.1 * 10.0 * (2.0 * step) ** 3
-    np.testing.assert_array_equal(nearness(np.arange(7) / 6.0), [0, 1, 0, 1, 0, 1, 0])
 
 
 def test_a_colon_without_such_a_path_is_an_error(colon, monkeypatch):

@@ -69,21 +69,13 @@ def sphere_around(radius: float, rows: int, columns: int) -> ColonSurface:
     return grid_surface(radius * unit, -unit, np.cross(unit, [0.0, 0.0, 1.0]))
 
 
-@pytest.mark.parametrize("distance", [6.0, 10.0, 20.0, 40.0])
-@pytest.mark.parametrize("behind", [0.0, 3.6])
-def test_flat_patch_obeys_inverse_square_from_the_lamp(distance, behind):
-    light = lamp(offset=(0.0, 0.0, -behind))
-    sensor, exposure = photograph_plane(distance, (light,))
-    assert not light.casts_shadows
-    middle = sensor.image(exposure.radiance)[9, 12]
-    np.testing.assert_allclose(middle, np.array(ALBEDO) * (UNIT_DISTANCE / (distance + behind)) ** 2, rtol=1e-4)
-    np.testing.assert_allclose(exposure.z_depth, distance, rtol=1e-5)
-
-
-def test_every_pixel_of_a_flat_patch_obeys_the_whole_law():
-    offset, spread, vignetting, distance = np.array([1.0, -0.5, -2.0]), 1.5, 2.5, 15.0
+@pytest.mark.parametrize("distance", [6.0, 15.0, 40.0])
+def test_every_pixel_of_a_flat_patch_obeys_the_whole_law(distance):
+    offset, spread, vignetting = np.array([1.0, -0.5, -2.0]), 1.5, 2.5
     light = lamp(offset=tuple(offset), spread=spread)
     sensor, exposure = photograph_plane(distance, (light,), vignetting)
+    assert not lamp(offset=(0.0, 0.0, -3.6)).casts_shadows
+    np.testing.assert_allclose(exposure.z_depth, distance, rtol=1e-5)
     points = sensor.centers * distance
     away = points - offset
     square = (away**2).sum(axis=1)
@@ -91,7 +83,7 @@ def test_every_pixel_of_a_flat_patch_obeys_the_whole_law():
     cos_theta = 1.0 / np.linalg.norm(sensor.centers, axis=1)
     inside = cos_lamp > np.cos(np.radians(70.0))
     expected = cos_lamp**spread * UNIT_DISTANCE**2 / square * cos_lamp * cos_theta**vignetting
-    np.testing.assert_allclose(exposure.radiance[inside, 1], ALBEDO[1] * expected[inside], rtol=2e-4)
+    np.testing.assert_allclose(exposure.radiance[inside], np.outer(expected, ALBEDO)[inside], rtol=2e-4)
 
 
 def test_exponential_beam_is_modrzejewskis():
@@ -132,34 +124,11 @@ def test_interreflection_in_a_sphere_is_the_integrating_spheres():
     np.testing.assert_allclose(indirect.mean(axis=0), expected, rtol=0.15)
 
 
-def irradiance(offsets, point, shares=()) -> float:
-    """Irradiance at a point square to the light, of lamps without a beam."""
-    lights = CameraLight.all_of(PhantomSettings(lamps=offsets, lamp_shares=shares))
-    points = np.array([point], float)
-    return float(sum(replace(light, spread=0.0).irradiance(points, np.eye(4))[0][0] for light in lights))
-
-
-def test_a_ring_of_lamps_gains_less_on_close_walls_and_far_away_is_one_lamp():
-    ring = tuple((3.5 * np.cos(clock), 3.5 * np.sin(clock), 0.0) for clock in (0.0, 2.0943951, 4.1887902))
-    for distance, share in ((5.0, 0.67), (10.0, 0.89), (20.0, 0.97), (40.0, 0.99)):
-        gained = irradiance(ring, (0.0, 0.0, distance)) * (distance / UNIT_DISTANCE) ** 2
-        assert gained == pytest.approx(1.0 / (1.0 + (3.5 / distance) ** 2), rel=1e-5) and round(gained, 2) == share
-    middle = tuple(np.mean(GUIDES, axis=0))
-    for distance in (30.0, 90.0):
-        # Beyond the first order, the squares of the lamps' distances from their middle are left over.
-        bound = 4.0 * (3.9 / distance) ** 2
-        point = (0.3 * distance, -0.2 * distance, distance)
-        assert irradiance(GUIDES, point) == pytest.approx(irradiance((middle,), point), rel=bound)
-
-
 def test_the_light_of_all_lamps_is_that_of_one():
     for shares in ((), (2.0, 1.0, 1.0)):
         lamps = CameraLight.all_of(PhantomSettings(lamps=GUIDES, lamp_shares=shares))
         assert sum(light.share for light in lamps) == pytest.approx(1.0)
         assert lamps[0].share == pytest.approx(0.5 if shares else 1.0 / 3.0)
-    assert irradiance((GUIDES[0],) * 3, (1.0, 2.0, 12.0), (5.0, 1.0, 3.0)) == pytest.approx(
-        irradiance(GUIDES[:1], (1.0, 2.0, 12.0))
-    )
 
 
 def test_an_image_is_the_sum_of_its_lamps_with_their_own_glints_and_shadows():
