@@ -58,15 +58,8 @@ def test_train_is_the_command(scene, trained, tmp_path):
     [
         (lambda frame: frame, []),
         (lambda frame: frame.with_maps(depth=frame.depth / 3.0), ["depth and poses are in different units"]),
-        (lambda frame: frame.with_maps(depth=30.0 / frame.depth), ["frames do not agree on the surface"]),
-        (
-            lambda frame: replace(frame, camera=replace(frame.camera, camera_to_world=frame.camera.world_to_camera)),
-            ["poses agree with depth when read as: world-to-camera"],
-        ),
-        (lambda frame: frame.with_maps(image=torch.full_like(frame.image, 90)), ["images repeat"]),
-        (lambda frame: frame.with_maps(depth=torch.full_like(frame.depth, 20.0)), ["depth is the same everywhere"]),
     ],
-    ids=["sound", "scaled-depth", "inverse-depth", "inverse-poses", "repeats", "flat-depth"],
+    ids=["sound", "scaled-depth"],
 )
 def test_training_warns_of_suspect_data(tmp_path, caplog, change, warnings):
     scene = wall_scene()
@@ -98,14 +91,10 @@ def test_a_run_says_what_it_is(trained):
     assert len(repr(trained.load())) < 500
 
 
-def test_its_log_is_arrays(trained):
+def test_its_log_is_arrays_with_nan_where_a_row_has_no_number(trained, tmp_path):
     history = trained.history
     np.testing.assert_array_equal(history["step"], np.arange(1, 9))
-    assert {"loss", "psnr", "seconds", "terms.l1"} <= history.keys()
-    assert np.isfinite(history["psnr"]).all()
-
-
-def test_columns_of_a_log_have_nan_where_a_row_has_no_number(trained, tmp_path):
+    assert {"loss", "psnr", "seconds", "terms.l1"} <= history.keys() and np.isfinite(history["psnr"]).all()
     shutil.copytree(trained.path, tmp_path / "run")
     log, run = tmp_path / "run/metrics.jsonl", cp.load_run(tmp_path / "run")
     row = {"step": 1, "psnr": 20.0, "seconds": 0.5}
@@ -267,15 +256,9 @@ def test_a_table_of_methods(compared):
     assert "psnr (dB)" in str(table) and "1 of 1" in str(table) and not table.notes
     assert repr(compared) == f"2 of 2 cells done: {compared.folder}"
     assert compared._repr_html_() == table._repr_html_()
-
-
-def test_columns_are_chosen(compared):
     assert list(compared.table(["depth_mae"]).rows[0]) == ["method", "done", "depth_mae"]
     with pytest.raises(InputError, match=r"no metric 'psrn'.*Did you mean 'psnr'"):
         compared.table(["psrn"])
-
-
-def test_variants_are_methods_with_settings(compared):
     losses = {result.method: set(result.config["losses"]) for result in compared.results}
     assert losses["coliags"] - losses["without depth"] == {"depth"}
 

@@ -39,6 +39,8 @@ SOURCES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
+#: Every module but the root.
+COMPONENTS = [name for name in SOURCES if name != ROOT]
 
 
 @cache
@@ -76,14 +78,10 @@ def package_of(name: str) -> str:
     return name.split(".")[1]
 
 
-def components() -> list[str]:
-    """Every module but the root."""
-    return [name for name in SOURCES if name != ROOT]
-
-
 def test_imports_point_down():
+    assert {package_of(name) for name in COMPONENTS} | {"modules"} == set(RANK)
     upwards = []
-    for name in components():
+    for name in COMPONENTS:
         package = package_of(name)
         for imported in imports(SOURCES[name]):
             is_root = imported == ROOT  # which imports everything
@@ -103,12 +101,12 @@ def test_no_import_circle():
 
 def test_only_the_registry_names_modules_in_strings():
     """A module imported by its name closes circles that no import statement shows; components are the one exception."""
-    assert {name for name in components() if targets(SOURCES[name])} == {f"{ROOT}.config.registry"}
+    assert {name for name in COMPONENTS if targets(SOURCES[name])} == {f"{ROOT}.config.registry"}
 
 
 def test_heavy_libraries_are_imported_late():
     early = []
-    for name in components():
+    for name in COMPONENTS:
         path = SOURCES[name]
         loaded = {imported.split(".")[0] for imported in imports(path, top_level_only=True)}
         allowed = {name for name in ("numba", "triton") if f"{name}_kernels" in path.parts}
@@ -119,7 +117,7 @@ def test_heavy_libraries_are_imported_late():
 def test_the_key_of_the_code_covers_all_that_the_engine_imports():
     """All but presentation, and those parts of results/ that compute none."""
     modules = set()
-    todo = [name for name in components() if package_of(name) == "engine"]
+    todo = [name for name in COMPONENTS if package_of(name) == "engine"]
     while todo:
         name = todo.pop()
         if name in SOURCES and name != ROOT and name not in modules:
@@ -132,7 +130,7 @@ def test_the_key_of_the_code_covers_all_that_the_engine_imports():
 
 def test_habits():
     faults = []
-    for name in components():
+    for name in COMPONENTS:
         text = SOURCES[name].read_text(encoding="utf-8")
         nodes = list(ast.walk(tree_of(SOURCES[name])))
         calls = {node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
@@ -148,8 +146,3 @@ def test_habits():
         }
         faults += [f"{name}: {rule}" for rule, broken in checks.items() if broken]
     assert faults == []
-
-
-def test_every_package_has_a_layer():
-    there = {package_of(name) for name in SOURCES if name != ROOT}
-    assert there | {"modules"} == set(RANK)

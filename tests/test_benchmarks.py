@@ -154,8 +154,6 @@ SURFELS = ("--backends", "cpu", "--primitives", "flat,surfels", "--counts", 300,
     ("name", "argv", "cells"),
     [
         ("train_stages", ("--anchors", 300, "--steps", 1, *SIZE, "--renderers", "cpu"), ["render ms", "cpu | 300"]),
-        ("render_fps", ("--anchors", 300, "--frames", 3, *SIZE, "--renderers", "cpu"), ["frames_per_s", "cpu | 300"]),
-        ("rasterizer", (*SURFELS, "--scene", "wall"), ["cpu | flat | 300", "cpu | surfels | 300", "both, of flat"]),
         ("rasterizer", (*SURFELS, "--scene", "lining"), ["cpu | flat | 300", "cpu | surfels | 300", "both, of flat"]),
         ("load_scene", ("--frames", 20, *SIZE), ["True | 20 | 48x36"]),
     ],

@@ -42,7 +42,3 @@ def test_the_contract(context, check):
     }
     with pytest.raises(CheckSkippedError) if is_inapplicable.get(name_of_check(check)) else nullcontext():
         context.run(check)
-
-
-def test_there_are_methods_to_check():
-    assert QUICK | {"ablations/none"} <= set(METHODS)

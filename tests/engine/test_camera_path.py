@@ -57,11 +57,6 @@ def test_places_stay_between_their_keyframes_and_turns_are_smooth():
     assert np.abs(np.diff(steps)).max() < 0.05  # degrees; a turn at constant speed in each part would jump by 0.2
 
 
-def test_a_file_is_read_as_it_was_written(tmp_path):
-    PATH.write(tmp_path / "path.json")
-    assert CameraPath.read(tmp_path / "path.json") == PATH
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -74,14 +69,16 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
         (lambda path: path["keyframes"][0]["camera_to_world"].pop(), "not a rotation"),
     ],
 )
-def test_what_is_no_path_is_refused(tmp_path, change, message):
-    values = json.loads(
-        json.dumps({**PATH.model_dump(), "keyframes": [each.model_dump() for each in PATH.keyframes[:2]]})
-    )
+def test_a_file_is_read_as_it_was_written_and_what_is_no_path_is_refused(tmp_path, change, message):
+    file = tmp_path / "path.json"
+    PATH.write(file)
+    assert CameraPath.read(file) == PATH
+    values = json.loads(file.read_text())
+    values["keyframes"].pop()
     change(values)
-    (tmp_path / "path.json").write_text(json.dumps(values))
+    file.write_text(json.dumps(values))
     with pytest.raises(InputError, match=message):
-        CameraPath.read(tmp_path / "path.json")
+        CameraPath.read(file)
 
 
 def test_the_video_of_a_path(tmp_path, capsys):

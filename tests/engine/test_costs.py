@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from coliags_plugin.engine import costs
 from coliags_plugin.engine.costs import PSNR_MARKS, CostMeter, RenderMeter, TrainingCost, seconds_to_psnr
 from coliags_plugin.engine.devices import device_name
-from tests.engine.test_trainer import final_state, interfere, kill, log_rows, make_trainer, train
+from tests.engine.test_trainer import final_state, interfere, kill, log_rows, make_trainer
 
 CPU = torch.device("cpu")
 
@@ -120,24 +120,6 @@ def test_the_cost_of_a_resumed_run_goes_on_from_its_checkpoint(tmp_path, clocks)
     assert [row["seconds"] for row in log_rows(second)] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
 
 
-def test_steps_taken_outside_the_loop_have_no_cost(tmp_path):
-    trainer = make_trainer(tmp_path / "run")
-    trainer.start()
-    trainer.take_step()
-    trainer.save()
-    assert final_state(trainer).cost is None
-
-
-def test_log_rows_end_at_the_step_and_leave_damaged_lines_out(tmp_path):
-    trainer = train(tmp_path / "run", steps=4)
-    whole = log_rows(trainer)
-    with trainer.run.log_file.open("a") as log:
-        log.write('{"step": 5}\n[]\n3\n{"step": 6, "psn')
-    assert trainer.run.log_rows(3) == whole[:3] and trainer.run.log_rows(99) == whole
-    trainer.run.log_file.unlink()
-    assert trainer.run.log_rows(3) == []
-
-
 # Rendering
 
 
@@ -163,27 +145,19 @@ def test_gaussians_that_were_not_drawn_do_not_count():
 # Marks of quality
 
 
-def rows_of(psnr, every=1):
-    """A log with a row every so many steps, each step taking 2 seconds."""
-    return [
-        {"step": every * index, "psnr": value, "seconds": 2.0 * every * index}
-        for index, value in enumerate(psnr, start=1)
-    ]
-
-
 @settings(max_examples=50, deadline=None)
 @example(psnr=[10.0, 12.0, 35.0, 35.42402470117271, 36.0], frames=1, every=1)
 @given(psnr=st.lists(st.floats(10, 50), max_size=60), frames=st.integers(1, 25), every=st.integers(1, 12))
 def test_marks_agree_with_means_taken_one_by_one(psnr, frames, every):
-    rows = rows_of(psnr, every)
+    steps = [every * index for index in range(1, len(psnr) + 1)]
+    rows = [{"step": step, "psnr": value, "seconds": 2.0 * step} for step, value in zip(steps, psnr, strict=True)]
     expected = dict.fromkeys(map(str, PSNR_MARKS)) if rows else {}
     for row in rows:
         window = [other["psnr"] for other in rows if row["step"] - frames < other["step"] <= row["step"]]
         for mark in PSNR_MARKS:
             if row["step"] >= frames and expected[str(mark)] is None and fmean(window) >= mark:
                 expected[str(mark)] = row["seconds"]
-    times = seconds_to_psnr(rows, frames)
-    assert times == expected
+    assert seconds_to_psnr(rows, frames) == expected
 
 
 # Blocks of 64 KiB, below the size from which glibc maps each apart; the last one stays, so that the heap cannot shrink.

@@ -61,14 +61,6 @@ def test_what_nearly_has_a_format_is_told_what_is_wrong(tmp_path, files, message
         find_format(tmp_path)
 
 
-def test_auto_passes_on_what_was_set(wall):
-    auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
-    manager = data_manager(auto, wall)
-    scene = manager.load(wall)
-    assert scene.provenance.dataset == "c3vd" and len(scene.points) == 77
-    assert manager.fingerprint(wall) == scene.provenance.fingerprint
-
-
 def test_options_of_the_folders_own_format_may_be_set(wall):
     method = load_method_for(wall, "coliags", ["datamanager.lens=fisheye", "datamanager.points_count=5"])
     assert method.config.datamanager.name == "c3vd"
@@ -80,15 +72,12 @@ def test_options_of_the_folders_own_format_may_be_set(wall):
         load_method_for(wall, "coliags", [], "c3dv")
 
 
-@pytest.mark.parametrize("data_format", [None, "c3vd"])
-def test_options_of_the_method_are_kept_when_the_format_is_recognised(wall, data_format):
-    method = load_method_for(wall, "3dgs", [], data_format)
-    assert method.config.datamanager.name == "c3vd"
-    assert method.config.datamanager.settings.points_count == 50_000
-    assert "points_count: 50000  # 3dgs.yaml:7" in method.with_origins()
-
-
-def test_options_for_another_format_are_dropped(wall, tmp_path):
+def test_options_of_the_method_are_kept_unless_for_another_format(wall, tmp_path):
+    for data_format in (None, "c3vd"):
+        method = load_method_for(wall, "3dgs", [], data_format)
+        assert method.config.datamanager.name == "c3vd"
+        assert method.config.datamanager.settings.points_count == 50_000
+        assert "points_count: 50000  # 3dgs.yaml:7" in method.with_origins()
     mine = tmp_path / "mine.yaml"
     mine.write_text("base: 3dgs\ndatamanager: {name: rotatecolon, points_count: 9}\n")
     kept, dropped = (load_method_for(wall, str(mine), [], name) for name in (None, "c3vd"))
@@ -97,6 +86,11 @@ def test_options_for_another_format_are_dropped(wall, tmp_path):
 
 
 def test_options_without_a_method(wall):
+    auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
+    manager = data_manager(auto, wall)
+    scene = manager.load(wall)
+    assert scene.provenance.dataset == "c3vd" and len(scene.points) == 77
+    assert manager.fingerprint(wall) == scene.provenance.fingerprint
     assert len(open_scene(wall, options=["split=all-train", "max_frames=4"]).train) == 4
     for options, told in [(["splti=own"], "splti"), (["max_frames=none"], "max_frames"), (["x"], "key.path=value")]:
         with pytest.raises(InputError, match=told):

@@ -7,7 +7,6 @@ from coliags_plugin.comparison.compare import make_executor
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.devices import choose_device, find_device
 from coliags_plugin.engine.tasks import ExecutionOptions
-from tests.commands import refused
 
 CPU = torch.device("cpu")
 
@@ -48,13 +47,6 @@ def test_a_device_that_is_not_there(cards):
     for name in ("cuda", "cuda:0", "cuda:1"):
         with pytest.raises(InputError, match="torch finds none"):
             find_device(name)
-
-
-def test_the_command_line_tells(cards, capsys, tmp_path):
-    cards(1)
-    train = ("train", "coliags", "--data", tmp_path, "--device")
-    assert "torch finds cuda:0 (card 0)" in refused(capsys, *train, "cuda:1")
-    assert "Expected auto, cpu, cuda or cuda:N" in refused(capsys, *train, "gpu")
 
 
 @pytest.mark.parametrize(

@@ -65,13 +65,8 @@ def test_modules_act_in_their_order_on_camera_and_output():
     torch.testing.assert_close(output.rgb, 6.0 * plain.rgb)
     torch.testing.assert_close(output["depth_expected"], plain["depth_expected"])
     assert set(output.maps) == {"depth_expected", "normals"}
-
-
-def test_parameter_groups_carry_the_modules_names():
-    first, second = Shift(0.0, 1.0), Shift(0.0, 1.0)
-    groups = make_model(exposure=first, poses=second).parameter_groups()
-    assert groups["exposure.weight"][0] is first.weight
-    assert groups["poses.weight"][0] is second.weight
+    groups = model.parameter_groups()
+    assert groups["a.weight"][0] is first.weight and groups["b.weight"][0] is second.weight
 
 
 def test_outputs_that_nobody_delivers_are_refused():

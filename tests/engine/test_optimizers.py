@@ -24,12 +24,17 @@ class Rows(nn.Module):
         return {"points": [self.points], "sizes": [self.part.sizes]}
 
 
+def make(**options):
+    """A field, and its optimizers before their first step."""
+    field = Rows()
+    settings = {"points": OptimizerSettings(lr=0.1, **options), "sizes": OptimizerSettings(lr=0.01)}
+    return field, Optimizers(Model(field, None, {}), settings, 100, 1.0)
+
+
 @pytest.fixture
 def stepped():
     """Optimizers after three steps, with gradients that have not been used."""
-    field = Rows()
-    settings = {"points": OptimizerSettings(lr=0.1), "sizes": OptimizerSettings(lr=0.01)}
-    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
+    field, optimizers = make()
     for step in (1, 2, 3, None):
         generator = torch.Generator().manual_seed(step or 0)
         field.points.grad = torch.randn(5, 3, generator=generator)
@@ -44,27 +49,19 @@ def moments(optimizers, group):
     return optimizers.adam[group].state[parameter]
 
 
-def test_new_rows_have_no_history(stepped):
+def test_new_rows_have_no_history_but_their_parents_mean_square(stepped):
     field, optimizers = stepped
-    before = (
-        field.points.detach().clone(),
-        field.points.grad.clone(),
-        moments(optimizers, "points")["exp_avg_sq"].clone(),
-    )
-    optimizers.add_rows({"points": torch.full((2, 3), 7.0)})
-    assert torch.equal(field.points.detach(), torch.cat([before[0], torch.full((2, 3), 7.0)]))
-    assert torch.equal(field.points.grad, torch.cat([before[1], torch.zeros(2, 3)]))
-    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"], torch.cat([before[2], torch.zeros(2, 3)]))
+    points, gradient = field.points.detach().clone(), field.points.grad.clone()
+    squares, new = moments(optimizers, "points")["exp_avg_sq"].clone(), torch.full((2, 3), 7.0)
+    optimizers.add_rows({"points": new})
+    assert torch.equal(field.points.detach(), torch.cat([points, new]))
+    assert torch.equal(field.points.grad, torch.cat([gradient, torch.zeros(2, 3)]))
+    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"], torch.cat([squares, torch.zeros(2, 3)]))
     assert moments(optimizers, "points")["step"].item() == 3
     assert optimizers.adam["points"].param_groups[0]["params"] == [field.points]
     assert len(field.part.sizes) == 5
-
-
-def test_new_rows_take_their_parents_mean_square(stepped):
-    _, optimizers = stepped
-    squares = moments(optimizers, "points")["exp_avg_sq"].clone()
-    optimizers.add_rows({"points": torch.zeros(2, 3)}, torch.tensor([4, 1]))
-    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"][5:], squares[[4, 1]])
+    optimizers.add_rows({"points": new}, torch.tensor([4, 1]))
+    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"][7:], squares[[4, 1]])
     assert not moments(optimizers, "points")["exp_avg"][5:].any()
 
 
@@ -79,9 +76,9 @@ def test_rows_that_stay_keep_everything(stepped):
     assert torch.equal(moments(optimizers, "sizes")["exp_avg"], momentum)
 
 
-def test_reset_rows_forget_their_moments_alone(stepped):
+def test_reset_rows_forget_their_moments_alone_and_replaced_values_start_anew(stepped):
     field, optimizers = stepped
-    values = field.points.detach().clone()
+    values, parameter = field.points.detach().clone(), field.part.sizes
     others = moments(optimizers, "points")["exp_avg"][[0, 2, 3]].clone()
     optimizers.reset_rows("points", torch.tensor([False, True, False, False, True]))
     state = moments(optimizers, "points")
@@ -90,20 +87,13 @@ def test_reset_rows_forget_their_moments_alone(stepped):
     assert torch.equal(field.points.detach(), values)
     optimizers.reset_rows("points")
     assert not state["exp_avg"].any()
-
-
-def test_replaced_values_start_anew(stepped):
-    field, optimizers = stepped
-    parameter = field.part.sizes
     optimizers.replace_values("sizes", torch.arange(5.0))
     assert field.part.sizes is parameter and parameter.tolist() == [0, 1, 2, 3, 4]
     assert not moments(optimizers, "sizes")["exp_avg"].any() and not moments(optimizers, "sizes")["exp_avg_sq"].any()
 
 
 def test_before_the_first_step_there_are_no_moments_to_cut():
-    field = Rows()
-    settings = {"points": OptimizerSettings(lr=0.1), "sizes": OptimizerSettings(lr=0.01)}
-    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
+    field, optimizers = make()
     optimizers.add_rows({"points": torch.zeros(1, 3)}, torch.tensor([0]))
     optimizers.reset_rows("sizes")
     optimizers.keep_rows(["points"], torch.arange(6) > 0)
@@ -112,10 +102,8 @@ def test_before_the_first_step_there_are_no_moments_to_cut():
 
 def test_beta2_sets_how_long_squared_gradients_are_remembered():
     """Without a memory of squares, bias-corrected Adam divides the momentum by the present gradient's size."""
-    field = Rows()
+    field, optimizers = make(beta2=0.0)
     before = field.points.detach().clone()
-    settings = {"points": OptimizerSettings(lr=0.1, beta2=0.0), "sizes": OptimizerSettings(lr=0.01)}
-    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
     for step, gradient in ((1, 4.0), (2, 1.0)):
         field.points.grad = torch.full((5, 3), gradient)
         optimizers.step(step)

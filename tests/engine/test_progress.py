@@ -27,18 +27,11 @@ def count(clock, titles, seconds, **options):
                 report(title, count_done, 10)
 
 
-def test_each_title_ends_with_a_line(clock, capsys):
-    count(clock, ["read", "fuse"], 0.01)
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[0] for line in lines] == ["read 10/10", "fuse 10/10"]
-
-
-def test_what_is_quick_is_not_mentioned(clock, capsys):
+def test_what_takes_long_is_mentioned_and_each_title_ends_with_a_line(clock, capsys):
     count(clock, ["read", "fuse"], 0.01, after=2.0)
     assert capsys.readouterr().err == ""
-
-
-def test_what_takes_long_is(clock, capsys):
+    count(clock, ["read", "fuse"], 0.01)
+    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == ["read 10/10", "fuse 10/10"]
     count(clock, ["read", "fuse"], 6.0, after=2.0)
     lines = capsys.readouterr().err.splitlines()
     # A line every ten seconds, at most, from two seconds on.

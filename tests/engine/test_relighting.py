@@ -158,10 +158,6 @@ def test_a_method_without_a_lamp_is_refused_and_the_fields_with_one_are_listed(t
         plain.relight(power=3.0)
 
 
-def test_a_lamp_is_at_the_camera_unless_told_otherwise():
-    assert Lamp().at_camera and not Lamp(offset=(1.0, 0.0, 0.0)).at_camera
-
-
 # Light that a method has learned
 
 
@@ -171,15 +167,10 @@ def plus(wall, tmp_path_factory):
     return coliags_plugin.train("coliags-plus", wall, tmp_path_factory.mktemp("light") / "run", steps=4, device="cpu")
 
 
-def test_learned_numbers_are_in_the_metrics(plus):
-    result = plus.evaluate()
-    learned = result.provenance["learned"]
+def test_learned_numbers_are_in_the_metrics_and_gains_at_a_bound_are_said(plus, caplog):
+    learned = plus.evaluate().provenance["learned"]
     assert set(learned) == {"field", "exposure", "response"} and len(learned["field"]["distance_exponent"]) == 3
-    summary = json.loads((plus.path / "eval" / "paper" / "metrics.json").read_text())
-    assert summary["learned"] == learned
-
-
-def test_gains_at_a_bound_are_said(plus, caplog):
+    assert json.loads((plus.path / "eval" / "paper" / "metrics.json").read_text())["learned"] == learned
     loaded = coliags_plugin.load_run(plus.path, device="cpu")
     with torch.no_grad():
         loaded.load().model.view_modules["exposure"].log_gain[3] = 90.0

@@ -47,9 +47,11 @@ def test_a_run_of_another_version_is_refused_by_name(tmp_path, written):
             read()
 
 
-def test_the_step_of_a_run_is_read_from_the_end_of_its_log(tmp_path):
+def test_the_log_is_read_to_a_step_without_its_damaged_lines(tmp_path):
     run = RunFolder(tmp_path)
-    assert run.logged_step == 0
+    assert run.logged_step == 0 and run.log_rows(3) == []
     rows = [{"step": step, "psnr": 20.0, "seconds": 1.0 * step} for step in range(1, 1000)]
+    run.log_file.write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 5}\n[]\n3\n{"step": 1000, "ps')
+    assert run.log_rows(3) == rows[:3] and run.log_rows(2000) == rows
     run.log_file.write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 1000, "ps')
     assert run.logged_step == 999

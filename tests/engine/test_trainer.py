@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,11 +17,7 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import DeviceMemoryError, InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.core.files import CHECKSUMS, write_checksums
 from coliags_plugin.engine import run_folder
-from coliags_plugin.engine.checkpoints import (
-    DamagedCheckpointError,
-    read_checkpoint,
-    take_newest,
-)
+from coliags_plugin.engine.checkpoints import DamagedCheckpointError, read_checkpoint, take_newest
 from coliags_plugin.engine.devices import software
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
@@ -31,49 +28,24 @@ CPU = torch.device("cpu")
 
 #: A window so early that growing and pruning happen within a test.
 EARLY_GROWTH = (
-    "strategy.statistics_from=0",
-    "strategy.growth_from=2",
-    "strategy.every=3",
-    "strategy.min_opacity=0.5",
-    "strategy.gradient_threshold=1e-7",
-    "strategy.pixels_per_birth=50",
-    "schedule.written_for=16",
-    "strategy.until=8",
-    "field.voxel_size=1.0",
-    "optimizers.offsets.lr=0.3",
+    *("strategy.statistics_from=0", "strategy.growth_from=2", "strategy.every=3", "strategy.until=8"),
+    *("strategy.min_opacity=0.5", "strategy.gradient_threshold=1e-7", "strategy.pixels_per_birth=50"),
+    *("schedule.written_for=16", "field.voxel_size=1.0", "optimizers.offsets.lr=0.3"),
 )
-
-
 MODULES = (
-    "modules.exposure=gain",
-    'optimizers."exposure.gain"={lr: 0.01}',
-    "modules.poses=pose-correction",
-    'optimizers."poses.rotation"={lr: 0.001}',
-    'optimizers."poses.translation"={lr: 0.01}',
+    *("modules.exposure=gain", 'optimizers."exposure.gain"={lr: 0.01}', "modules.poses=pose-correction"),
+    *('optimizers."poses.rotation"={lr: 0.001}', 'optimizers."poses.translation"={lr: 0.01}'),
 )
 #: Growth and both regularization losses of surfels within a few steps.
 SURFELS = (
-    "renderer=torch",
-    "schedule.written_for=14",
-    "losses.distortion.from_step=3",
-    "losses.normals.from_step=5",
-    "strategy.densify_from=1",
-    "strategy.until=12",
-    "strategy.every=4",
-    "strategy.reset_every=9",
-    "strategy.gradient_threshold=1e-4",
-    "strategy.min_opacity=0.09",
+    *("renderer=torch", "schedule.written_for=14", "losses.distortion.from_step=3", "losses.normals.from_step=5"),
+    *("strategy.densify_from=1", "strategy.until=12", "strategy.every=4", "strategy.reset_every=9"),
+    *("strategy.gradient_threshold=1e-4", "strategy.min_opacity=0.09"),
 )
 #: Noise and growth of Gaussians that are lit.
 LIT = (
-    "schedule.written_for=14",
-    "field.network_from=3",
-    "field.normal_neighbours=10",
-    "strategy.densify_from=2",
-    "strategy.until=12",
-    "strategy.every=4",
-    "strategy.gradient_threshold=1e-7",
-    "strategy.prune_above=0",
+    *("schedule.written_for=14", "field.network_from=3", "field.normal_neighbours=10", "strategy.densify_from=2"),
+    *("strategy.until=12", "strategy.every=4", "strategy.gradient_threshold=1e-7", "strategy.prune_above=0"),
     "losses.diffuse-factor={from_step: 3, until_step: 12}",
 )
 
@@ -137,19 +109,6 @@ def without_clock(rows):
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
 
 
-def test_every_step_and_term_is_logged(tmp_path):
-    trainer = train(tmp_path / "run", steps=30)
-    rows = log_rows(trainer)
-    assert [row["step"] for row in rows] == list(range(1, 31))
-    assert all(set(row["terms"]) == {"l1", "d-ssim", "scale-volume", "depth"} for row in rows)
-    assert rows[-1]["psnr"] > rows[0]["psnr"]
-
-
-def test_another_seed_is_another_run(tmp_path):
-    first, other = train(tmp_path / "a"), train(tmp_path / "b", seed=1)
-    assert not torch.equal(final_state(first).tensors["field/features"], final_state(other).tensors["field/features"])
-
-
 @pytest.mark.parametrize(
     ("method", "steps", "cut", "overrides", "number"),
     [
@@ -182,16 +141,6 @@ def test_an_interrupted_run_resumes_to_the_bit(tmp_path, request, method, steps,
     assert changes["pruned"] > 0 or overrides in (MODULES, LIT)
 
 
-def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
-    trainer = train(tmp_path / "run", steps=4)
-    with trainer.run.log_file.open("a") as log:
-        log.write('{"step": 5, "loss": 1.0}\n{"step": 6, "lo')
-    longer = make_trainer(tmp_path / "run", steps=6)
-    longer.resume()
-    longer.train()
-    assert [row["step"] for row in log_rows(longer)] == [1, 2, 3, 4, 5, 6]
-
-
 def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path):
     trainer = make_trainer(tmp_path / "run", steps=4)
     trainer.start()
@@ -218,38 +167,11 @@ def test_a_second_interrupt_does_not_wait(tmp_path):
 def test_loss_that_is_not_finite_names_step_frame_and_term(tmp_path):
     trainer = make_trainer(tmp_path / "run")
     trainer.start()
-    calls = {"count": 0}
-    honest = trainer.losses["d-ssim"]
-
-    class Poisoned:
-        settings = honest.settings
-
-        def __call__(self, step):
-            calls["count"] += 1
-            return honest(step) * (float("nan") if calls["count"] == 3 else 1.0)
-
-    trainer.losses["d-ssim"] = Poisoned()
+    honest, factors = trainer.losses["d-ssim"], iter([1.0, 1.0, float("nan")])
+    poisoned = mock.Mock(side_effect=lambda step: honest(step) * next(factors), settings=honest.settings)
+    trainer.losses["d-ssim"] = poisoned
     with pytest.raises(NotFiniteError, match=r"step 3, frame 000\d: loss term 'd-ssim' is nan"):
         trainer.train()
-
-
-def test_plain_heads_train_to_scaffolds_bits(tmp_path):
-    """ColIAGS with plain heads is Scaffold-GS, trained and all."""
-    plain = ("field.geometry_head.name=plain", "field.appearance_head.name=plain")
-    ours = train(tmp_path / "a", method="coliags", overrides=plain)
-    theirs = train(tmp_path / "b", method="scaffold-gs-depth")
-    first, second = final_state(ours).tensors, final_state(theirs).tensors
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_existing_run_is_not_overwritten(tmp_path):
-    trainer = train(tmp_path / "run", steps=1)
-    with pytest.raises(InputError, match="already exists"):
-        make_trainer(tmp_path / "run").start()
-    again = make_trainer(tmp_path / "run", steps=1)
-    again.start(overwrite=True)
-    assert not trainer.run.checkpoints.exists()
 
 
 @pytest.mark.parametrize(
@@ -277,11 +199,14 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):
     assert without_clock(log_rows(whole)) == without_clock(log_rows(again))
 
 
-def test_a_changed_schedule_is_recorded(tmp_path):
-    train(tmp_path / "run", steps=4)
+def test_a_changed_schedule_is_recorded_and_rows_after_the_checkpoint_are_forgotten(tmp_path):
+    trainer = train(tmp_path / "run", steps=4)
+    with trainer.run.log_file.open("a") as log:
+        log.write('{"step": 5, "loss": 1.0}\n{"step": 6, "lo')
     longer = make_trainer(tmp_path / "run", steps=6)
     longer.resume()
     longer.train()
+    assert [row["step"] for row in log_rows(longer)] == [1, 2, 3, 4, 5, 6]
     provenance = longer.run.provenance()
     assert provenance["steps"] == longer.run.method().config.schedule.steps == 6
     assert provenance["plan"] == longer.strategy.plan()
@@ -332,6 +257,8 @@ def test_checkpoints_by_the_clock_and_how_many_are_kept(tmp_path):
     other.start()
     other.train(save_seconds=3600.0)
     assert len(list(other.run.checkpoints.iterdir())) == 3
+    make_trainer(tmp_path / "other").start(overwrite=True)
+    assert not other.run.checkpoints.exists()
 
 
 def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
@@ -357,22 +284,26 @@ def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"),
+    ("change", "message"),
     [
-        ([{}], "step-000002 is damaged: 1 validation error"),
-        ([-1], "step-000002 is damaged: 1 validation error"),
-        ([True], "step-000002 is damaged: 1 validation error"),
-        ([3, 7], "plans frame 7"),
+        *(({"frame_queue": frames}, "step-000002 is damaged: 1 validation error") for frames in ([{}], [-1], [True])),
+        ({"frame_queue": [3, 7]}, "plans frame 7"),
+        ({"format": 99}, "has format 99"),
+        ({"method": "other"}, "is of method 'other'"),
     ],
 )
-def test_planned_frames_that_are_none_are_refused(tmp_path, frames, message):
+def test_a_checkpoint_of_something_else_is_refused(tmp_path, change, message):
     trainer = train(tmp_path / "run", steps=2)
     checkpoint = trainer.run.newest_checkpoint
     state = json.loads((checkpoint / "state.json").read_text())
-    (checkpoint / "state.json").write_text(json.dumps({**state, "frame_queue": frames}))
+    (checkpoint / "state.json").write_text(json.dumps({**state, **change}))
     write_checksums(checkpoint)
     with pytest.raises(InputError, match=message):
         trainer._restore(read_checkpoint(checkpoint, "coliags", CPU))
+    if "frame_queue" not in change:  # which is not set aside
+        with pytest.raises(InputError, match=message):
+            trainer.resume()
+        assert checkpoint.is_dir()
 
 
 def test_moments_and_random_states_of_another_run_are_refused(tmp_path):
@@ -406,17 +337,6 @@ def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):
     assert read_checkpoint(checkpoint, "coliags", CPU).step == 1
 
 
-@pytest.mark.parametrize("change", [{"format": 99}, {"method": "other"}])
-def test_a_checkpoint_of_something_else_is_not_set_aside(tmp_path, change):
-    checkpoint = train(tmp_path / "run", steps=1).run.newest_checkpoint
-    state = checkpoint / "state.json"
-    state.write_text(json.dumps({**json.loads(state.read_text()), **change}))
-    write_checksums(checkpoint)
-    with pytest.raises(InputError, match=r"has format 99|is of method 'other'"):
-        make_trainer(tmp_path / "run", steps=1).resume()
-    assert checkpoint.is_dir()
-
-
 def test_learning_rates_follow_the_papers_schedules(tmp_path):
     trainer = make_trainer(tmp_path / "run", steps=30_000)
     optimizers, extent = trainer.optimizers, trainer.scene.extent
@@ -428,12 +348,14 @@ def test_learning_rates_follow_the_papers_schedules(tmp_path):
     assert optimizers.rate("features", 1) == optimizers.rate("features", 30_000) == 0.0075
 
 
-def test_provenance_says_where_the_run_came_from(tmp_path):
-    trainer = train(tmp_path / "run", steps=1, seed=5)
+def test_each_step_and_term_is_logged_and_where_the_run_came_from(tmp_path):
+    trainer = train(tmp_path / "run", steps=30, seed=5)
+    rows = log_rows(trainer)
+    assert [row["step"] for row in rows] == list(range(1, 31))
+    assert all(set(row["terms"]) == {"l1", "d-ssim", "scale-volume", "depth"} for row in rows)
+    assert rows[-1]["psnr"] > rows[0]["psnr"]
     provenance = json.loads(trainer.run.provenance_file.read_text())
-    assert provenance["seed"] == 5
-    assert provenance["renderer"] == "cpu"
-    assert "auto" in provenance["renderer_reason"]
+    assert provenance["seed"] == 5 and provenance["renderer"] == "cpu" and "auto" in provenance["renderer_reason"]
     assert provenance["scene"]["provenance"]["fingerprint"] == "wall-9-True"
     assert software().items() <= provenance.items()
 
