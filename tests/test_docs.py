@@ -22,16 +22,12 @@ from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
 from coliags_plugin.cli.runs import TrainCommand
 from coliags_plugin.cli.scenes import PhantomCommand
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
-from coliags_plugin.config.registry import REGISTRIES, datamanagers
+from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.core.render_output import OUTPUTS
-from coliags_plugin.core.settings import Settings
-from coliags_plugin.datamanagers.scene_settings import SceneSettings, held_out
-from coliags_plugin.engine.data_formats import formats
+from coliags_plugin.datamanagers.scene_settings import held_out
 from coliags_plugin.engine.samplers import PURPOSES
-from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
-from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.phantom.settings import PRESETS
 from coliags_plugin.results.reading import find_results
-from coliags_plugin.surface.coverage.visibility import CoverageSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -266,40 +262,6 @@ def as_written(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-OPTIONS = "| option | default | values | what |"
-FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"]
-OPTION_TABLES = [
-    (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
-    (CoverageSettings, "coverage.md", OPTIONS),
-    (FrameSettings, "reconstruct.md", "| setting | default | range | what |"),
-    *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
-]
-
-
-def own_fields(settings: type[Settings]) -> dict[str, Any]:
-    """The fields that a page lists: for formats, those not shared with the others, or of another default."""
-    shared = SceneSettings.model_fields if issubclass(settings, SceneSettings) else {}
-    return {
-        name: field
-        for name, field in settings.model_fields.items()
-        if name not in shared or field.default != shared[name].default
-    }
-
-
-@pytest.mark.parametrize(("settings", "page", "header"), OPTION_TABLES, ids=str)
-def test_tables_of_options_are_complete_with_their_defaults_and_ranges(settings, page, header):
-    rows = table_rows(page, header)
-    fields = own_fields(settings)
-    assert sorted((row[0], row[1]) for row in rows) == sorted(
-        (name, as_written(field.default)) for name, field in fields.items()
-    )
-    for name, _, values, *_ in rows:
-        limits = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", values)}
-        for limit in fields[name].metadata:
-            bounds = {getattr(limit, side) for side in ("ge", "le", "gt", "lt") if hasattr(limit, side)}
-            assert bounds <= limits, f"{name}: {values} leaves out {bounds - limits}"
-
-
 def test_the_table_of_presets_is_the_presets():
     cells = {row[0]: row[1:] for row in table_rows("phantom.md", "| | `c3vd`, the default | `strong` |")}
     for column, name in enumerate(("c3vd", "strong")):
@@ -390,6 +352,15 @@ def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
                 assert any(all(bound in range_text for bound in bounds) for range_text, _, _ in rows), (
                     f"{name}: range of {option}"
                 )
+
+
+def test_the_page_of_options_has_the_settings_of_commands_with_their_meaning():
+    text = generated("options")
+    for name, settings in tool("options")["COMMANDS"].items():
+        section = text.split(f"\n### {name}\n")[1].split("\n### ")[0]
+        for option, field in settings.model_fields.items():
+            assert f"| `{option}` | {tool('options')['type_text'](field)} | " in section, f"{name}: {option}"
+            assert tool("options")["meanings"](settings)[option] in section
 
 
 @pytest.mark.parametrize("name", METHODS)

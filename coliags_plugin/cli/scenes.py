@@ -44,7 +44,7 @@ class PhantomCommand:
     rotation_views: int | None = None
     """Extra test views, 12 by default, rotated by 15 to 30 degrees; none in layouts that cannot store them."""
     set: options.Assignments = ()
-    """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
+    """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 says where they are listed)."""
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
     """Files and folders to write (`coliags list phantom_layouts`)."""
     overwrite: options.Overwrite = False

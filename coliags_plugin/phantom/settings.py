@@ -257,4 +257,4 @@ class PhantomSettings(Settings):
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
     """Validate plain options; an error names the first that is unknown, of the wrong type or out of range."""
     plain: dict[str, Any] = {name: tuples(value) for name, value in options.items()}
-    return validated(PhantomSettings, plain, "phantom setting", "docs/phantom.md lists all with their units and ranges")
+    return validated(PhantomSettings, plain, "phantom setting", "the page Options of the documentation lists all")

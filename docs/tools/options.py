@@ -27,6 +27,13 @@ from pydantic_core import PydanticUndefined
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings
 from coliags_plugin.config.registry import REGISTRIES, Registry
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.phantom.settings import PhantomSettings
+from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
+from coliags_plugin.reconstruction.depth.sweeping import DepthEstimationSettings
+from coliags_plugin.reconstruction.structure.features import FeatureSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings, TrackSettings
+from coliags_plugin.surface.coverage.visibility import CoverageSettings
+from coliags_plugin.surface.meshing.views import MeshSettings
 
 HEAD = """\
 # Options
@@ -52,12 +59,29 @@ PLACES = {
     "protocols": "named under `protocol`; they have no options",
 }
 
+#: Settings of commands, under the prefix that ``--set`` of the command needs.
+COMMANDS: dict[str, type[Settings]] = {
+    "phantom": PhantomSettings,
+    "reconstruct": ReconstructionSettings,
+    "reconstruct, under `frames.`": FrameSettings,
+    "poses sfm": SfmSettings,
+    "poses sfm, under `camera.`": CameraSettings,
+    "poses sfm, under `tracks.`": TrackSettings,
+    "poses sfm and depth estimate, under `features.`": FeatureSettings,
+    "depth estimate": DepthEstimationSettings,
+    "mesh": MeshSettings,
+    "coverage": CoverageSettings,
+}
+
 
 def page() -> str:
     """The whole page."""
     parts = [HEAD, *_config_keys()]
     for kind, registry in REGISTRIES.items():
         parts += _of_kind(kind, registry)
+    parts.append("## Commands\n\nSettings of `--set NAME=VALUE` of commands that read no method config.\n")
+    for name, settings in COMMANDS.items():
+        parts += [f"### {name}\n", f"{whole_text(settings)}\n", table(settings)]
     return "\n".join(parts).rstrip() + "\n"
 
 
