@@ -11,7 +11,10 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES
+from coliags_plugin.geometry.poses.colmap import posed_model
+from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.reconstruction.structure.hypotheses import (
     Hypothesis,
     choose,
@@ -41,59 +44,35 @@ COUNT, POINTS = 8, 120
 BRIGHTNESS = 1e8
 
 
-def turntable(depth=1000.0, relief=8.0, noise=0.3, seed=0):
+def turntable(noise=0.3):
     """A shallow, distant surface that turns in front of the camera, and its exact depths: nearly affine images."""
-    rng = np.random.default_rng(seed)
-    points = np.column_stack([rng.uniform(-30, 30, (POINTS, 2)), rng.uniform(-relief, relief, POINTS)])
-    model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, SIDE, SIDE)
-    camera.camera_id = 1
-    model.add_camera_with_trivial_rig(camera)
-    depths = []
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-30, 30, (POINTS, 2)), rng.uniform(-8, 8, POINTS)])
+    poses, seen, depths = [], [], []
     for index in range(COUNT):
         rotation = Rotation.from_euler("yx", [2.0 * (index - COUNT / 2), 1.5 * np.sin(index)], degrees=True).as_matrix()
-        pose = np.column_stack([rotation, (0.0, 0.0, depth)])
-        local = points @ rotation.T + pose[:, 3]
+        poses.append(pycolmap.Rigid3d(np.column_stack([rotation, (0.0, 0.0, 1000.0)])))
+        local = points @ rotation.T + (0.0, 0.0, 1000.0)
         pixels = FOCAL * local[:, :2] / local[:, 2:] + SIDE / 2 + rng.normal(0.0, noise, (POINTS, 2))
-        image = pycolmap.Image(name=f"{index}.png", camera_id=1, image_id=index + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+        seen.append(SeenPoints(pixels, np.arange(POINTS)))
         depths.append(local[:, 2])
-    for number, position in enumerate(points):
-        track = pycolmap.Track()
-        for index in range(COUNT):
-            track.add_element(index + 1, number)
-        model.add_point3D(position, track, np.zeros(3, np.uint8))
-    model.update_point_3d_errors()
+    camera = Intrinsics(FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
+    model = posed_model(poses, [f"{index}.png" for index in range(COUNT)], [camera], [0] * COUNT)
+    add_points(model, seen, points, np.zeros((POINTS, 3), np.uint8))
     return model, np.array(depths)
 
 
-def shape_correlation(model, depths):
-    """Correlation of a model's depths in the middle image with the true ones."""
-    features, z = depths_of(model)[COUNT // 2 + 1]
-    return np.corrcoef(z, depths[COUNT // 2][features])[0, 1]
-
-
-@pytest.fixture(scope="module")
-def ambiguous():
-    model, depths = turntable()
-    return model, reversed_in_depth(model, refine_camera=False), depths
-
-
-def test_a_shallow_surface_reversed_in_depth_fits_nearly_as_well(ambiguous):
-    model, other, depths = ambiguous
-    assert shape_correlation(model, depths) > 0.99
-    assert shape_correlation(other, depths) < -0.9
-    assert other.compute_num_observations() > 0.95 * model.compute_num_observations()
-    assert other.compute_mean_reprojection_error() < 1.0
-    # The model that was given stays as it was.
-    assert model.compute_num_observations() == COUNT * POINTS
-
-
 @pytest.mark.parametrize("swapped", [False, True])
-def test_the_lamp_chooses_between_a_model_and_its_reversal(ambiguous, swapped):
+def test_the_lamp_chooses_between_a_model_and_its_reversal(swapped):
     """Light falls off with the squared distance; the gain of each image is arbitrary."""
-    model, other, depths = ambiguous
+    model, depths = turntable()
+    other = reversed_in_depth(model, refine_camera=False)
+    # A shallow surface reversed in depth fits nearly as well; the model that was given stays as it was.
+    features, z = depths_of(other)[COUNT // 2 + 1]
+    assert np.corrcoef(z, depths[COUNT // 2][features])[0, 1] < -0.9
+    assert model.compute_num_observations() == COUNT * POINTS
+    assert other.compute_num_observations() > 0.95 * COUNT * POINTS
+    assert other.compute_mean_reprojection_error() < 1.0
     gain = np.linspace(0.5, 2.0, COUNT)[:, None]
     brightness = list(gain * BRIGHTNESS / depths**2)
     pair = [Hypothesis.of(model, brightness), Hypothesis.of(other, brightness, is_reversed=True)]
@@ -104,12 +83,6 @@ def test_the_lamp_chooses_between_a_model_and_its_reversal(ambiguous, swapped):
     inverse = list(gain * depths**2 / 1e4)
     pair = [Hypothesis.of(model, inverse), Hypothesis.of(other, inverse, is_reversed=True)]
     assert choose(pair, NARROW).is_reversed
-
-
-def test_two_reversals_are_none():
-    model, depths = turntable(noise=0.0)
-    again = reversed_in_depth(reversed_in_depth(model, False), False)
-    assert shape_correlation(again, depths) > 0.95
 
 
 @dataclass
@@ -175,15 +148,6 @@ def test_the_least_distorted_of_camera_models_that_fit_as_well(swapped):
     assert taken(0.0, error=0.6) == "SIMPLE_RADIAL"
 
 
-def test_a_fisheye_is_as_wide_as_its_own_law_says():
-    lens = "SIMPLE_RADIAL_FISHEYE"
-    wide = Hypothesis(Model(focal=130.0, lens=lens), -0.7)
-    assert wide.fields_of_view == [pytest.approx(141.0, abs=0.1)]
-    assert wide.is_plausible(RANGE)
-    # A pinhole of this focal length has 116 degrees, a fisheye 183.
-    assert not Hypothesis(Model(focal=100.0, lens=lens), -0.7).is_plausible((40.0, 180.0))
-
-
 @pytest.mark.parametrize(
     ("focal", "error", "correlation", "lens", "fits"),
     [
@@ -215,7 +179,7 @@ def test_brightness_is_the_mean_around_a_pixel():
 
 
 @pytest.mark.parametrize("name", CALIBRATED)
-@pytest.mark.parametrize("size", [(1350, 1080), (675, 540), (338, 270)])
+@pytest.mark.parametrize("size", [(1350, 1080), (338, 270)])
 def test_colmaps_camera_projects_as_the_lens(name, size):
     (camera,) = starting_cameras(CameraSettings(model=name), [], [size], Start(name, 1.0))
     points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 1.0), (50, 3))
@@ -224,6 +188,8 @@ def test_colmaps_camera_projects_as_the_lens(name, size):
     pinhole = points[:, :2] * (k.fx, k.fy) + (k.cx, k.cy)
     expected = lens.project(points) if camera.model_name == "OPENCV_FISHEYE" else pinhole
     np.testing.assert_allclose(camera.img_from_cam(points), expected, atol=1e-6)
+    with pytest.raises(InputError, match=rf"`camera={name}`, and images of 800 x 800. Expected the whole frame"):
+        starting_cameras(CameraSettings(model=name), [], [(800, 800)], Start(name, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -248,32 +214,17 @@ def test_known_cameras_have_one_start_and_are_kept(options, refined, count):
         assert [lens.radial for lens in lenses] == [0.333, 0.0, 0.167] and len(factors) == 6
 
 
-def test_crops_are_refused():
-    with pytest.raises(InputError, match=r"`camera=c3vd`, and images of 800 x 800. Expected the whole frame"):
-        starting_cameras(CameraSettings(model="c3vd"), [], [(800, 800)], Start("c3vd", 1.0))
-
-
 @pytest.mark.parametrize("size", [(200, 120), (120, 200)])
 @pytest.mark.parametrize(
-    ("model", "degrees", "term"),
-    [
-        ("PINHOLE", 90.0, 0.0),
-        ("SIMPLE_FISHEYE", np.degrees(2.0), 0.0),
-        ("SIMPLE_RADIAL", 90.0, -0.25),
-        ("SIMPLE_RADIAL_FISHEYE", np.degrees(2.0), 0.5),
-    ],
+    ("model", "degrees"), [("PINHOLE", 90.0), ("SIMPLE_FISHEYE", np.degrees(2.0)), ("SIMPLE_RADIAL", 90.0)]
 )
-def test_field_of_view_and_distortion_at_the_border_have_closed_forms(model, degrees, term, size):
-    """Without distortion, the field of view is between the rays that COLMAP projects to the ends of the larger side."""
+def test_field_of_view_and_distortion_at_the_border_have_closed_forms(model, degrees, size):
     camera = pycolmap.Camera.create_from_model_name(0, model, 100.0, *size)
+    term = -0.25 if model == "SIMPLE_RADIAL" else 0.0
     if term:
         camera.params = [*camera.params[:-1], term]
     assert field_of_view(camera) == pytest.approx(degrees)
     assert distortion(camera) == pytest.approx(abs(term), abs=1e-12)
-    half = np.radians(0.5 * field_of_view(camera))
-    if not term:
-        ray = np.array([[np.sin(half), 0.0, np.cos(half)]])
-        assert camera.img_from_cam(ray)[0, 0] == pytest.approx(0.5 * size[0] + 100.0)
 
 
 @pytest.mark.parametrize(
