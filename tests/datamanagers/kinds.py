@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -352,19 +351,16 @@ def change_model(change: Callable[[pycolmap.Reconstruction], pycolmap.Reconstruc
     return spoil
 
 
-def change_binary_pose(place: int, change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """Change the seven numbers of an image's pose in ``images.bin``: quaternion, w first, and translation."""
+def scale_pose(number: int, factor: float) -> Spoil:
+    """Multiply the quaternion and translation of an image's pose in a COLMAP model."""
 
-    def spoil(folder: Path) -> None:
-        path = folder / "sparse/0/images.bin"
-        data, at = bytearray(path.read_bytes()), 8
-        for _ in range(place):
-            end = data.index(b"\0", at + 64)
-            at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
-        struct.pack_into("<7d", data, at + 4, *change(np.array(struct.unpack_from("<7d", data, at + 4))))
-        path.write_bytes(bytes(data))
+    def change(model: pycolmap.Reconstruction) -> None:
+        image = model.images[number]
+        pose = image.cam_from_world()
+        turn = pycolmap.Rotation3d(factor * pose.rotation.quat)
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(turn, factor * pose.translation))
 
-    return spoil
+    return change_model(change)
 
 
 # Faults
@@ -422,7 +418,7 @@ def one_pose(matrix: Callable[[np.ndarray], None], factor: float) -> Callable[[K
         if kind is KINDS["colmap-text"]:
             return change_row(kind.poses, 6, 1, lambda quaternion: factor * quaternion)
         if kind is KINDS["colmap"]:
-            return change_binary_pose(3, lambda values: factor * values)
+            return scale_pose(4, factor)
         if matrix is MIRROR and kind is not KINDS["c3vd-raw-old"]:
             return change_matrices(lambda matrices: MIRROR(matrices[3].T), kind.poses)
         return change_matrices(lambda matrices: matrix(matrices[3]), kind.poses)
@@ -497,7 +493,6 @@ _CAMERAS = {"c3vd-v2": "camera_intrinsics.txt", "colmap": "sparse/0/cameras.bin"
 #: Faults that can befall several layouts.
 DAMAGES: dict[str, Callable[[Kind], Spoil]] = {
     "an image of another size": lambda k: repaint(k.images, 4, half_size),
-    "the first image of another size": lambda k: repaint(k.images, 0, half_size),
     "depth of another size": lambda k: repaint(k.depths, 0, half_size),
     "an image cut short": lambda k: cut(k.images, 4),
     "an image of one channel": lambda k: repaint(k.images, 4, lambda pixels: pixels[..., 0].copy()),
@@ -525,13 +520,11 @@ DAMAGES: dict[str, Callable[[Kind], Spoil]] = {
     "poses cut short": lambda k: (
         edit(k.poses, r" \S+\s*\Z", "") if "sparse" in k.poses else cut(k.poses or "sparse/0/images.bin")
     ),
-    "a result cut short": lambda k: cut(k.params, share=0.3),
     "poses of something else": lambda k: write(k.poses, RUBBISH),
     "poses of another format": lambda k: write(k.poses, "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n"),
     "a result of something else": lambda k: write(k.params, "PK nonsense"),
     "a number that is none": one_pose(scaled(np.nan, 0, 0), np.nan),
     "a result of no numbers": result(lambda arrays: arrays.update(cam_trans=arrays["cam_trans"] * np.nan)),
-    "a word for a pose": lambda k: change_lines(k.poses, lambda rows: [*rows[:2], "none", *rows[3:]]),
     "no matrix": lambda k: change_json(k.poses, lambda content: content["frames"][1].pop("transform_matrix")),
     "a rotation that is none": one_pose(scaled(2.0, slice(3), slice(3)), 2.0),
     "a quaternion of length 0": one_pose(MIRROR, 0.0),
@@ -554,7 +547,6 @@ DAMAGES: dict[str, Callable[[Kind], Spoil]] = {
 }
 SAID = r"""
 an image of another size | all: <4>\.png is 20 x 16, but \S*<size> says 40 x 32.*of one size
-the first image of another size | all: (20 x 16.*40 x 32|40 x 32.*20 x 16)
 depth of another size | depth: <0>\.(png|tiff|exr) is 20 x 16, but \S*<size> says 40 x 32
 an image cut short | all: <4>\.png \(\d+ bytes\) cannot be decoded.*a complete image
 an image of one channel | all: <4>\.png is an image of 1 channel of uint8
@@ -600,10 +592,9 @@ poses cut short
   json: <poses> is not JSON: .* line \d+.*Expected
   colmap-text: images\.txt, line \d+: .*Expected X Y POINT3D_ID of each point
   colmap: images\.bin \(\d+ bytes\) is damaged or cut short
-a result cut short | params: cannot read \S*params\.npz.*written by EndoGSLAM
 poses of something else | matrices, tum, json, colmap-text: cannot read \S*<poses>.*Expected
 poses of another format | tum: <poses>, line 1: '1,0,0,0
-a result of something else | params: cannot read \S*params\.npz
+a result of something else | params: cannot read \S*params\.npz.*written by EndoGSLAM
 a number that is none
   matrices: <poses>, line 4: 'nan,.*16 finite numbers
   json: <poses>, frame 1 \(.*\): transform_matrix.*rows of 4 finite numbers
@@ -611,7 +602,6 @@ a number that is none
   colmap-text: images\.txt, line \d+: '4 nan.*all finite
   colmap: images\.bin, image \d+ .*its pose is nan
 a result of no numbers | params: params\.npz: cam_trans holds numbers that are not finite
-a word for a pose | matrices: <poses>, line 3: 'none'
 no matrix | json: <poses>, frame 1 \(.*\): transform_matrix
 a rotation that is none
   matrices: <poses>, line 4: not a rigid transform \(R\^T R is 3.*within 0\.001

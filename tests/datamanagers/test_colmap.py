@@ -21,6 +21,7 @@ from coliags_plugin.datamanagers.colmap import find_models, read_model
 from coliags_plugin.datamanagers.reading.files import sidecar_files
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from tests.datamanagers.kinds import change_lines, change_model
 from tests.datamanagers.wall_scenes import colors, load_scene, look, manager, off_wall, poses, seen_from
 
@@ -63,32 +64,6 @@ def taken(cam: pycolmap.Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return look(pose, directions)
 
 
-def wall_model(cameras: list[pycolmap.Camera], names: list[str]) -> pycolmap.Reconstruction:
-    """Image i is taken from pose i by camera i, round and round."""
-    model = pycolmap.Reconstruction()
-    for cam in cameras:
-        model.add_camera_with_trivial_rig(cam)
-    # Points that the first camera sees from the first pose.
-    pixels = np.random.default_rng(0).uniform(2, [cameras[0].width - 2, cameras[0].height - 2], (POINTS, 2))
-    directions = np.concatenate([cameras[0].cam_from_img(pixels), np.ones((POINTS, 1))], axis=1)
-    start = poses(1)[0]
-    points = start[:3, 3] + look(start, directions)[0][:, None] * directions @ start[:3, :3].T
-    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in points]
-    for index, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
-        cam, rotation = cameras[index % len(cameras)], pose[:3, :3].T
-        pixels_seen = cam.img_from_cam((points - pose[:3, 3]) @ pose[:3, :3])
-        image = pycolmap.Image(name=name, camera_id=cam.camera_id, image_id=index + 1)
-        inside = (pixels_seen > 0).all(axis=1) & (pixels_seen < (cam.width, cam.height)).all(axis=1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(place) for place in pixels_seen[inside]])
-        for place, number in enumerate(np.flatnonzero(inside)):
-            tracks[number].append(pycolmap.TrackElement(index + 1, place))
-        world_to_camera = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:3, 3])
-        model.add_image_with_trivial_frame(image, world_to_camera)
-    for point, color, track in zip(points, colors(points), tracks, strict=True):
-        model.add_point3D(point, pycolmap.Track(track), color)
-    return model
-
-
 def write_colmap(
     folder: Path,
     cameras: list[pycolmap.Camera] | None = None,
@@ -96,15 +71,29 @@ def write_colmap(
     place: str = "sparse/0",
     text: bool = False,
 ) -> Path:
-    """The wall, its model in ``place`` and its images in ``images``."""
-    cameras = cameras or [camera()]
-    model = wall_model(cameras, names)
-    (folder / place).mkdir(parents=True, exist_ok=True)
-    (model.write_text if text else model.write_binary)(str(folder / place))
+    """The wall; image i is taken from pose i by camera i, round and round. The model is in ``place``."""
+    cameras, model, seen = cameras or [camera()], pycolmap.Reconstruction(), []
+    for cam in cameras:
+        model.add_camera_with_trivial_rig(cam)
+    # Points that the first camera sees from the first pose.
+    pixels = np.random.default_rng(0).uniform(2, [cameras[0].width - 2, cameras[0].height - 2], (POINTS, 2))
+    directions = np.concatenate([cameras[0].cam_from_img(pixels), np.ones((POINTS, 1))], axis=1)
+    start = poses(1)[0]
+    points = start[:3, 3] + look(start, directions)[0][:, None] * directions @ start[:3, :3].T
     for index, (name, pose) in enumerate(zip(names, poses(len(names)), strict=True)):
+        cam, rotation = cameras[index % len(cameras)], pose[:3, :3].T
+        places = cam.img_from_cam((points - pose[:3, 3]) @ pose[:3, :3])
+        inside = (places > 0).all(axis=1) & (places < (cam.width, cam.height)).all(axis=1)
+        seen.append(SeenPoints(places[inside], np.flatnonzero(inside)))
+        image = pycolmap.Image(name=name, camera_id=cam.camera_id, image_id=index + 1)
+        world_to_camera = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:3, 3])
+        model.add_image_with_trivial_frame(image, world_to_camera)
         path = folder / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), taken(cameras[index % len(cameras)], pose)[1][..., ::-1])
+        cv2.imwrite(str(path), taken(cam, pose)[1][..., ::-1])
+    add_points(model, seen, points, colors(points))
+    (folder / place).mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder / place))
     return folder
 
 

@@ -45,7 +45,7 @@ def folder(request, copied) -> Path:
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_stored_values_are_255ths(folder, keep):
+def test_stored_values_are_255ths_and_resized_by_the_nearest_like_depth(folder, keep):
     scene = load(folder, keep_pixels=keep)
     assert scene.provenance.depth_is_estimated is True
     for frame in scene.video:
@@ -53,13 +53,9 @@ def test_stored_values_are_255ths(folder, keep):
         for values in (frame.depth_confidence, frame.to("cpu").depth_confidence, frame.target.depth_confidence):
             torch.testing.assert_close(values, expected, rtol=0, atol=1e-7)
         assert frame.true_depth is None
-
-
-def test_it_is_resized_by_the_nearest_like_depth(folder):
-    frame = load(folder, width=25, height=20).train[0]
-    np.testing.assert_array_equal(
-        np.rint(frame.depth_confidence.numpy() * 255), resize_nearest(stored(frame.index), 25, 20)
-    )
+    frame = load(folder, width=25, height=20, keep_pixels=keep).train[0]
+    nearest = resize_nearest(stored(frame.index), 25, 20)
+    np.testing.assert_array_equal(np.rint(frame.depth_confidence.numpy() * 255), nearest)
     assert frame.depth.shape == (20, 25)
 
 

@@ -42,8 +42,6 @@ from tests.datamanagers.wall_scenes import (
     write_wall,
 )
 
-ROOT = Path(__file__).parents[2]
-
 
 def load(folder: Path, name: str, **options) -> Scene:
     return manager(KINDS[name].format, **options).load(folder)
@@ -363,12 +361,6 @@ def test_a_folder_that_is_not_there(tmp_path, format):
     assert datamanagers.get(format).recognise(tmp_path / "nowhere") is None
 
 
-def table(page: str, header: str) -> list[list[str]]:
-    """Cells of a table in the documentation."""
-    rows = (ROOT / page).read_text().split(header)[1].split("\n\n")[0].splitlines()[2:]
-    return [[cell.strip().replace("`", "") for cell in row.strip("|").split("|")] for row in rows]
-
-
 def test_a_file_in_the_place_of_a_folder(copied, tmp_path):
     folder = copied("nerfstudio")
     (folder / "a clip.MP4").touch()
@@ -462,11 +454,10 @@ RAW, PREPARED, PAPER, FIFTH = (1350, 1080), (675, 540), (338, 270), (270, 216)
 def test_the_default_size_is_the_one_published_as_the_page_says(format):
     kind = datamanagers.get(format)
     assert kind.seen_split == kind.Settings().split
-    fits = {
-        name: size
-        for formats, size, _ in table("docs/data.md", "| format | default size | published by |")
-        for name in formats.split(", ")
-    }
+    page = (Path(__file__).parents[2] / "docs/data.md").read_text()
+    rows = page.split("| format | default size | published by |")[1].split("\n\n")[0].replace("`", "").splitlines()[2:]
+    cells = [re.split(r" *\| *", row) for row in rows]
+    fits = {name: size for _, formats, size, *_ in cells for name in formats.split(", ")}
     size = fits.get(format, fits["others"])
     assert size.split(",")[0] == ("as stored" if kind.fits is None else "x".join(map(str, kind.fits)))
     stored = [RAW, PREPARED, PAPER, FIFTH, (1920, 1080), (169, 135)]

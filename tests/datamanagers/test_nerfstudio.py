@@ -18,7 +18,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.recorded import Recording
-from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.kinds import change_frames, change_json
@@ -218,13 +217,6 @@ def test_the_files_own_split(mine):
     change_json(FILE, test_filenames=NAMES[7:])(mine)
     assert [frame.index for frame in load(mine, split="own").test_sets["test"]] == [7, 8]
     assert [frame.index for frame in load(mine).test_sets["test"]] == [0, 8]
-
-
-def test_recognised_by_its_file(mine):
-    (mine / "sparse/0").mkdir(parents=True)
-    assert find_format(mine) == "nerfstudio"
-    (mine / "transforms_test.json").write_text("{}")
-    assert manager("nerfstudio").recognise(mine) is None
 
 
 @pytest.mark.parametrize("start", ["{folder}", ".."])

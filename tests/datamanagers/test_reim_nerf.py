@@ -15,12 +15,12 @@ import torch
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.geometry.lenses.undistortion import undistortion_map
 from tests.datamanagers.kinds import change_frames, remove
-from tests.datamanagers.wall_scenes import load_scene, manager, names, poses, write_wall
+from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses, write_wall
 
-WIDTH, HEIGHT, FRAMES = 90, 72, 27
+KIND = "reim-nerf"
 LENS = LENSES["fisheye"].resized(WIDTH, HEIGHT)
 
-load = partial(load_scene, "reim-nerf")
+load = partial(load_scene, KIND)
 
 
 def content_of(folder: Path, part: str = "test") -> dict:
@@ -43,37 +43,22 @@ def step(folder: Path) -> float:
     return content["distmap_scale"] / 65535 / content["scene_scale"]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("reim") / "wall", "reim-nerf", FRAMES, WIDTH, HEIGHT)
-
-
-@pytest.fixture(scope="module")
-def scene(folder):
-    return load(folder)
-
-
 @pytest.fixture
-def mine(tmp_path):
-    """A scene to be spoilt."""
-    return write_wall(tmp_path / "wall", "reim-nerf", 9, WIDTH, HEIGHT)
+def folder(walls):
+    return walls(KIND)
 
 
-def test_its_own_split_leaves_validation_out(folder, scene):
-    train = [0, 5, 10, 15, 20]
-    assert [frame.index for frame in scene.train] == train
-    assert names(scene.train) == [f"{index:04d}_color" for index in train]
-    assert [frame.index for frame in scene.test_sets["test"]] == [i for i in range(FRAMES) if i % 5]
-    assert scene.provenance.parts == {"train": 5, "val": 1, "test": FRAMES, "true_test": 21}
+def test_its_own_split_leaves_validation_out(tmp_path):
+    folder = write_wall(tmp_path, KIND, 27)
+    scene = load(folder)
+    assert names(scene.train) == [f"{index:04d}_color" for index in (0, 5, 10, 15, 20)]
+    assert [frame.index for frame in scene.test_sets["test"]] == [index for index in range(27) if index % 5]
+    assert scene.provenance.parts == {"train": 5, "val": 1, "test": 27, "true_test": 21}
+    remove("transforms_true_test.json")(folder)
     other = load(folder, split="every-8th", initial_points="none")
-    assert len(other.video) == FRAMES
+    assert len(other.video) == 27
     assert [frame.index for frame in other.test_sets["test"]] == [0, 8, 16, 24]
-
-
-def test_test_frames_are_only_needed_by_the_own_split(mine):
-    remove("transforms_true_test.json")(mine)
-    assert len(load(mine, split="every-8th").video) == 9
-    assert manager("reim-nerf").recognise(mine) == "transforms_train.json beside distmaps"
+    assert manager(KIND).recognise(folder) == "transforms_train.json beside distmaps"
 
 
 def test_stored_poses_are_normalised_and_opengl(folder):
@@ -85,8 +70,8 @@ def test_stored_poses_are_normalised_and_opengl(folder):
     np.testing.assert_allclose(stored[:, :3, 3] / content["scene_scale"] - shift, poses(FRAMES)[:, :3, 3], atol=1e-9)
 
 
-def test_working_depth_is_that_of_the_nearest_stored_pixel(folder, scene):
-    frame = scene.train[2]
+def test_working_depth_is_that_of_the_nearest_stored_pixel(folder):
+    frame = load(folder).train[1]
     stored = cv2.imread(str(folder / "distmaps" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
     columns, rows = (np.rint(part).astype(int) for part in undistortion_map(LENS, LENS.pinhole))
     expected = (stored * step(folder) * cosines())[rows, columns]
@@ -103,12 +88,12 @@ def test_what_ends_at_c3vds_range_is_there_or_beyond(mine):
     steps[:, 2 * WIDTH // 3 :] = 0
     cv2.imwrite(str(mine / "distmaps/0000_color.png"), steps.astype(np.uint16))
     cv2.imwrite(str(mine / "distmaps/0005_color.png"), np.full((HEIGHT, WIDTH), 9000, np.uint16))
-    spoilt, unclipped = load(mine).train
-    clipped, middle, right = (np.s_[20:50, start : start + 15] for start in (5, 38, 70))
+    spoilt, unclipped, _ = load(mine).train
+    clipped, middle, right = (np.s_[10:20, start : start + 6] for start in (2, 17, 31))
     depth, bound = spoilt.depth, spoilt.depth_at_least
     assert torch.isnan(depth[clipped]).all() and torch.isnan(depth[right]).all()
-    torch.testing.assert_close(depth[middle], torch.full((30, 15), 99.9), atol=step(mine), rtol=0)
-    torch.testing.assert_close(bound[clipped], torch.full((30, 15), 100.0), atol=step(mine), rtol=0)
+    torch.testing.assert_close(depth[middle], torch.full((10, 6), 99.9), atol=step(mine), rtol=0)
+    torch.testing.assert_close(bound[clipped], torch.full((10, 6), 100.0), atol=step(mine), rtol=0)
     assert torch.isnan(bound[middle]).all() and torch.isnan(bound[right]).all()
     assert unclipped.depth_at_least is None
 

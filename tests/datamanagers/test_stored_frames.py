@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from coliags_plugin.datamanagers import shots
 from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.shots import StoredPixels
-from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, load_scene, manager, names, poses
+from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
 
 
 @pytest.fixture
@@ -50,10 +49,7 @@ def frame_of(folder: Path, index: int, keep: bool = True) -> Frame:
     return Frame(shot.name, index, source, shot.rectification.camera(shot.camera_to_world))
 
 
-load = partial(load_scene, "c3vd")
-
-
-def test_a_frame_reads_nothing_until_asked_and_then_once(folder, reads):
+def test_a_frame_reads_nothing_until_asked_and_then_once_or_anew_where_pixels_are_not_kept(folder, reads):
     frame = frame_of(folder, 3)
     assert (frame.name, frame.camera.width) == ("0003_color", WIDTH)
     pose = frame.scaled(2.0).source.camera_to_world
@@ -64,27 +60,28 @@ def test_a_frame_reads_nothing_until_asked_and_then_once(folder, reads):
         assert frame.depth.shape == (HEIGHT, WIDTH)
         assert frame.valid.all()
     assert sorted(reads) == ["0003_color.png", "0003_depth.png"]
-
-
-def test_loading_reads_each_file_once(folder, reads):
-    load(folder)
-    both = [f"{index:04d}_{kind}" for index in range(FRAMES) for kind in ("color.png", "depth.png")]
-    turned = [f"{index:04d}_{kind}" for index in range(2) for kind in ("color.png", "depth.png")]
-    assert sorted(reads) == sorted([*both, *turned])
-
-
-def test_not_keeping_reads_depth_twice_and_images_once_for_the_points(folder, reads):
-    training = names(load(folder, keep_pixels=False).train)
-    depths = [f"{name[:4]}_depth.png" for name in training]
-    assert sorted(reads) == sorted([f"{name}.png" for name in training] + 2 * depths)
-
-
-def test_not_keeping_reads_anew_and_only_what_is_asked_for(folder, reads):
+    reads.clear()
     frame = frame_of(folder, 3, keep=False)
     for part in ("depth", "depth", "image", "image", "valid"):
         getattr(frame, part)
     assert frame.mask is None
     assert reads == 2 * ["0003_depth.png"] + 2 * ["0003_color.png"]
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_loading_reads_each_file_once_or_for_the_points_alone_and_tells_how_far_it_is(folder, reads, keep):
+    calls = []
+    training = names(manager("c3vd", keep_pixels=keep).load(folder, lambda *call: calls.append(call)).train)
+    if keep:
+        numbers = [*range(FRAMES), 0, 1]  # and the turned views
+        assert sorted(reads) == sorted(f"{index:04d}_{kind}.png" for index in numbers for kind in ("color", "depth"))
+    else:
+        assert sorted(reads) == sorted(
+            f"{name[:4]}_{kind}.png" for name in training for kind in ("color", "depth", "depth")
+        )
+    assert (("read images", FRAMES + 2, FRAMES + 2) in calls) == keep
+    assert ("fuse depth", FRAMES - 2, FRAMES - 2) in calls
+    assert all(0 < done <= total for _, done, total in calls)
 
 
 def test_frames_of_a_lens_share_its_mask(walls):
@@ -120,9 +117,6 @@ def test_what_is_kept_is_as_small_as_on_disk_and_goes_with_the_frame(folder):
     assert image() is None
 
 
-# Threads
-
-
 @pytest.mark.parametrize("keep", [True, False])
 def test_many_threads_at_one_frame_see_the_same(folder, keep):
     frame, alone = frame_of(folder, 4, keep), frame_of(folder, 4)
@@ -133,16 +127,12 @@ def test_many_threads_at_one_frame_see_the_same(folder, keep):
     assert all(torch.equal(depth, alone.depth) for depth in depths)
 
 
-def test_results_come_in_order_and_progress_is_told():
-    calls = []
+def test_results_come_in_order_and_after_a_failure_the_rest_is_left_undone():
+    calls, begun = [], []
     squares = parallel_map(lambda number: number**2, list(range(50)), "square", lambda *call: calls.append(call))
     assert squares == [number**2 for number in range(50)]
     assert calls == [("square", done, 50) for done in range(1, 51)]
     assert parallel_map(lambda number: number, [], "nothing") == []
-
-
-def test_the_first_failure_is_raised_and_the_rest_left_undone():
-    begun = []
 
     def work(number):
         begun.append(number)
@@ -152,12 +142,3 @@ def test_the_first_failure_is_raised_and_the_rest_left_undone():
     with pytest.raises(InputError, match="one"):
         parallel_map(work, list(range(5000)), "work")
     assert len(begun) < 5000
-
-
-@pytest.mark.parametrize("keep_pixels", [True, False])
-def test_loading_tells_how_far_it_is(folder, keep_pixels):
-    calls = []
-    manager("c3vd", keep_pixels=keep_pixels).load(folder, lambda *call: calls.append(call))
-    assert (("read images", FRAMES + 2, FRAMES + 2) in calls) == keep_pixels
-    assert ("fuse depth", FRAMES - 2, FRAMES - 2) in calls
-    assert all(0 < done <= total for _, done, total in calls)

@@ -123,14 +123,9 @@ def _splats(name: str) -> Callable[[Path], None]:
         for values in (cloud.means, cloud.quats_wxyz, cloud.scales, cloud.opacities, cloud.harmonics):
             assert np.isfinite(values).all()
         assert _within(cloud.means, 2e6)
+        _command("import", folder / f"cloud.{name}", "--data", folder / "scene", "--output", folder / "imported")
 
     return read
-
-
-def _import(name: str) -> Callable[[Path], None]:
-    return lambda folder: _command(
-        *("import", folder / f"cloud.{name}", "--data", folder / "scene", "--output", folder / "imported")
-    )
 
 
 def _resume(folder: Path) -> None:
@@ -210,11 +205,7 @@ TARGETS: dict[str, Target] = {
         for name in ("mesh.ply", "mesh.obj", "mesh.glb", "text.ply")
     },
     **{
-        f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name))
-        for name in filter(reader_of, SPLAT_FORMATS)
-    },
-    **{
-        f"import-{name}": Target("splats", (f"cloud.{name}",), _import(name), True)
+        f"splats-{name}": Target("splats", (f"cloud.{name}",), _splats(name), True)
         for name in filter(reader_of, SPLAT_FORMATS)
     },
     "resume": Target("run", _RUN, _resume, True),
