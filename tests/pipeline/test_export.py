@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coliags_plugin.cli import main
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.pipeline.export import export_atlas
 from coliags_plugin.pipeline.survey import Survey
+from tests import commands
 from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity
 
 
-def test_every_sub_map_is_exported_with_its_trajectory(out, tmp_path):
+def test_every_sub_map_is_exported_with_its_trajectory_and_the_transform_to_the_first_of_those_joined(out, tmp_path):
     manifest = export_atlas(out, tmp_path / "export")
     assert json.loads((tmp_path / "export" / "manifest.json").read_text()) == manifest
     assert {entry["name"]: entry["frames"] for entry in manifest["submaps"]} == {
@@ -35,10 +35,6 @@ def test_every_sub_map_is_exported_with_its_trajectory(out, tmp_path):
         scene = open_scene(folder / "colmap", "colmap", ["initial_points=none"])
         assert len(scene.video) == len(entry["frames"]) == len(list((folder / "colmap" / "images").iterdir()))
         assert entry["nerfstudio"] == (number != "2") == (folder / "nerfstudio" / "transforms.json").is_file()
-
-
-def test_joined_sub_maps_have_the_transform_to_the_first_one(out, tmp_path):
-    manifest = export_atlas(out, tmp_path / "export")
     by_name = {entry["name"]: entry for entry in manifest["submaps"]}
     joined = {name for name, entry in by_name.items() if entry["joined_to"] != name}
     assert joined == {"segment-001/0"}
@@ -57,17 +53,13 @@ def test_a_short_video_is_exported_likewise(short, tmp_path):
     assert colmap.read(tmp_path / "export" / "submap-1" / "colmap" / "sparse" / "0").names
 
 
-def test_timestamps_are_frame_numbers_where_the_rate_is_unknown(out, tmp_path):
+def test_timestamps_are_frame_numbers_where_the_rate_is_unknown_and_those_of_frames_where_it_varies(out, tmp_path):
     change_video(out, rate=None)
     assert export_atlas(out, tmp_path / "export")["timestamps"] == "frame number"
     assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
-
-
-def test_timestamps_are_those_of_frames_where_the_rate_varies(out, tmp_path):
     times = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.3, 100))
     replace(Survey.read(out), times=times).write(out)
-    manifest = export_atlas(out, tmp_path / "export")
-    for entry in manifest["submaps"]:
+    for entry in export_atlas(out, tmp_path / "export", overwrite=True)["submaps"]:
         path = tum.read(tmp_path / "export" / entry["folder"] / "trajectory.txt")
         np.testing.assert_array_equal(path.timestamps, times[entry["frames"]])
 
@@ -108,13 +100,7 @@ def test_what_cannot_be_exported_is_refused(out, tmp_path):
 
 
 def test_the_command_names_the_sub_maps(out, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["poses", "export", str(out), "--output", str(tmp_path / "export")])
-    assert stopped.value.code == 0
+    assert commands.run("poses", "export", out, "--output", tmp_path / "export") == 0
     printed = capsys.readouterr().out
     assert "segment-001/0: 14 frames, unit unknown, joined to segment-000/2" in printed
     assert "segment-000/2: 5 frames, unit unknown, no dense depth" in printed
-    with pytest.raises(SystemExit) as stopped:
-        main(["poses", "export", str(tmp_path), "--output", str(tmp_path / "other")])
-    assert stopped.value.code == 2
-    assert "already exists and is no reconstruction" in capsys.readouterr().err

@@ -226,25 +226,6 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
     assert Record.of(tmp_path / "none").is_done("survey") and Survey.read(tmp_path / "none")
 
 
-@pytest.mark.thorough
-def test_the_camera_is_that_of_the_first_segment_with_poses(long_video, tmp_path, workers, monkeypatch):
-    make_poses, tried = steps.make_poses, []
-
-    def poses(context):
-        tried.append(context.out.name)
-        if len(tried) == 1:
-            raise InputError("2 of 50 frames have poses")
-        return make_poses(context)
-
-    monkeypatch.setattr(steps, "make_poses", poses)
-    executor = workers()
-    record = cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS)
-    states = {name: record.stages[f"{name}/poses"].state for name in segments_of(record)}
-    assert states == {name: "failed" if name == tried[0] else "done" for name in states}
-    plans = [json.loads(task.settings)["sfm"]["camera"]["params"] for task in executor.tasks if task.submap is None]
-    assert [params is None for params in plans] == [True, True, False]
-
-
 def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, workers, capsys):
     write_video([np.zeros((48, 64, 3), np.uint8)] * 60, tmp_path / "dark.mp4", 10.0)
     executor, out = workers(), tmp_path / "out"

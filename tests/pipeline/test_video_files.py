@@ -65,6 +65,7 @@ class Pipe:
         ("a.mov", "prores_ks", {"pix_fmt": "yuv422p10le"}, True),
         ("a.mkv", "libx264", ORDERED, True),
         ("a.mkv", "ffv1", {"pix_fmt": "yuva444p"}, True),
+        ("a.mkv", "ffv1", {"pix_fmt": "bgra"}, True),
         ("a.webm", "libvpx-vp9", {"g": 8, "cpu-used": 8}, True),
         ("a.ts", "libx264", ORDERED, True),
         ("a.m2ts", "libx264", OPEN, True),
@@ -80,10 +81,14 @@ class Pipe:
     ],
 )
 def test_frame_n_is_what_follows_n_frames(tmp_path, name, codec, options, is_sought):
-    path = write_film(FRAMES, tmp_path / name, codec, 25, **({"b": 4_000_000} if codec[0] == "m" else {}), **options)
+    rate = Fraction(30_000, 1001)
+    path = write_film(FRAMES, tmp_path / name, codec, rate, **({"b": 4_000_000} if codec[0] == "m" else {}), **options)
     whole = numbers(path)
     assert whole == list(range(40 - len(whole), 40))
-    assert frame_source(path).rate == pytest.approx(20 if "times" in options else 25)
+    source = frame_source(path)
+    assert source.rate == pytest.approx(20 if "times" in options else 30_000 / 1001, rel=1e-4)
+    assert not source.is_variable
+    assert [source.frame_at(n / source.rate) for n in range(len(whole))] == list(range(len(whole)))
     for first in (1, 3, 7, 8, 13, 17, 31, len(whole) - 1):
         assert numbers(path, Span(first, first + 1)) == whole[first : first + 2]
     if is_sought:
@@ -147,16 +152,9 @@ def test_what_cannot_be_read_is_refused(tmp_path):
             list(frame_source(tmp_path / name, Span(first)))
 
 
-def test_colours_are_those_of_the_video_and_times_are_frames(tmp_path):
-    """Videos are lossy; red and blue are not swapped."""
-    frames = film(range(0, 72, 6))
-    write_video(frames, tmp_path / "film.mp4", 15.0)
+def test_times_are_written_as_seconds_minutes_and_hours(tmp_path):
+    write_video(film(range(3)), tmp_path / "film.mp4", 15.0)
     source = frame_source(tmp_path / "film.mp4")
-    for _ in range(2):
-        for (_, image), frame in zip(source, frames, strict=True):
-            np.testing.assert_allclose(image.mean(axis=(0, 1)), frame.mean(axis=(0, 1)), atol=5.0)
-            assert np.mean(np.abs(image.astype(float) - frame)) < 10.0
-    assert source.rate == pytest.approx(15.0)
     for text, frame in (("0", 0), ("3:20", 3000), ("1:00:00.2", 54003), ("0.4", 6)):
         assert source.frame_at(seconds_of(text)) == frame
     for text in ("", "3:x", "-1", "1:2:3:4"):
@@ -305,15 +303,6 @@ def test_times_are_those_of_the_frames(tmp_path, name, caplog):
     np.testing.assert_array_equal(Survey.read(tmp_path).part(7, 12).times, source.times[7:13])
 
 
-@pytest.mark.parametrize("name", ["a.ts", "a.mkv", "a.avi", "a.mp4"])
-def test_even_rates_are_not_variable(tmp_path, name):
-    codec = {"codec": "mjpeg", "pix_fmt": "yuvj420p"} if name == "a.avi" else ORDERED
-    source = frame_source(write_film(FRAMES, tmp_path / name, rate=Fraction(30000, 1001), **codec))
-    assert source.rate == pytest.approx(30000 / 1001, rel=1e-4) and not source.is_variable
-    assert [source.frame_at(number * 1001 / 30000) for number in range(40)] == list(range(40))
-    assert survey_video(source).times is None
-
-
 def test_files_of_a_folder_may_have_other_rates(tmp_path):
     for part, rate in enumerate((10, 20)):
         write_film(FRAMES[:20], tmp_path / f"{part}.mp4", rate=rate)
@@ -386,19 +375,16 @@ def test_sound_and_cover_pictures_are_no_video(tmp_path, name, codecs, caplog):
 
 
 @pytest.mark.parametrize(
-    ("name", "codec", "pix_fmt", "options"),
+    ("codec", "pix_fmt", "options"),
     [
-        ("a.mkv", "ffv1", "gray", {}),
-        ("a.mkv", "ffv1", "yuv422p10le", {}),
-        ("a.mkv", "ffv1", "bgra", {}),
-        ("a.mov", "prores_ks", "yuva444p10le", {}),
-        ("a.mkv", "libx264", "yuvj444p", {"qp": 1}),
-        ("a.mkv", "libx265", "yuv420p10le", {"x265-params": "lossless=1:log-level=none"}),
+        ("ffv1", "gray", {}),
+        ("libx264", "yuvj444p", {"qp": 1}),
+        ("libx265", "yuv420p10le", {"x265-params": "lossless=1:log-level=none"}),
     ],
 )
-def test_pixel_formats(tmp_path, name, codec, pix_fmt, options):
+def test_pixel_formats(tmp_path, codec, pix_fmt, options):
     frames = [np.full((48, 64, 3), 20 + 20 * n, np.uint8) for n in range(11)]
-    path = write_film(frames, tmp_path / name, codec, pix_fmt=pix_fmt, **options)
+    path = write_film(frames, tmp_path / "a.mkv", codec, pix_fmt=pix_fmt, **options)
     for (_, image), frame in zip(frame_source(path), frames, strict=True):
         np.testing.assert_allclose(image.astype(int), frame, atol=3)
 

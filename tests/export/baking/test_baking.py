@@ -24,22 +24,13 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def some_gaussians(count: int, scales: int = 3, seed: int = 0) -> Gaussians:
+def some_gaussians(count: int) -> Gaussians:
     """Random Gaussians within 10 mm of the origin."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
-        return low + (high - low) * torch.rand(*shape, generator=generator)
-
-    index = torch.arange(count)
+    index, drawn = torch.arange(count), torch.rand(count, 10, generator=torch.Generator().manual_seed(0))
+    means, scales, opacities, colors = drawn.split((3, 3, 1, 3), dim=1)
+    turns = random(count, 4)
     return Gaussians(
-        means=uniform(-10.0, 10.0, count, 3),
-        quats_wxyz=torch.randn(count, 4, generator=generator),
-        scales=uniform(0.1, 1.0, count, scales),
-        opacities=uniform(0.05, 1.0, count),
-        colors=uniform(0.0, 1.0, count, 3),
-        source_index=index,
-        visible_sources=index,
+        20.0 * means - 10.0, turns, 0.1 + 0.9 * scales, 0.05 + 0.95 * opacities[:, 0], colors, index, index
     )
 
 
@@ -108,18 +99,14 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
 
 def test_the_heaviest_gaussians_are_kept():
     averages = GaussianAverages(6, 1, 3, torch.device("cpu"))
+    averages.add(some_gaussians(6), torch.zeros(6), camera_at(0, 0, 0))
+    with pytest.raises(InputError, match="visible"):
+        averages.visible()
     averages.add(some_gaussians(6), torch.tensor([3.0, 10.0, 0.0, 1.0, 5.0, 1.0]), camera_at(0, 0, 0))
     assert averages.heaviest(3).tolist() == [0, 1, 4]
     assert averages.heaviest(9).tolist() == [0, 1, 3, 4, 5]  # one fills no pixel
     assert averages.heaviest(9, 0.75).tolist() == [1, 4]  # 15 of 20 pixels
     assert averages.heaviest(1, 0.75).tolist() == [1]
-
-
-def test_nothing_visible_is_an_error():
-    averages = GaussianAverages(3, 1, 3, torch.device("cpu"))
-    averages.add(some_gaussians(3), torch.zeros(3), camera_at(0, 0, 0))
-    with pytest.raises(InputError, match="visible"):
-        averages.visible()
 
 
 def test_the_mean_camera_is_between_the_cameras():

@@ -13,7 +13,6 @@ import gsply
 import numpy as np
 import pytest
 import torch
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,8 +22,6 @@ from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, read_splats, reader_of, write_splats
 from coliags_plugin.fields import spherical_harmonics
-from coliags_plugin.geometry.meshes.files import write_mesh
-from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs/export.md"
@@ -73,16 +70,6 @@ def test_attributes_of_ply_stand_in_the_order_of_3dgs(tmp_path):
     opacity = cloud.opacities.astype(np.float64)
     np.testing.assert_allclose(rows[:, 54], np.log(opacity / (1 - opacity)), rtol=1e-5)
     np.testing.assert_allclose(rows[:, 55:58], np.log(cloud.scales), rtol=1e-5, atol=1e-6)
-
-
-def test_another_library_reads_the_ply(tmp_path):
-    cloud = random_cloud(20)
-    loaded = gsply.plyread(str(written(tmp_path, cloud, "ply")))
-    np.testing.assert_array_equal(loaded.means, cloud.means)
-    np.testing.assert_allclose(loaded.quats, cloud.quats_wxyz, atol=2e-7)
-    np.testing.assert_allclose(np.exp(loaded.scales), cloud.scales, rtol=1e-5)
-    np.testing.assert_array_equal(loaded.sh0, cloud.harmonics[:, 0])
-    np.testing.assert_array_equal(loaded.shN.reshape(20, 15, 3), cloud.harmonics[:, 1:])
 
 
 def test_surfels_get_a_third_scale_that_is_finite(tmp_path):
@@ -249,34 +236,3 @@ def test_formats_keep_positions_and_are_documented(tmp_path, name):
         np.testing.assert_allclose(read(path).means, cloud.means, atol=1.0 / 4096)
     (row,) = re.findall(rf"^\| `{name}` \|.*\| (.*?) \|$", DOCUMENTATION.read_text(encoding="utf-8"), re.M)
     assert row.startswith("no" if read is None else "yes")
-
-
-#: Corners of a tetrahedron which no turn and no mirroring brings back onto itself. [4, 3]
-PLACES = np.array([[1, 2, 30], [5, 2, 31], [1, 9, 33], [2, 3, 45]], np.float32)
-COLORS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], np.uint8)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """The tetrahedron as ``mesh.*``, and Gaussians at its corners as ``splats.*``."""
-    target = tmp_path_factory.mktemp("frames")
-    triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    for suffix in ("ply", "obj", "glb"):
-        write_mesh(target / f"mesh.{suffix}", TriangleMesh(PLACES, triangles, COLORS))
-    cloud = replace(random_cloud(4, 0), means=PLACES)
-    for suffix in ("ply", "glb"):
-        write_splats(target / f"splats.{suffix}", cloud, suffix)
-    return target
-
-
-def in_order(points: np.ndarray) -> np.ndarray:
-    return points[np.argsort(points[:, 2])]
-
-
-@pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "splats.ply", "splats.glb"])
-def test_trimesh(folder, name):
-    scene = trimesh.load_scene(folder / name, skip_materials=True)
-    (placed,) = scene.dump()
-    np.testing.assert_allclose(in_order(placed.vertices), PLACES, rtol=1e-6)
-    if name.startswith("mesh"):
-        np.testing.assert_array_equal(placed.visual.vertex_colors[np.argsort(placed.vertices[:, 2]), :3], COLORS)

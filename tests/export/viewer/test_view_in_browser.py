@@ -7,7 +7,6 @@ import time
 import numpy as np
 import pytest
 
-import coliags_plugin as cp
 from coliags_plugin.core.images import read_rgb
 
 pytest.importorskip("viser")
@@ -58,16 +57,3 @@ def test_the_run_is_seen_from_the_first_frame_on_and_the_slider_moves_the_view(b
         assert session.frame.value == len(viewer.trained.scene.video) - 1
         assert not np.allclose(before, last)
         assert elsewhere(browser, viewer.url) == []
-
-
-def test_a_scene_in_a_report_is_seen_once_it_is_opened(browser, anchors, tmp_path):
-    anchors.evaluate()
-    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
-    browser.open(page, WIDTH, HEIGHT)
-    time.sleep(1.0)
-    assert browser.run("document.querySelector('iframe').contentDocument?.querySelector('canvas') == null")
-    browser.run("document.querySelector('details:has(iframe)').open = true")
-    browser.run("document.querySelector('iframe').scrollIntoView()")
-    until(browser, tmp_path / "report.png", drawn)
-    assert elsewhere(browser, page.resolve().as_uri()) == []
-    assert not [error for error in browser.errors() if "worker" in error]  # it sorts the Gaussians

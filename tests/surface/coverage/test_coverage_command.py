@@ -14,10 +14,8 @@ import pytest
 
 import tests.layouts  # noqa: F401  (registers c3vd-raw)
 from coliags_plugin.api.scenes import make_phantom
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_8_bit, write_image
 from coliags_plugin.core.provenance import Provenance
-from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.surface.coverage.page import RESEARCH_USE
 from coliags_plugin.surface.coverage.visibility import CoverageSettings, Level, recorded_views
@@ -46,14 +44,6 @@ def recorded(request, phantom, tmp_path_factory):
 
 def true_mesh(phantom):
     return phantom / "truth" / "mesh.ply"
-
-
-def test_frames_are_seen_through_the_lens_that_recorded_them(recorded):
-    views = recorded_views(open_recording(recorded))
-    assert len(views) == 9
-    raw = isinstance(views[0].lens, OmnidirectionalLens)
-    assert raw == (recorded.name == "c3vd-raw") and (views[0].mask is not None) == raw
-    assert views[0].read_image().shape == (views[0].lens.height, views[0].lens.width, 3)
 
 
 def test_hidden_pixels_see_nothing(recorded, tmp_path):
@@ -113,14 +103,6 @@ def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
     ):
         assert message in refused(capsys, "coverage", *arguments), arguments
     assert not out.exists()
-
-
-def test_a_mesh_of_another_world_is_refused(phantom, tmp_path):
-    scene, mesh = open_recording(phantom), read_mesh(true_mesh(phantom))
-    away = type(mesh)(mesh.vertices + np.float32(5000.0), mesh.triangles)
-    with pytest.raises(InputError, match="no viewing ray"):
-        measure_scene(scene, away, tmp_path / "out", CoverageSettings())
-    assert not (tmp_path / "out").exists()
 
 
 def test_of_a_short_video_the_seen_wall_is_written_and_why_there_is_no_section(phantom, tmp_path, capsys):

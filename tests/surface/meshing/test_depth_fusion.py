@@ -29,7 +29,7 @@ from coliags_plugin.surface.meshing.views import (
 )
 from tests.scenes import camera_at, wall_color, wall_scene, write_wall
 from tests.surface.coverage.tubes import plane
-from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run, with_provenance
+from tests.surface.meshing.exact import SQUARE, WALL, exact_run, with_provenance
 
 
 def test_a_wall():
@@ -99,13 +99,6 @@ def test_what_lies_too_far_is_not_fused():
 
 
 @pytest.mark.thorough
-def test_transparent_views_have_no_surface():
-    with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
-        fuse_run(exact_run(alpha=0.7))
-    assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)).mesh)
-
-
-@pytest.mark.thorough
 def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     run = exact_run()
     calls = []
@@ -124,9 +117,6 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     mesh = fuse_run(run, MeshSettings(color="flattened")).mesh
     assert calls == [("flattened", len(run.scene.train))]
     assert set(np.unique(mesh.colors)) == {51}
-    plain = fuse_run(run).mesh
-    # open3d's threads leave the order of vertices open.
-    assert mesh.areas.sum() == pytest.approx(plain.areas.sum()) and len(np.unique(plain.colors)) > 1
 
 
 def test_too_few_views_and_methods_without_depth_are_refused():
@@ -137,13 +127,6 @@ def test_too_few_views_and_methods_without_depth_are_refused():
     assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))).mesh)
     with pytest.raises(InputError, match="meshing with median depth"):
         fuse_run(exact_run(depth=False))
-
-
-def test_incidence_on_a_wall():
-    camera = camera_at(0.0, 0.0, 0.0, 60, 40, yaw=0.4)
-    cosines = incidence_cosines(depth_of(camera, square=False), camera)
-    rays = camera.rays()
-    assert torch.allclose(cosines, rays[..., 2].abs() / rays.norm(dim=-1))
 
 
 def test_incidence_at_a_jump():
@@ -226,13 +209,6 @@ def test_files_and_figures(truth, tmp_path):
     assert read_rgb(meshed.folder / "comparison.png").shape[2] == 3
 
 
-def test_without_truth(tmp_path):
-    meshed = mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, formats=("obj",))
-    assert {path.name for path in meshed.folder.iterdir()} == {"mesh.obj", "mesh.json"}
-    assert meshed.comparison is None
-    assert json.loads((meshed.folder / "mesh.json").read_text())["comparison"] is None
-
-
 def test_with_a_texture(tmp_path):
     meshed = mesh_run(exact_run(frames=9), tmp_path / "mesh", MeshSettings(voxel_size=1.0, texture=2.0))
     names = {"mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.glb", "mesh.json"}
@@ -259,13 +235,15 @@ def test_what_is_there_is_not_replaced_unless_told(tmp_path):
     with pytest.raises(InputError, match="already exists"):
         mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS)
     assert (tmp_path / "mesh/mine").read_text() == "mine"
-    mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, formats=("ply",), overwrite=True)
-    assert not (tmp_path / "mesh/mine").exists()
+    meshed = mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, formats=("obj",), overwrite=True)
+    assert {path.name for path in meshed.folder.iterdir()} == {"mesh.obj", "mesh.json"}
+    assert meshed.comparison is json.loads((meshed.folder / "mesh.json").read_text())["comparison"] is None
 
 
 def test_a_failure_leaves_nothing(truth, tmp_path):
     with pytest.raises(InputError, match="no surface"):
-        mesh_run(exact_run(frames=9, alpha=0.1), tmp_path / "mesh", SETTINGS)
+        mesh_run(exact_run(frames=9, alpha=0.7), tmp_path / "mesh", SETTINGS)
+    assert len(fuse_run(exact_run(frames=9, alpha=0.7), MeshSettings(min_alpha=0.5)).mesh)
     with pytest.raises(InputError, match="no file"):
         mesh_run(exact_run(frames=9), tmp_path / "mesh", SETTINGS, truth=tmp_path / "gone.ply")
     assert not any(tmp_path.iterdir())

@@ -30,14 +30,6 @@ def view(depth: float = 20.0) -> DepthView:
     return DepthView(camera, torch.full((40, 60), depth), torch.ones(40, 60), lambda: None)
 
 
-def test_a_small_hole_is_closed_as_the_wall_about_it():
-    closed, count = close_holes(without(WHOLE, (1.0, 2.0)), 15.0, [view()])
-    assert count == 1
-    assert closed.areas.sum() == pytest.approx(WHOLE.areas.sum())
-    np.testing.assert_allclose(closed.normals, WHOLE.normals[:1].repeat(len(closed), 0), atol=1e-4)
-    assert len(closed.border) == len(WHOLE.border)
-
-
 def test_the_wall_goes_on_as_it_bends():
     """The middle of the hole in a sphere of 15 mm is 0.1 mm off the plane of its rim, and less off the sphere."""
     x, y = WHOLE.vertices[:, :2].T
@@ -126,21 +118,12 @@ def test_noise_goes_and_the_fold_stays(deviation):
     assert smooth.vertices[crest, 2].mean() == pytest.approx(4.0, abs=0.15)
 
 
-def test_surface_without_noise_stays_as_it_is():
-    flat = plane(0.0, 20.0, 0.5)
-    np.testing.assert_allclose(smoothed(flat).vertices, flat.vertices, atol=1e-5)
-
-
 def test_smoothing_moves_with_the_mesh_and_scales_with_it():
     rough = noisy(folded(), 0.1)
     moved = replace(rough, vertices=rough.vertices * np.float32(3.0) + np.float32([5, -2, 7]))
     expected = smoothed(rough).vertices * 3.0 + [5, -2, 7]
     np.testing.assert_allclose(smoothed(moved).vertices, expected, atol=0.02)
-
-
-def test_the_border_does_not_shrink():
-    rough = noisy(plane(0.0, 20.0, 0.5), 0.1)
-    assert np.abs(smoothed(rough).vertices[:, :2]).max() > 19.9
+    assert np.abs(smoothed(rough).vertices[:, :2]).max() > 19.9, "the border does not shrink"
 
 
 def test_nothing_to_smooth():
