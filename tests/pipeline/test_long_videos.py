@@ -1,8 +1,9 @@
-"""Long videos: survey, segments, joins, and their reconstruction by worker processes."""
+"""Long videos: survey, segments, joins, their reconstruction by worker processes, and the export of their sub-maps."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,9 +15,13 @@ from scipy.spatial.transform import Rotation
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.tasks import TaskOutcome
+from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.pipeline import steps
 from coliags_plugin.pipeline.contents import read_contents
+from coliags_plugin.pipeline.export import export_atlas
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.joins import PosedFrames, joins
 from coliags_plugin.pipeline.settings import FrameSettings
@@ -25,10 +30,9 @@ from coliags_plugin.pipeline.survey import OVERLAP, Survey, cut, survey_video
 from coliags_plugin.reporting.video import write_video
 from tests import commands
 from tests.faults import largest_file
-from tests.pipeline.conftest import TRAINING, write_atlas
+from tests.pipeline.conftest import write_atlas
 from tests.pipeline.films import film
-
-SUBMAP = ("check_data", "estimate_depth", *TRAINING)
+from tests.pipeline.reconstructions import JOINS, RATE, SUBMAPS, change_video, similarity
 
 
 def surveyed(followed, sharpness=1.0):
@@ -155,6 +159,7 @@ def segments_of(record):
 
 
 OPTIONS = {"frames.segment": 60, "frames.least_motion": 0.0, "frames.least_sharpness": 0.0}
+WORDS = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
 
 
 @pytest.mark.thorough
@@ -208,8 +213,7 @@ def test_it_goes_on_after_a_stop_and_a_segment_without_poses_leaves_the_others(
 
     monkeypatch.setattr(steps, "make_poses", poses)
     workers(TaskOutcome("died", "the node died"))
-    words = [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
-    assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *words) == 0
+    assert commands.run("reconstruct", long_video, "--output", tmp_path / "out", *WORDS) == 0
     stages = Record.of(tmp_path / "out").stages
     states = [stages[f"{name}/poses"].state for name in segments_of(Record.of(tmp_path / "out"))]
     assert sorted(states)[0] == "done" and len(states) >= 3
@@ -247,8 +251,7 @@ def test_a_video_in_which_nothing_is_followed_has_a_page_that_says_so(tmp_path, 
 
 @pytest.mark.thorough
 def test_a_full_disk_ends_it_and_it_goes_on_once_there_is_space(long_video, tmp_path, workers, capsys):
-    argv = ["reconstruct", long_video, "--output", tmp_path / "out"]
-    argv += [word for name, value in OPTIONS.items() for word in ("--set", f"{name}={value}")]
+    argv = ("reconstruct", long_video, "--output", tmp_path / "out", *WORDS)
     executor = workers()
     with largest_file(20_000):
         message = commands.refused(capsys, *argv)
@@ -267,3 +270,91 @@ def test_what_the_executor_refuses_is_told_before_the_survey(long_video, tmp_pat
     with pytest.raises(InputError, match=r"does not see long\.mp4"):
         cp.reconstruct(long_video, tmp_path / "out", settings=OPTIONS, jobs=2)
     assert not any((tmp_path / "out").glob("[!.]*"))
+
+
+def test_every_sub_map_is_exported_with_its_trajectory_and_the_transform_to_the_first_of_those_joined(out, tmp_path):
+    manifest = export_atlas(out, tmp_path / "export")
+    assert json.loads((tmp_path / "export" / "manifest.json").read_text()) == manifest
+    assert {entry["name"]: entry["frames"] for entry in manifest["submaps"]} == {
+        name: [*folder] for name, folder in SUBMAPS.items()
+    }
+    assert (manifest["source"], manifest["rate"], manifest["timestamps"]) == (["withdrawal.mp4"], RATE, "s")
+    for entry in manifest["submaps"]:
+        segment, number = entry["name"].split("/")
+        folder = tmp_path / "export" / entry["folder"]
+        assert entry["folder"] == f"{segment}-{number}"
+        path, model = tum.read(folder / "trajectory.txt"), colmap.read(out / segment / "poses" / "sparse" / number)
+        np.testing.assert_array_equal(path.timestamps, np.array(entry["frames"]) / RATE)
+        np.testing.assert_allclose(path.camera_to_world, model.camera_to_world, atol=1e-9)
+        scene = open_scene(folder / "colmap", "colmap", ["initial_points=none"])
+        assert len(scene.video) == len(entry["frames"]) == len(list((folder / "colmap" / "images").iterdir()))
+        assert entry["nerfstudio"] == (number != "2") == (folder / "nerfstudio" / "transforms.json").is_file()
+    by_name = {entry["name"]: entry for entry in manifest["submaps"]}
+    joined = {name for name, entry in by_name.items() if entry["joined_to"] != name}
+    assert joined == {"segment-001/0"}
+    assert by_name["segment-001/0"]["joined_to"] == "segment-000/2"
+    np.testing.assert_allclose(by_name["segment-001/0"]["to_joined"], similarity(1))
+    np.testing.assert_array_equal(by_name["segment-000/2"]["to_joined"], np.eye(4))
+    assert [entry["reason"] for entry in manifest["joins"]] == [entry["reason"] for entry in JOINS]
+
+
+def test_a_short_video_is_exported_likewise(short, tmp_path):
+    manifest = export_atlas(short, tmp_path / "export")
+    assert [(entry["name"], entry["folder"], entry["nerfstudio"]) for entry in manifest["submaps"]] == [
+        (f"sub-map {number}", f"submap-{number}", number != 2) for number in range(3)
+    ]
+    assert manifest["joins"] == [] and manifest["size"] == [40, 32]
+    assert colmap.read(tmp_path / "export" / "submap-1" / "colmap" / "sparse" / "0").names
+
+
+def test_timestamps_are_frame_numbers_where_the_rate_is_unknown_and_those_of_frames_where_it_varies(out, tmp_path):
+    change_video(out, rate=None)
+    assert export_atlas(out, tmp_path / "export")["timestamps"] == "frame number"
+    assert tum.read(tmp_path / "export" / "segment-001-1" / "trajectory.txt").timestamps.tolist() == [*range(40, 52)]
+    times = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.3, 100))
+    replace(Survey.read(out), times=times).write(out)
+    for entry in export_atlas(out, tmp_path / "export", overwrite=True)["submaps"]:
+        path = tum.read(tmp_path / "export" / entry["folder"] / "trajectory.txt")
+        np.testing.assert_array_equal(path.timestamps, times[entry["frames"]])
+
+
+@pytest.mark.parametrize(("link", "other_disk"), [(False, False), (True, False), (True, True)])
+def test_linked_images_take_no_space_on_the_same_disk(out, tmp_path, monkeypatch, link, other_disk):
+    def refused(*_):
+        raise OSError(18, "Invalid cross-device link")
+
+    if other_disk:
+        monkeypatch.setattr("os.link", refused)
+    export_atlas(out, tmp_path / "export", link=link)
+    for file, is_linked in (("images/003.png", link and not other_disk), ("sparse/0/images.bin", False)):
+        entry, other = out / "segment-000/poses" / file, tmp_path / "export/segment-000-0/colmap" / file
+        assert entry.read_bytes() == other.read_bytes()
+        assert entry.samefile(other) is is_linked
+
+
+def test_what_cannot_be_exported_is_refused(out, tmp_path):
+    export = tmp_path / "export"
+    export_atlas(out, export)
+    with pytest.raises(InputError, match="already exists"):
+        export_atlas(out, export)
+    with pytest.raises(InputError, match="a folder apart from the input"):
+        export_atlas(out, out / "export")
+    file = out / "segment-000" / "poses" / "atlas.json"
+    content = json.loads(file.read_text())
+    content["submaps"][0]["frames"].pop()
+    write_json(file, content)
+    before = (export / "manifest.json").read_bytes()
+    with pytest.raises(InputError, match=r"sparse/0 has 14 frames, .* names 13 of it"):
+        export_atlas(out, export, overwrite=True)
+    assert (export / "manifest.json").read_bytes() == before
+    for segment in ("segment-000", "segment-001"):
+        (out / segment / "poses" / "atlas.json").write_text("{")
+    with pytest.raises(InputError, match=r"has no sub-map with poses: segment-000: poses/atlas\.json"):
+        export_atlas(out, export, overwrite=True)
+
+
+def test_the_command_names_the_sub_maps(out, tmp_path, capsys):
+    assert commands.run("poses", "export", out, "--output", tmp_path / "export") == 0
+    printed = capsys.readouterr().out
+    assert "segment-001/0: 14 frames, unit unknown, joined to segment-000/2" in printed
+    assert "segment-000/2: 5 frames, unit unknown, no dense depth" in printed

@@ -27,7 +27,6 @@ from tests.pipeline.reconstructions import (
     SUBMAPS,
     change_video,
     done,
-    failed,
     join,
     similarity,
     span,
@@ -201,7 +200,7 @@ def test_the_time_line_has_one_axis(out):
     assert values["curves"][2]["path"].startswith("M105.0")  # where motion was measured first
 
 
-def test_times_are_those_of_frames_where_the_rate_varies(out):
+def test_times_are_those_of_frames_where_the_rate_varies_and_frame_numbers_where_it_is_unknown(out):
     times = np.concatenate([np.arange(50) / 10.0, 65.0 + np.arange(50) / 10.0])
     replace(Survey.read(out), times=times).write(out)
     contents = read_contents(out)
@@ -209,9 +208,6 @@ def test_times_are_those_of_frames_where_the_rate_varies(out):
     ticks = timeline(contents, frame_states(contents)).values["ticks"]
     assert [tick["texts"] for tick in (ticks[0], ticks[-1])] == [["0:00", "0"], ["1:00", "50"]]
     assert "100 frames, 1 min 10 s" in page_of(out)
-
-
-def test_an_unknown_rate_leaves_frame_numbers(out):
     change_video(out, rate=None)
     text = page_of(out)
     assert "min:s" not in text and ">frame number<" in text
@@ -317,11 +313,6 @@ def test_a_video_without_any_pose_has_a_page_that_says_so(out, tmp_path):
     assert "no frame of this video has a pose: it was not begun" in text
     assert "No sub-map was reconstructed." in text
     assert text.count('class="lost"') == 1
-    record.stages["survey"] = done(**video(segments=[span("", 0, 99)], skipped=[]))
-    record.stages["poses"] = failed("2 of 32 frames have poses")
-    record.write()
-    text = page_of(tmp_path)
-    assert "poses failed: 2 of 32 frames have poses" in text and "No sub-map was reconstructed." in text
 
 
 @pytest.mark.parametrize(

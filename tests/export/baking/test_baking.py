@@ -1,22 +1,34 @@
-"""Parts of baking, against closed forms."""
+"""Parts of baking, against closed forms; runs to files of Gaussians and back."""
 
 from __future__ import annotations
 
+import json
+import logging
 import math
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians, rotation_matrices
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
-from coliags_plugin.engine.held_light import mean_camera
-from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, blending_weights, fit_harmonics
+from coliags_plugin.core.ply import read_vertices, write_ply
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import flattened_light, mean_camera
+from coliags_plugin.engine.rendering import render_view
+from coliags_plugin.export.baking import distillation
+from coliags_plugin.export.baking.baking import GaussianAverages, SeenColors, bake, blending_weights, fit_harmonics
 from coliags_plugin.export.baking.distillation import beside
-from coliags_plugin.export.splats.cloud import field_of_cloud
+from coliags_plugin.export.baking.exporting import export_cost
+from coliags_plugin.export.splats.cloud import SplatCloud, cloud_of_field, field_of_cloud, read_splats, write_splats
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from tests.commands import refused, run
+from tests.export.splats.clouds import PARTS, random_cloud
 from tests.scenes import camera_at
 
 
@@ -144,3 +156,233 @@ def test_held_lights():
     assert distances.tolist() == [30.0, 30.0]
     torch.testing.assert_close(cosines, torch.full((2,), math.cos(0.5)))
     assert torch.equal(flat.towards(points, normals), normals)
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    monkeypatch.setattr(distillation, "STEPS", 3)
+    monkeypatch.setattr(distillation, "_MUCH", 0.0)
+
+
+def test_an_imported_export_renders_what_the_run_renders(run_of, wall, tmp_path):
+    trained = run_of("3dgs")
+    (exported,) = trained.export(tmp_path / "wall.ply")
+    again = cp.import_splats(exported.file, wall, tmp_path / "imported")
+    assert again.method == "3dgs" and again.step == 0
+    name = trained.frame_names()[0]
+    ours, theirs = trained.render(name), again.render(name)
+    assert np.abs(ours.rgb.astype(int) - theirs.rgb).max() <= 1
+    np.testing.assert_allclose(theirs.depth, ours.depth, atol=1e-3)
+    record = json.loads((tmp_path / "wall.ply.json").read_text())
+    assert record["baking"] is None and record["unit"] == "mm" and record["run"]["method"] == "3dgs"
+    assert record["gaussians"] == len(read_splats(exported.file))
+    assert abs(record["cost"]["test"]["cost"]["psnr"]) < 1e-3
+    psnr = trained.evaluate().mean("psnr")
+    assert record["cost"]["test"]["run"]["psnr"] == pytest.approx(psnr, abs=1e-6)
+    assert again.evaluate().mean("psnr") == pytest.approx(psnr, abs=1e-3)
+    assert again.load().provenance["imported"]["gaussians"] == record["gaussians"]
+
+
+def test_anchors_are_baked(anchors, wall, tmp_path, few_steps, capsys):
+    trained = anchors
+    file = tmp_path / "wall.spz"
+    assert run("export", trained.path, "--format", "spz", "--output", file, "--light", "flattened") == 0
+    printed = capsys.readouterr().out
+    record = json.loads((tmp_path / "wall.spz.json").read_text())
+    assert str(file) in printed
+    assert f"{record['cost']['test']['export']['psnr']:.2f} dB in that light" in printed
+    assert record["baking"]["light"]["name"] == "flattened" and record["baking"]["steps"] == 3
+    assert 0.9 < record["baking"]["light"]["cosine"] <= 1.0
+    cost = record["cost"]["test"]
+    assert cost["cost"]["psnr"] == pytest.approx(cost["run"]["psnr"] - cost["export"]["psnr"])
+    assert cost["psnr_between"] > 20
+    assert record["sh_degree"] == 3 and record["gaussians"] == len(read_splats(file))
+    assert run("import", file, "--data", wall, "--output", tmp_path / "imported") == 0
+    imported = cp.load_run(tmp_path / "imported")
+    assert imported.render(imported.frame_names()[0]).rgb.std() > 5
+
+
+def test_several_formats_are_of_one_baking(anchors, tmp_path, few_steps):
+    exported = anchors.export(tmp_path / "wall.any", "ply", "spz", measure=False)
+    assert [part.file.name for part in exported] == ["wall.ply", "wall.spz"]
+    first, second = (read_splats(part.file) for part in exported)
+    assert len(first) == len(second) and "dB" not in exported[0].text
+    np.testing.assert_allclose(first.means, second.means, atol=2e-4)
+
+
+def test_distillation_comes_nearer_to_the_frames(anchors, monkeypatch):
+    """The run was hardly trained, and is no better than its averages; frames in its own light are the frames."""
+    trained = anchors.load()
+    frame = trained.scene.train[0]
+    light = LightOfCamera(frame.camera)
+    baked = field_of_cloud(bake(trained, light)[0])
+    camera = frame.camera.to(dtype=torch.float32)
+
+    def error() -> float:
+        with torch.no_grad():
+            shown = trained.model.renderer.draw(baked.gaussians(camera), camera, ("rgb", "alpha")).rgb
+        return float((shown - frame.rgb).square().mean())
+
+    assert not distillation.needs_distillation(baked, trained, light)
+    before = error()
+    assert distillation.distil(baked, trained, light, seconds=0.0) == 0
+    monkeypatch.setattr(distillation, "STEPS", 40)
+    assert distillation.distil(baked, trained, light, seconds=600.0) == 40
+    assert error() < 0.9 * before
+    with torch.no_grad():
+        baked.sh0 += 1.0
+    assert distillation.needs_distillation(baked, trained, light)
+
+
+def test_a_fit_of_so_many_steps_is_the_same_again(anchors):
+    trained = anchors.load()
+    first, second = (field_of_cloud(bake(trained, None)[0]) for _ in range(2))
+    assert [distillation.distil(field, trained, None, math.inf, 5) for field in (first, second)] == [5, 5]
+    for name, values in first.state_dict().items():
+        assert torch.equal(values, second.state_dict()[name])
+
+
+@pytest.mark.thorough
+def test_distilled_colours_fall_with_the_distance_to_the_lamp(run_of, monkeypatch):
+    """Renderings of the run are the frames: colours that are the same from everywhere cannot follow them."""
+    trained = run_of("pr-endo").load()
+    frames = trained.scene.train
+    for index, frame in enumerate(frames):
+        rgb = render_view(trained, frame, ("rgb", "alpha")).rgb
+        image = (255.0 * rgb.detach()).round().to(torch.uint8)
+        frames[index] = Frame.of(name=frame.name, index=frame.index, camera=frame.camera, image=image)
+    monkeypatch.setattr(distillation, "STEPS", 60)
+    between, clouds = [], []
+    for attenuated in (False, True):
+        field = field_of_cloud(bake(trained, None, degree=0, attenuated=attenuated)[0])
+        distillation.distil(field, trained, None, seconds=600.0)
+        clouds.append(cloud_of_field(field))
+        between.append(export_cost(trained, clouds[-1], None)["test"]["psnr_between"])
+    assert between[1] > between[0] + 3.0
+    assert clouds[0].attenuation is None and np.median(clouds[1].attenuation[:, 1]) > 0.0
+
+
+def test_a_view_starts_where_the_wall_is_farthest_of_what_is_shown_well(run_of):
+    """Cameras come nearer to the wall; what stands before the first one only is behind the others."""
+    trained = run_of("3dgs").load()
+    cloud = cloud_of_field(trained.model.field)
+    assert distillation.best_frame(field_of_cloud(cloud), trained, None) == 0
+    before = trained.scene.train[0].camera.center.numpy().astype(np.float32) + np.float32([0.0, 0.0, 0.3])
+    first = cloud.part(np.arange(len(cloud)) == 0)
+    shape = {"means": before[None], "scales": np.full_like(first.scales, 0.1), "opacities": np.float32([0.9])}
+    blob = replace(first, **shape, harmonics=first.harmonics + np.float32(10.0))
+    both = SplatCloud(**{name: np.concatenate([getattr(cloud, name), getattr(blob, name)]) for name in PARTS})
+    assert distillation.best_frame(field_of_cloud(both), trained, None) == 1
+
+
+def test_surfels_are_exported_thin_and_come_back_as_surfels(run_of, wall, tmp_path):
+    trained = run_of("2dgs")
+    record = trained.export(tmp_path / "wall.ply", seconds=0.0)[0].record
+    assert record["cost"]["test"]["psnr_between"] > 25
+    thinnest = read_splats(tmp_path / "wall.ply").scales.min(axis=1)
+    assert thinnest.min() > 0
+    # A file of 2DGS has two scales: its import is a run of surfels.
+    field = trained.load().model.field
+    scales = field.scales.detach().numpy()
+    columns = read_vertices(tmp_path / "wall.ply")
+    del columns["scale_2"]
+    write_ply(tmp_path / "discs.ply", columns)
+    again = cp.import_splats(tmp_path / "discs.ply", wall, tmp_path / "discs")
+    assert again.method == "2dgs"
+    np.testing.assert_allclose(again.load().model.field.scales.detach().numpy(), scales, atol=1e-5)
+
+
+def test_surfels_alone_of_explicit_gaussians_are_fitted(run_of, few_steps):
+    assert bake(run_of("2dgs").load(), None)[1]["steps"] == 3
+    assert bake(run_of("3dgs").load(), None)[1] == {}
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("coliags", "pr-endo", "3dgs"),
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("coliags-plus", "scaffold-gs-distance")),
+        pytest.param("scaffold-gs", marks=pytest.mark.thorough),
+    ],
+)
+def test_fields_that_know_a_lamp_look_different_under_another_and_the_same_under_the_cameras(run_of, method):
+    trained = run_of(method).load()
+    field, camera = trained.model.field, trained.scene.train[2].camera
+    assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
+    camera = replace(camera, camera_to_world=camera.camera_to_world.float())
+    lights = (LightOfCamera(camera), FlattenedLight(10.0, 1.0), FlattenedLight(60.0, 1.0))
+    with torch.no_grad():
+        moving = field.gaussians(camera)
+        own, near, far = (field.gaussians_in_light(camera, light) for light in lights)
+    assert torch.equal(near.colors, far.colors) != field.knows_lamp
+    assert torch.equal(moving.means, own.means) and torch.equal(moving.opacities, own.opacities)
+    torch.testing.assert_close(own.colors, moving.colors, atol=1e-5, rtol=1e-4)
+
+
+def test_flattened_light_is_even_over_a_wall(run_of):
+    """Gaussians of one albedo and one normal look the same everywhere, however far they are."""
+    field = run_of("pr-endo").load().model.field
+    light = FlattenedLight(20.0, 1.0)
+    cameras = [frame.camera for frame in run_of("pr-endo").load().scene.train]
+    with torch.no_grad():
+        near, far = (
+            field.gaussians_in_light(replace(camera, camera_to_world=camera.camera_to_world.float()), light)
+            for camera in (cameras[0], cameras[-1])
+        )
+    common = set(near.source_index.tolist()) & set(far.source_index.tolist())
+    rows = [torch.tensor([g.source_index.tolist().index(slot) for slot in sorted(common)]) for g in (near, far)]
+    difference = (near.colors[rows[0]] - far.colors[rows[1]]).abs()
+    assert float(difference.max()) < 0.05  # the mirrored part alone depends on the view
+
+
+def test_flattened_light_is_the_median_of_what_cameras_see(run_of):
+    trained = run_of("3dgs").load()
+    light = flattened_light(trained.model, [frame.camera for frame in trained.scene.train])
+    assert 15.0 < light.distance < 22.0 and 0.8 < light.cosine < 1.0
+
+
+def test_exports_that_cannot_be(run_of, anchors, tmp_path, capsys, few_steps):
+    trained = run_of("3dgs")
+    (tmp_path / "there.ply").write_text("mine")
+    assert "already exists" in refused(capsys, "export", trained.path, "--output", tmp_path / "there.ply")
+    assert (tmp_path / "there.ply").read_text() == "mine"
+    with pytest.raises(InputError, match="no format 'sog'"):
+        trained.export(tmp_path / "a.sog", "sog")
+    with pytest.raises(InputError, match="no light 'men'"):
+        anchors.export(tmp_path / "a.ply", light="men")
+    with pytest.raises(InputError, match="relit"):
+        run_of("pr-endo").relight(power=2.0).export(tmp_path / "a.ply")
+    radiance = run_of("reim-nerf-small", "field.width=8")
+    assert "has no Gaussians" in refused(capsys, "export", radiance.path, "--output", tmp_path / "a.ply")
+    assert "not a run folder" in refused(capsys, "export", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["there.ply"]
+
+
+def test_imports_that_cannot_be(wall, tmp_path, capsys):
+    good, output = tmp_path / "good.ply", tmp_path / "run"
+    write_splats(good, random_cloud(5), "ply")
+    assert "no reader" in refused(capsys, "import", tmp_path / "a.glb", "--data", wall, "--output", output)
+    assert "cannot read" in refused(capsys, "import", tmp_path / "a.ply", "--data", wall, "--output", output)
+    refused(capsys, "import", good, "--data", tmp_path / "nowhere", "--output", output)
+    assert not output.exists()
+    output.mkdir()
+    (output / "mine.txt").write_text("mine")
+    assert "already exists" in refused(capsys, "import", good, "--data", wall, "--output", output)
+    assert "not a run folder" in refused(capsys, "import", good, "--data", wall, "--output", output, "--overwrite")
+    assert (output / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda cloud: {"means": cloud.means - np.float32(5000)}, "0 % of the Gaussians lie in the view of a"),
+        (lambda cloud: {"means": cloud.means / 1000, "scales": cloud.scales / 1000}, "(of the Gaussians|show nothing)"),
+        (lambda cloud: {"opacities": np.full_like(cloud.opacities, 1e-6)}, "2 of 2 views of it show nothing"),
+    ],
+)
+def test_a_file_of_another_world_is_imported_with_a_warning(wall, tmp_path, caplog, change, text):
+    cloud = random_cloud(200)
+    write_splats(tmp_path / "far.ply", replace(cloud, **change(cloud)), "ply")
+    with caplog.at_level(logging.WARNING):
+        cp.import_splats(tmp_path / "far.ply", wall, tmp_path / "run")
+    assert re.search(f"{text}.*world frame and unit", caplog.text)

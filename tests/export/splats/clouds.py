@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.export.splats.cloud import SplatCloud
 
@@ -29,15 +30,7 @@ def random_cloud(count: int = 50, degree: int = 3, scales: int = 3, seed: int = 
 
 def covariances(cloud: SplatCloud) -> np.ndarray:
     """Covariance of each Gaussian. [N, 3, 3]"""
-    w, x, y, z = (cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)).astype(np.float64).T
-    rotations = np.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        axis=1,
-    ).reshape(-1, 3, 3)
+    rotations = Rotation.from_quat(cloud.quats_wxyz, scalar_first=True).as_matrix()
     stretched = rotations * cloud.scales[:, None].astype(np.float64)
     return stretched @ stretched.transpose(0, 2, 1)
 

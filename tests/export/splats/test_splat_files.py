@@ -13,6 +13,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,6 +23,8 @@ from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.export.splats import spz
 from coliags_plugin.export.splats.cloud import THICKNESS_SHARE, SplatCloud, read_splats, reader_of, write_splats
 from coliags_plugin.fields import spherical_harmonics
+from coliags_plugin.geometry.meshes.files import write_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs/export.md"
@@ -236,3 +239,21 @@ def test_formats_keep_positions_and_are_documented(tmp_path, name):
         np.testing.assert_allclose(read(path).means, cloud.means, atol=1.0 / 4096)
     (row,) = re.findall(rf"^\| `{name}` \|.*\| (.*?) \|$", DOCUMENTATION.read_text(encoding="utf-8"), re.M)
     assert row.startswith("no" if read is None else "yes")
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "splats.ply", "splats.glb"])
+def test_trimesh_reads_files_in_the_frame_of_the_scene(tmp_path, name):
+    """A tetrahedron that no turn and no mirroring brings back onto itself."""
+    places = np.array([[1, 2, 30], [5, 2, 31], [1, 9, 33], [2, 3, 45]], np.float32)
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], np.uint8)
+    if name.startswith("mesh"):
+        write_mesh(
+            tmp_path / name, TriangleMesh(places, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), colors)
+        )
+    else:
+        write_splats(tmp_path / name, replace(random_cloud(4, 0), means=places), name.partition(".")[2])
+    (placed,) = trimesh.load_scene(tmp_path / name, skip_materials=True).dump()
+    order = np.argsort(placed.vertices[:, 2])
+    np.testing.assert_allclose(placed.vertices[order], places, rtol=1e-6)
+    if name.startswith("mesh"):
+        np.testing.assert_array_equal(placed.visual.vertex_colors[order, :3], colors)

@@ -32,19 +32,15 @@ from tests.surface.coverage.tubes import plane
 from tests.surface.meshing.exact import SQUARE, WALL, exact_run, with_provenance
 
 
-def test_a_wall():
-    mesh = fuse_run(exact_run(scene=wall_scene(17, 160, 120, lamp=False))).mesh
-    assert np.abs(mesh.vertices[:, 2] - WALL).max() < 0.01
-    # Seen from the cameras, which look along +z, triangles are counter-clockwise.
-    assert (mesh.normals[:, 2] < -0.99).all()
-    expected = wall_color(torch.from_numpy(mesh.vertices)).numpy()
-    assert np.abs(mesh.colors / 255.0 - expected).max() < 0.01
-
-
-def test_a_texture_of_a_wall():
-    """At the centres of triangles, between vertices, it has the colour of the wall."""
+def test_a_wall_has_the_colours_of_the_wall_and_so_has_its_texture():
+    """The texture at the centres of triangles, between vertices."""
     run = exact_run(scene=wall_scene(17, 160, 120, lamp=False))
     fused = fuse_run(run, MeshSettings(voxel_size=1.0, texture=4.0))
+    assert np.abs(fused.mesh.vertices[:, 2] - WALL).max() < 0.01
+    # Seen from the cameras, which look along +z, triangles are counter-clockwise.
+    assert (fused.mesh.normals[:, 2] < -0.99).all()
+    expected = wall_color(torch.from_numpy(fused.mesh.vertices)).numpy()
+    assert np.abs(fused.mesh.colors / 255.0 - expected).max() < 0.01
     image, corners = fused.texture.image, fused.texture.corners
     size = np.sqrt(fused.mesh.areas.sum() / 0.6) / 0.25
     assert image.shape == (int(np.ceil(size)), int(np.ceil(size)), 3)
@@ -62,9 +58,10 @@ def test_edges_of_three_triangles_cannot_be_textured():
         best_texture(fan, 0.1, [])
 
 
-def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
+def test_no_triangles_fly_between_a_square_and_the_wall_behind_it_and_small_parts_go():
     settings = MeshSettings(voxel_size=0.3)
-    mesh = fuse_run(exact_run(square=True), settings).mesh
+    run = exact_run(square=True)
+    mesh = fuse_run(run, settings).mesh
     z = mesh.vertices[:, 2]
     # At its edges, the square is as thick as the truncation.
     assert np.minimum(np.abs(z - SQUARE), np.abs(z - WALL)).max() < 0.3 * settings.truncation
@@ -72,12 +69,7 @@ def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
     front = mesh.part(mesh.centers[:, 2] < SQUARE + 0.05)
     # Flat up to a voxel from each of its four edges.
     assert 3.4**2 <= front.areas.sum() <= 4.0**2
-
-
-def test_small_parts_go_and_large_ones_stay():
-    run = exact_run(square=True)
-    settings = MeshSettings(voxel_size=0.3, min_part=0.5)
-    assert fuse_run(run, settings).mesh.vertices[:, 2].min() > 16
+    assert fuse_run(run, MeshSettings(voxel_size=0.3, min_part=0.5)).mesh.vertices[:, 2].min() > 16
 
 
 @pytest.mark.parametrize("what", ["mask", "depth_at_least"])
