@@ -17,12 +17,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.pipeline.frame_selection import one_field
-from coliags_plugin.pipeline.frame_sources import (
-    Span,
-    chosen_frames,
-    frame_source,
-    opened_recording,
-)
+from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source, opened_recording
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.pipeline.survey import Survey, survey_video
 from coliags_plugin.pipeline.video_files import VideoFile

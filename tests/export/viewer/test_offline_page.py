@@ -282,29 +282,18 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
     assert "<iframe" not in plain.read_text(encoding="utf-8")
 
 
-def test_a_page_of_a_method_without_a_lamp_speaks_of_no_light(run_of):
-    text = scene_page(run_of("3dgs").load()).text
-    assert "Gaussians; " in text and "recorded light" not in text
-
-
-@pytest.mark.thorough
-def test_meshes_of_the_run_are_layers_of_the_page(run_of):
-    run = run_of("2dgs")
-    mesh = TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), np.full((3, 3), 200, np.uint8))
-    write_mesh(run.path / "mesh" / "mesh.ply", mesh)
-    text = scene_page(run.load()).html
-    assert re.findall(r'value="\d"[^>]*>([\w ]+)</label>', text) == ["Gaussians", "surface"]
-    assert '"about":"1 triangle","legend":[]' in text
-
-
-def test_maps_of_coverage_have_a_legend_of_the_colours_that_they_have(run_of):
+def test_meshes_of_the_run_are_layers_and_maps_of_coverage_have_a_legend_of_their_colours(run_of):
     run = run_of("2dgs")
     colors = np.array([Level.SEEN.color, Level.SEEN.color, Level.UNSEEN.color], np.uint8)
-    file = run.path / "coverage" / "coverage.ply"
-    write_mesh(file, TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), colors))
-    text = scene_page(run.load()).html
-    shutil.rmtree(file.parent)
-    assert '"legend":[["seen",[150,200,190]],["not seen",[213,62,0]]]' in text
+    for file in ("mesh/mesh.ply", "coverage/coverage.ply"):
+        write_mesh(run.path / file, TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), colors))
+    page = scene_page(run.load())
+    for folder in ("mesh", "coverage"):
+        shutil.rmtree(run.path / folder)
+    assert re.findall(r'value="\d"[^>]*>([\w ]+)</label>', page.html)[:2] == ["Gaussians", "surface"]
+    assert '"about":"1 triangle","legend":[]' in page.html
+    assert '"legend":[["seen",[150,200,190]],["not seen",[213,62,0]]]' in page.html
+    assert "Gaussians; " in page.text and "recorded light" not in page.text, "the method knows no lamp"
 
 
 def test_the_most_visible_are_the_opaque_and_large_ones():

@@ -103,14 +103,10 @@ def test_triangles_between_the_rays_are_seen_by_their_centroids():
     assert np.isfinite(views.brightness[views.seen]).all()
 
 
-def test_surface_beyond_the_range_is_not_seen():
+def test_only_the_front_within_range_is_seen_and_a_mesh_is_turned_to_the_cameras():
     mesh, camera = plane(40.0, 5.0), [view_at((0, 0, 0))]
     assert see_faces(mesh, camera, CoverageSettings(max_distance=41.0)).seen.all()
     assert not see_faces(mesh, camera, CoverageSettings(max_distance=39.0)).seen.any()
-
-
-def test_only_the_front_is_seen_and_a_mesh_is_turned_to_the_cameras():
-    mesh, camera = plane(40.0, 5.0), [view_at((0, 0, 0))]
     turned = TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1])
     assert not see_faces(turned, camera, DEFAULTS).seen.any()
     assert np.array_equal(facing_cameras(turned, camera, DEFAULTS).triangles, mesh.triangles)

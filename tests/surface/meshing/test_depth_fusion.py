@@ -260,13 +260,12 @@ def test_a_scene_of_unknown_scale(truth, tmp_path):
     run = exact_run(scene=with_provenance(wall_scene(9, 160, 120), unit="unknown"))
     with pytest.raises(InputError, match="unknown scale"):
         mesh_run(run, tmp_path / "mesh", SETTINGS, truth=truth)
-    meshed = mesh_run(run, tmp_path / "mesh", SETTINGS, formats=("ply",))
-    assert json.loads((meshed.folder / "mesh.json").read_text())["unit"] == "unknown"
     (folder / "truth").mkdir()
     write_mesh(folder / "truth/mesh.ply", wall_mesh())
     meshed = mesh_run(run, tmp_path / "compared", SETTINGS, formats=("ply",), truth=folder)
     assert meshed.comparison.f_at(0.5) > 0.9
     assert meshed.comparison.unit == "mm", "the unit that the scene shares with that of the truth"
+    assert json.loads((meshed.folder / "mesh.json").read_text())["unit"] == "unknown"
     write_unit(folder, "unknown")
     compared = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder).comparison
     printed = terminal_text(comparison_blocks(compared))
