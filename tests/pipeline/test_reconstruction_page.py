@@ -300,7 +300,7 @@ def test_an_atlas_that_names_frames_elsewhere_is_not_used(out):
         assert f"{name}" in read_contents(out).problems[0]
 
 
-def test_a_video_without_any_pose_has_a_page_that_says_so(out, tmp_path):
+def test_a_video_without_any_pose_has_a_page_that_says_so(tmp_path):
     with pytest.raises(InputError, match=r"no stage in .*reconstruction\.json"):
         write_page(tmp_path)
     record = Record(tmp_path, {"survey": done(**video(segments=[span("segment-000", 0, 99)], skipped=[]))})

@@ -113,6 +113,15 @@ def test_only_the_front_within_range_is_seen_and_a_mesh_is_turned_to_the_cameras
     assert facing_cameras(mesh, camera, DEFAULTS) is mesh
 
 
+def test_masked_pixels_see_nothing():
+    lens = pinhole()
+    mask = np.zeros((lens.height, lens.width), bool)
+    mask[:, : lens.width // 2] = True
+    mesh = plane(40.0, 5.0, 1.0)
+    visible = see_faces(mesh, [view_at((0, 0, 0), lens=lens, mask=mask)], DEFAULTS).seen
+    assert visible[mesh.centers[:, 0] < -1.0].all() and not visible[mesh.centers[:, 0] > 1.0].any()
+
+
 def test_levels_tell_a_glance_darkness_and_distance_apart():
     mesh, options = plane(40.0, 5.0, 2.0), CoverageSettings(glance_frames=2, far=50.0, dark=0.2, grazing=60.0)
 
