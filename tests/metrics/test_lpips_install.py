@@ -152,13 +152,6 @@ def test_what_does_not_arrive_whole_is_not_installed(server, cache, spoil, messa
 # Copying
 
 
-def test_heads_beside_the_backbone_are_taken_too(server, cache, made, tmp_path):
-    for name in ALEX:
-        (tmp_path / name.rpartition("/")[2]).write_bytes((made / name).read_bytes())
-    install(["alex"], None, tmp_path)
-    assert files(cache) == [*ALEX]
-
-
 def test_a_copy_under_another_name_gets_that_of_its_checksum(server, cache, tmp_path, monkeypatch):
     """Features alone must not pass for torchvision's file, wherever they lie."""
     lay_out(tmp_path, "squeeze")
@@ -198,15 +191,11 @@ def test_a_folder_that_lacks_files_says_which(server, cache, made, tmp_path):
 # What is there already
 
 
-@pytest.mark.parametrize("damage", ["half", "other"])
-def test_damaged_weights_are_named_and_not_touched(server, cache, made, damage):
+def test_damaged_weights_are_named_and_not_touched(server, cache, made):
     install(["alex"], None, made)
     file = cache / BACKBONE_FILES["alex"][0]
-    if damage == "half":
-        file.write_bytes(file.read_bytes()[:1000])
-    else:
-        torch.save(random_backbone("squeeze"), file)
-    before = file.read_bytes()
+    before = file.read_bytes()[:1000]
+    file.write_bytes(before)
     with pytest.raises(InputError) as caught:
         install(["alex"], None, None)
     assert str(file) in str(caught.value) and "Remove that file" in str(caught.value)

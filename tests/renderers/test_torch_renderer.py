@@ -158,7 +158,7 @@ def test_compositing_of_gaussians_one_behind_the_other(opacities, name, value):
 
 def test_what_is_fainter_than_the_cut_is_not_drawn_and_radii_end_there():
     camera, variance = pinhole(41, 1), (20 * 0.3 / 4) ** 2 + 0.3
-    output = render_gaussians(make([[0, 0, 4.0]], 0.3, 0.7), camera)
+    output = render_gaussians(make([[0, 0, 4.0]], (0.3, 0.2, 0.2), 0.7), camera)
     distance = (torch.arange(41) - 20).abs()
     assert torch.equal(output.alpha[0] > 0, distance <= extent(0.7, variance))
     assert output.splats.radii.tolist() == [math.ceil(extent(0.7, variance))]
