@@ -134,20 +134,6 @@ class Division(Strategy):
         self.steps = torch.cat([self.steps, torch.zeros(born)])
 
 
-class Plain(ViewModule):
-    """Changes nothing."""
-
-    Settings = Settings
-    untrained_views = "as all"
-
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        return cls()
-
-    def parameter_groups(self):
-        return {}
-
-
 # Broken ones: what breaks is in the name.
 
 
@@ -197,7 +183,6 @@ def loss(change):
     return changed(Colour, __call__=lambda self, step: change(Colour.__call__(self, step), step))
 
 
-TurnsNaN = loss(lambda value, step: value * (torch.nan if step.step == 5 else 1.0))
 Maximised = loss(lambda value, step: -value)
 DiffersFromRunToRun = loss(lambda value, step: value * random.uniform(0.9, 1.1))
 TakesGlobalRandomNumbers = loss(lambda value, step: value * (0.9 + 0.2 * torch.rand(())))
@@ -275,7 +260,17 @@ SwapsPixels = renderer(swapped, VolumeRenderer)
 HasNoExpectedDepth = renderer(without_expected_depth, outputs=CpuRenderer.outputs - {"depth_expected"})
 
 
-class CrashesForFreeCameras(Plain):
+class CrashesForFreeCameras(ViewModule):
+    Settings = Settings
+    untrained_views = "as all"
+
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        return cls()
+
+    def parameter_groups(self):
+        return {}
+
     def adjust_camera(self, camera, view):
         _ = view.name
         return camera
@@ -320,15 +315,6 @@ class CrashesAlone(Sampler):
         if not self.queue:
             self.queue = torch.randint(2 * pairs, (4,), generator=self.generator).tolist()
         return [Draw(self.queue.pop())]
-
-
-class HasAHiddenCounter(Division):
-    counters = ()
-
-    def after_backward(self, step, rows):
-        super().after_backward(step, rows)
-        step.model.field.logits.grad *= 1.0 / float(self.steps.max())
-        return {}
 
 
 class ForgetsAGroup(Division):

@@ -27,11 +27,6 @@ class ReimNerfLayout(Layout):
     name = "reim-nerf"
     default_size = (1350, 1080)
 
-    def __init__(self):
-        self._cosines = None
-        #: Nearest and farthest normalised distance by frame, for the JSON files.
-        self._ranges = {}
-
     def lens(self, width, height):
         """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
         lens = LENSES["fisheye"].resized(width, height)
@@ -48,16 +43,12 @@ class ReimNerfLayout(Layout):
     def write_frame(self, folder, frame):
         clipped = np.minimum(frame.z_depth.astype(np.float64), C3VD_RANGE)
         height, width = clipped.shape
-        if self._cosines is None or self._cosines.shape != clipped.shape:
-            self._cosines = ray_cosines(LENSES["fisheye"].resized(width, height)).astype(np.float64)
-        distance = np.divide(clipped, self._cosines, out=np.zeros_like(clipped), where=self._cosines > 0.0)
+        cosines = ray_cosines(LENSES["fisheye"].resized(width, height)).astype(np.float64)
+        distance = np.divide(clipped, cosines, out=np.zeros_like(clipped), where=cosines > 0.0)
         steps = np.rint(distance * (SCENE_SCALE / DISTMAP_SCALE * 65535.0))
         stored = np.clip(steps, 0.0, 65535.0).astype(np.uint16)
         write_image(folder / "images" / _name(frame.index), frame.color)
         write_image(folder / "distmaps" / _name(frame.index), stored)
-        measured = stored[stored > 0] * (DISTMAP_SCALE / 65535.0)
-        nearest, farthest = float(measured.min(initial=DISTMAP_SCALE)), float(measured.max(initial=0.0))
-        self._ranges[frame.index] = (0.9 * nearest, 1.1 * farthest)
 
     def write_sequence(self, folder, part, poses, lens):
         _, lit = self.lens(lens.width, lens.height)
@@ -69,9 +60,8 @@ class ReimNerfLayout(Layout):
         for index, pose in enumerate(poses):
             normalised = pose @ FLIP_Y_AND_Z
             normalised[:3, 3] = (normalised[:3, 3] + shift) * SCENE_SCALE
-            near, far = self._ranges[index]
             names = {"file_path": f"images/{_name(index)}", "distmap_path": f"distmaps/{_name(index)}"}
-            frames.append({**names, "near": near, "far": far, "transform_matrix": normalised.tolist()})
+            frames.append({**names, "transform_matrix": normalised.tolist()})
         camera = {**_camera(lens), "scene_T": to_middle.tolist()}
         for name in PARTS:
             held = [frame for index, frame in enumerate(frames) if name in _parts_of(index)]
@@ -87,8 +77,6 @@ def _camera(lens):
         **{"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "k4": lens.k4, "p1": 0.0, "p2": 0.0},
         "w": lens.width,
         "h": lens.height,
-        "camera_angle_x": 2.0 * math.atan(lens.width / (2.0 * k.fx)),
-        "camera_angle_y": 2.0 * math.atan(lens.height / (2.0 * k.fy)),
         "scene_scale": SCENE_SCALE,
         "dist_ftype": "png",
         "distmap": True,

@@ -1,0 +1,310 @@
+"""Contents of files: arrays, text, JSON and PLY, read whole or refused with a message."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.arrays import read_array, read_arrays
+from coliags_plugin.core.bounds import JSON_BYTES
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
+from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.ply import point_properties, read_triangles, read_vertices, write_ply
+from coliags_plugin.core.text_files import read_text, text_lines, whole_text
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.export.splats.cloud import read_splats
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.poses.formats import format_of
+
+# NPZ and NPY files that are damaged or lie about their size
+
+
+EXPECTED = "an NPZ file with an array 'positions'"
+
+
+def npz_bytes(compressed=False, **arrays):
+    data = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(data, **arrays)
+    return data.getvalue()
+
+
+def test_wanted_arrays_come_back(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(one=np.arange(6).reshape(2, 3), two=np.array(1.5), three=np.array("text")))
+    assert read_arrays(path, EXPECTED, ["one"])["one"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert list(read_arrays(path, EXPECTED, ["one"], ["two", "nine"])) == ["one", "two"]
+    assert list(read_arrays(path, EXPECTED, optional=None)) == ["one", "two", "three"]
+    with pytest.raises(InputError, match=r"a\.npz lacks nine"):
+        read_arrays(path, EXPECTED, ["one", "nine"])
+
+
+def test_an_archive_that_expands_enormously_is_refused_before_it_does(tmp_path):
+    path = tmp_path / "bomb.npz"
+    path.write_bytes(npz_bytes(compressed=True, positions=np.zeros((3_000_000, 3), np.float64)))
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(InputError, match=r"expands to 72,000,\d\d\d"):
+        read_arrays(path, EXPECTED, ["positions"])
+
+
+def test_what_is_no_array_is_refused(tmp_path):
+    np.savez(tmp_path / "objects.npz", positions=np.array([{}], object))
+    np.save(tmp_path / "objects.npy", np.array([{}], object))
+    with zipfile.ZipFile(tmp_path / "text.npz", "w") as archive:
+        archive.writestr("positions", b"text")
+    # A header that promises more than follows reserves nothing.
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 1000000), }"
+    (tmp_path / "short.npy").write_bytes(
+        b"\x93NUMPY\x01\x00" + (len(header)).to_bytes(2, "little") + header + bytes(100)
+    )
+    for name in ("objects.npz", "objects.npy", "text.npz", "short.npy"):
+        message = "'positions', which is no array" if name == "text.npz" else "cannot read"
+        with pytest.raises(InputError, match=message):
+            read_array(tmp_path / name, EXPECTED) if name.endswith("npy") else read_arrays(
+                tmp_path / name, EXPECTED, ["positions"]
+            )
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_any_damage_is_an_input_error(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "damaged.npz"
+    whole = npz_bytes(compressed=data.draw(st.booleans()), positions=np.arange(300.0).reshape(100, 3))
+    spoiled = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 4))):
+        spoiled[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(spoiled[: data.draw(st.integers(0, len(whole)))] if data.draw(st.booleans()) else spoiled)
+    try:
+        arrays = read_arrays(path, EXPECTED, ["positions"])
+    except InputError:
+        return
+    assert arrays["positions"].nbytes <= 64 << 20
+
+
+# Text and JSON are read up to a size, long texts line by line; anything else is a message
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_and_json_with_and_without_a_byte_order_mark(tmp_path, encoding):
+    file = tmp_path / "a"
+    file.write_bytes("à\nb\n".encode(encoding))
+    assert whole_text(file) == read_text(file, "x") == "à\nb\n"
+    assert list(text_lines(file, "x")) == [(1, "à\n"), (2, "b\n")]
+    file.write_bytes('{"a": [1, 2.5]}'.encode(encoding))
+    assert read_json(file, "x") == {"a": [1, 2.5]}
+
+
+def test_sizes_up_to_the_largest_are_read(tmp_path):
+    file = tmp_path / "a"
+    file.write_bytes(b"abc")
+    assert whole_text(file, 3) == "abc"
+    with pytest.raises(ValueError, match="3 bytes, and at most 2"):
+        whole_text(file, 2)
+    file.write_bytes(bytes(1_000_001))
+    with pytest.raises(InputError, match=r"cannot read .*a: it has 1,000,001 bytes, and at most 1,000,000 are read"):
+        read_text(file, "x")
+    assert sum(len(line) for _, line in text_lines(file, "x")) == 1_000_001
+    os.truncate(file, JSON_BYTES + 1)
+    with pytest.raises(InputError, match=r"cannot read .*a: it has 100,000,001 bytes"):
+        read_json(file, "x")
+
+
+@pytest.mark.parametrize("content", [None, "loop", b"\xff\xfe\x00", b"\xfe"])
+@pytest.mark.parametrize("read", [read_text, lambda *args: list(text_lines(*args)), read_json])
+def test_what_is_not_text_is_a_message(tmp_path, read, content):
+    if content == "loop":
+        (tmp_path / "a").symlink_to("a")
+    elif content is not None:
+        (tmp_path / "a").write_bytes(content)
+    with pytest.raises(InputError, match="cannot read") as caught:
+        read(tmp_path / "a", "a test")
+    assert caught.value.expected == "a test"
+
+
+@pytest.mark.parametrize("content", ["", "{", "[" * 100_000, "9" * 5000])
+def test_what_is_not_json_is_a_message(tmp_path, content):
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(InputError, match=r"a\.json is not JSON") as caught:
+        read_json(tmp_path / "a.json", "a test", "Repair it")
+    assert (caught.value.expected, caught.value.do) == ("a test", "Repair it")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{\n  "a": [1,\n  2,],\n}', r"in line 3, column \d: '2,\],'.*nor a comma behind the last value"),
+        ('{\n  "a": 1 // one\n}', r"in line 2, column 10: '\"a\": 1 // one'.*neither comments"),
+        ("<!DOCTYPE html>\n<html>", "cannot read .*a: it is a web page"),
+    ],
+)
+def test_where_json_ends_is_told(tmp_path, content, message):
+    (tmp_path / "a").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_json(tmp_path / "a", "x")
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("a.png", decode_image),
+        ("a.ply", read_vertices),
+        ("a.npz", lambda path: read_arrays(path, "x")),
+        ("a.npy", lambda path: read_array(path, "x")),
+        ("a.json", lambda path: read_json(path, "x")),
+        ("a.obj", read_mesh),
+        ("a.glb", read_mesh),
+        ("a.spz", read_splats),
+        ("a.txt", format_of),
+        ("a.txt", lambda path: list(text_lines(path, "x"))),
+    ],
+)
+def test_what_is_in_the_place_of_a_file_is_told(tmp_path, name, read):
+    path = tmp_path / name
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(InputError, match=rf"{name}: it is a pointer of Git LFS.*`git lfs pull`"):
+        read(path)
+    path.write_text("\n<html><head>")
+    with pytest.raises(InputError, match=rf"{name}: it is a web page"):
+        read(path)
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_numbers_that_cannot_be_written_again(tmp_path, number):
+    (tmp_path / "a.json").write_text(f'{{"a": [{number}]}}')
+    assert set(read_json(tmp_path / "a.json", "x")) == {"a"}
+    with pytest.raises(InputError, match=f"{number} is not a finite number"):
+        read_json(tmp_path / "a.json", "x", finite=True)
+
+
+# PLY files: written ones are read by open3d; vertices in every form are read whole or not at all
+
+
+FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]
+WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}
+FORMATS = {"<": "binary_little_endian", ">": "binary_big_endian", "a": "ascii"}
+
+
+def vertices(order: str = "<") -> np.ndarray:
+    rng = np.random.default_rng(0)
+    rows = np.empty(5, [(name, order + kind) for name, kind in FIELDS])
+    for name, kind in FIELDS:
+        rows[name] = rng.normal(size=5) if kind[0] == "f" else rng.integers(0, 255, 5)
+    return rows
+
+
+def header(form: str, count: int = 5, more: str = "") -> str:
+    properties = "".join(f"property {WORDS[kind]} {name}\n" for name, kind in FIELDS)
+    return f"ply\nformat {form} 1.0\ncomment a\nelement vertex {count}\n{properties}{more}end_header\n"
+
+
+FACES = "property uchar kind\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+SPLIT = [(0, 1, 2), (0, 2, 3), (1, 2, 3), (1, 3, 4)]
+
+
+@pytest.mark.parametrize("order", FORMATS)
+@pytest.mark.parametrize(
+    ("faces", "triangles"), [([], []), ([(0, 1, 2), (2, 3, 4)],) * 2, ([(0, 1, 2, 3), (1, 2, 3, 4)], SPLIT)]
+)
+def test_every_form(tmp_path, order, faces, triangles):
+    """Files with other lists, and polygons, which are split into triangles."""
+    binary = order.replace("a", "<")
+    table, path = vertices(binary), tmp_path / "p.ply"
+    body = table.tobytes()
+    for face in faces:
+        body += struct.pack("BB", 7, len(face)) + np.array(face, f"{binary}i4").tobytes()
+        body += struct.pack("B", 2 * len(face)) + bytes(8 * len(face))
+    if order == "a":
+        rows = [" ".join(repr(value.item()) for value in row) for row in table]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} {2 * len(face)}{2 * len(face) * ' 0'}" for face in faces]
+        body = "\n".join([*rows, ""]).encode()
+    whole = header(FORMATS[order], more=f"element face 2\n{FACES}" if faces else "").encode() + body
+    path.write_bytes(whole)
+    properties = read_vertices(path)
+    assert list(properties) == [name for name, _ in FIELDS]
+    for name, kind in FIELDS:
+        assert properties[name].dtype == np.dtype(kind)
+        np.testing.assert_array_equal(properties[name], table[name])
+    points = load_points(path)
+    np.testing.assert_array_equal(points.positions[:, 0], table["x"])
+    np.testing.assert_array_equal(points.colors[:, 2], table["blue"])
+    if faces:
+        assert set(map(tuple, np.sort(read_triangles(path)[1], axis=1).tolist())) == set(triangles)
+        for cut in range(3, 40):
+            path.write_bytes(whole[:-cut])
+            with pytest.raises(InputError):
+                read_triangles(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "stored", "colors"),
+    [
+        ("float", "0.5 1.5 nan", [128, 255, 0]),
+        ("double", "127.6 255 0", [128, 255, 0]),
+        ("ushort", "32896 65535 0", [128, 255, 0]),
+        ("ushort", "128 255 0", [128, 255, 0]),
+        ("int", "300 -5 255", [1, 0, 1]),
+        ("uchar", "1 1 0", [1, 1, 0]),
+    ],
+)
+@pytest.mark.parametrize(
+    "names", ["red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue", "Red Green Blue"]
+)
+def test_colours_of_every_type_and_name(tmp_path, kind, stored, colors, names):
+    path = tmp_path / "p.ply"
+    properties = "".join(f"property float {name}\n" for name in "xyz")
+    properties += "".join(f"property {kind} {name}\n" for name in names.split())
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}{faces}end_header\n")
+    path.write_text(path.read_text() + f"1 2 3 {stored}\n" * 3 + "3 0 1 2\n")
+    assert load_points(path).colors.tolist() == [colors] * 3
+    assert read_mesh(path).colors.tolist() == [colors] * 3
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", r"\(0 bytes\) cannot be read as PLY"),
+        (b"plenty of text", "cannot be read as PLY"),
+        (header("binary_little_endian").encode() + vertices().tobytes()[:-1], "cannot be read as PLY"),
+        (header("ascii").encode() + b"1 2 3 4 5 6 7\n", "not a number x for each vertex"),
+        (header("ascii", 1).encode() + b"1 2 3\n", "cannot be read as PLY"),
+        (header("ascii", 2).encode() + b"1 2 3 4 5 6 7\n1 2 3\n", "not a number red for each vertex"),
+        (header("ascii", 2).encode() + b"1 2 3 4 5 6 7\n1 2 3 4 five 6 7\n", "cannot be read as PLY"),
+        (header("binary").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("format ascii 1.0\n", "").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("float x", "half x").encode(), "cannot be read as PLY"),
+        (header("ascii").replace("vertex", "face").encode(), "no x, y, z"),
+        (header("ascii").replace("float x", "list uchar int x").encode(), "not a number x for each vertex"),
+    ],
+)
+def test_refused(tmp_path, content, message):
+    (tmp_path / "p.ply").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_vertices(tmp_path / "p.ply")
+
+
+def test_written_files_are_read_by_open3d(tmp_path):
+    import open3d
+
+    positions, colors = np.arange(9.0).reshape(3, 3) ** 2, np.array([[1, 2, 3], [255, 0, 128], [9, 8, 7]], np.uint8)
+    write_ply(tmp_path / "folder" / "points.ply", point_properties(positions, colors))
+    cloud = open3d.io.read_point_cloud(str(tmp_path / "folder" / "points.ply"))
+    np.testing.assert_array_equal(cloud.points, positions)
+    np.testing.assert_allclose(cloud.colors, colors / 255.0)
+    write_ply(tmp_path / "mesh.ply", point_properties(positions), np.array([[0, 1, 2]]), "millimetres")
+    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    assert np.asarray(mesh.triangles).tolist() == [[0, 1, 2]] and not mesh.has_vertex_colors()
+    np.testing.assert_array_equal(mesh.vertices, positions)
+    assert b"\ncomment millimetres\n" in (tmp_path / "mesh.ply").read_bytes()
+    # Other types become float32.
+    write_ply(tmp_path / "rows.ply", {"x": np.array([1, 2]), "weight": np.array([0.5, 0.25])})
+    header, _, body = (tmp_path / "rows.ply").read_bytes().partition(b"end_header\n")
+    assert header.endswith(b"element vertex 2\nproperty float x\nproperty float weight\n")
+    assert np.frombuffer(body, "<f4").tolist() == [1.0, 0.5, 2.0, 0.25]
