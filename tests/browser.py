@@ -46,18 +46,11 @@ class Browser:
             [
                 *(sys.executable, "-c", _LAUNCH, str(their_in), str(their_out)),
                 executable,
-                "--headless=new",
-                "--remote-debugging-pipe",
-                "--no-sandbox",
-                "--disable-gpu",
-                "--use-angle=swiftshader",  # draws WebGL in software, which the option above alone forbids
-                "--enable-unsafe-swiftshader",
-                "--ignore-gpu-blocklist",
-                "--disable-dev-shm-usage",
-                "--hide-scrollbars",
-                "--no-first-run",
-                "--disable-background-networking",
-                "--disable-component-update",
+                *("--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
+                # Draws WebGL in software, which --disable-gpu alone forbids.
+                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+                *("--disable-dev-shm-usage", "--no-first-run"),
+                *("--disable-background-networking", "--disable-component-update"),
                 f"--user-data-dir={self._profile}",
                 "about:blank",
             ],

@@ -28,6 +28,7 @@ from coliags_plugin.datamanagers.scene_settings import held_out
 from coliags_plugin.engine.samplers import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS
 from coliags_plugin.results.reading import find_results
+from tests.commands import run
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -142,16 +143,6 @@ def commands() -> list[tuple[str, str]]:
     return typed
 
 
-def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The command that the command line would run, or None where it only shows help."""
-    caught = []
-    monkeypatch.setattr(cli, "run_command", lambda command: caught.append(command) or 0)
-    with pytest.raises(SystemExit) as stopped:
-        cli.main(argv)
-    assert stopped.value.code == 0
-    return caught[0] if caught else None
-
-
 #: Commands and their actions, which running text names alone.
 ALONE = {
     f"{name} {action}" for name, kind in cli.COMMANDS.items() for action in get_args(get_type_hints(kind).get("action"))
@@ -163,23 +154,19 @@ OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml
 
 @pytest.mark.parametrize(("page", "command"), commands(), ids=lambda value: value.replace("/", "."))
 def test_commands_parse(page, command, monkeypatch, capsys):
-    words = shlex.split(command, comments=True)
+    words, caught = shlex.split(command, comments=True), []
     argv = words[words.index("coliags") + 1 : words.index(">") if ">" in words else None]
     if " ".join(argv) in ALONE:
         argv.append("--help")  # the subcommand's name alone, in running text
-    parsed_command = parsed(argv, monkeypatch)
-    if (
-        isinstance(parsed_command, (TrainCommand, ConfigCommand, CheckCommand))
-        and parsed_command.method not in OF_THE_EXAMPLE
-        and not parsed_command.method.endswith(".yaml")
-    ):
+    monkeypatch.setattr(cli, "run_command", lambda command: caught.append(command) or 0)
+    assert run(*argv) == 0
+    parsed_command = caught[0] if caught else None
+    is_of_method = isinstance(parsed_command, (TrainCommand, ConfigCommand, CheckCommand))
+    if is_of_method and parsed_command.method not in OF_THE_EXAMPLE and not parsed_command.method.endswith(".yaml"):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
-        overrides = [
-            *format_of_page,
-            *(parsed_command.settings if isinstance(parsed_command, TrainCommand) else parsed_command.set),
-        ]
-        assert load_method(parsed_command.method, overrides).config
+        changes = parsed_command.settings if isinstance(parsed_command, TrainCommand) else parsed_command.set
+        assert load_method(parsed_command.method, [*format_of_page, *changes]).config
     if isinstance(parsed_command, PhantomCommand):
         made = []
         monkeypatch.setattr("coliags_plugin.phantom.generate.generate", lambda *a, **k: made.append(a))
@@ -193,12 +180,6 @@ def test_every_command_is_documented():
 
 
 # The tutorial
-
-
-def titled(language: str, name: str) -> str:
-    """The block of docs/configs.md that begins with ``# name``."""
-    (block,) = [block for block in fenced(DOCS / "configs.md", language) if block.startswith(f"# {name}\n")]
-    return block
 
 
 #: Commands, in one process, which loads torch once.
@@ -218,7 +199,8 @@ for words in json.loads(sys.argv[1]):
 def test_the_tutorial_runs_as_written(tmp_path):
     scene = write_wall(tmp_path / "SCENE")
     for language, name in (("python", "edges.py"), ("yaml", "coliags-edges.yaml")):
-        (tmp_path / name).write_text(titled(language, name))
+        (block,) = [block for block in fenced(DOCS / "configs.md", language) if block.startswith(f"# {name}\n")]
+        (tmp_path / name).write_text(block)
     (shell,) = [block for block in fenced(DOCS / "configs.md", "sh") if "coliags-edges.yaml" in block]
     environment, commands = dict(os.environ), []
     for line in shell.splitlines():
@@ -230,10 +212,9 @@ def test_the_tutorial_runs_as_written(tmp_path):
         if words[0] == "train":
             words += [part for override in SMALL for part in ("--set", override)]
         commands.append(words)
-    run = [sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(commands)]
-    process = subprocess.run(
-        run, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True, timeout=120
-    )
+    argv = [sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(commands)]
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True, "timeout": 120}
+    process = subprocess.run(argv, check=False, **options)
     assert process.returncode == 0, process.stderr
     assert re.search(r"^ *edges\b", process.stdout, re.MULTILINE), "listed"
     last = json.loads((tmp_path / "RUN" / "metrics.jsonl").read_text().splitlines()[-1])

@@ -99,19 +99,13 @@ def renderer_class():
     return run_path(str(RENDERER / "coliags_gsplat.py"))["COMPONENTS"]["renderers"]["gsplat"]
 
 
-@pytest.fixture
-def gsplat_renderer():
-    """The class of the renderer, where gsplat and a device are."""
-    availability = renderer_class().availability()
-    if not availability.ok:
-        pytest.skip(availability.reason)
-    return renderer_class()
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("count", [0, 1, 200])
-def test_gsplat_gives_the_definition_s_numbers(gsplat_renderer, count):
+def test_gsplat_gives_the_definition_s_numbers(count):
     """Rounding decides in few pixels, at a threshold; an image without Gaussians is the background, with a graph."""
+    gsplat_renderer = renderer_class()
+    if not gsplat_renderer.availability().ok:
+        pytest.skip(gsplat_renderer.availability().reason)
     gaussians, camera = strewn(200, 96, 64, "gaussians3d")
     of = {name: getattr(gaussians, name)[:count] for name in (*INPUTS, "source_index", "visible_sources")}
     wants, background = ("depth_expected", "normals", "rgb"), (0.3, 0.1, 0.9)

@@ -83,9 +83,15 @@ def check_images(there, here):
         assert np.quantile(differences, 0.99) <= 1, file
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_renders(method, trained, tmp_path):
-    check_images(*both(["render", trained(method), "--frames", "all", "--depth-tiff"], tmp_path))
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        *((method, ("--frames", "all", "--depth-tiff")) for method in METHODS),
+        *(("pr-endo", lamp) for lamp in (("--light", "offset=[2,0,0]"), ("--flatten",))),
+    ],
+)
+def test_renders(method, options, trained, tmp_path):
+    check_images(*both(["render", trained(method), *options], tmp_path))
 
 
 def test_a_camera_path_is_rendered(trained, tmp_path):
@@ -93,11 +99,6 @@ def test_a_camera_path_is_rendered(trained, tmp_path):
     CameraPath(keyframes=(Keyframe.of(start), Keyframe.of(end)), seconds=0.2).write(tmp_path / "path.json")
     there, here = both(["render", trained("3dgs"), "--path", tmp_path / "path.json"], tmp_path)
     assert {file.name for file in there.iterdir()} == {file.name for file in here.iterdir()}
-
-
-@pytest.mark.parametrize("lamp", [("--light", "offset=[2,0,0]"), ("--flatten",)])
-def test_renders_in_another_light(lamp, trained, tmp_path):
-    check_images(*both(["render", trained("pr-endo"), *lamp], tmp_path))
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -162,11 +162,8 @@ def test_origins_name_file_and_line_or_the_option():
         ("base: coliags\nnear_plane: -1.0\n", ["mine.yaml:2", "near_plane", "greater than or equal to 0"]),
         ("base: coliags\nrenderer: {name: cpu, eps: 1.0}\n", ["unknown key 'eps'", "Did you mean 'eps2d'"]),
         ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
-        ("base: coliags\nschedule:\n  steps: 1.5\n", ["mine.yaml:3", "schedule.steps", "1.5"]),
-        ("base: coliags\nschedule:\n  steps: 0\n", ["mine.yaml:3", "greater than or equal to 1"]),
         ("base: coliags\nrenderer: {name: cuda-magic}\n", ["mine.yaml:2", "no renderer 'cuda-magic'"]),
         ("base: coliags\nlosses:\n  extra: {weight: 1.0}\n", ["mine.yaml:3", "needs 'name'", "depth-l1"]),
-        ("base: coliags\nlosses:\n  l1: {weight: heavy}\n", ["mine.yaml:3", "losses.l1.weight", "heavy"]),
         (
             "base: coliags\nfield:\n  appearance_head: {spread_kinks: true}\n",
             ["mine.yaml:3", "field.appearance_head.spread_kinks", "unknown key 'spread_kinks'", "bias_init"],
@@ -182,7 +179,6 @@ def test_origins_name_file_and_line_or_the_option():
         ("base: 3\n", ["mine.yaml:1", "base is 3"]),
         ("description: lonely\n", ["datamanager: is missing"]),
         ("base: scaffold-gs\nlosses: {l1: null, d-ssim: null, scale-volume: null}\n", ["losses", "at least 1 item"]),
-        ("base: coliags\nlosses: 3\n", ["mine.yaml:2", "losses"]),
     ],
 )
 def test_mistakes_are_named(method_file, text, parts):

@@ -76,16 +76,11 @@ def test_processor_time_counts_work_and_not_waiting():
 
 def test_the_peak_holds_what_is_allocated():
     before = costs.peak_memory_mib(CPU)
-    block = np.ones(64 * 2**20 + int(before - _resident_mib()) * 2**20, dtype=np.uint8)
+    block = np.ones(64 * 2**20 + int(before * 2**20) - costs.resident_memory(), dtype=np.uint8)
     after = costs.peak_memory_mib(CPU)
     assert 55 < after - before < 120
     del block
     assert costs.peak_memory_mib(CPU) == pytest.approx(after, abs=1.0), "a peak does not fall"
-
-
-def _resident_mib():
-    with open("/proc/self/status", encoding="utf-8") as file:
-        return next(float(line.split()[1]) for line in file if line.startswith("VmRSS")) / 2**10
 
 
 def test_without_proc_the_peak_is_that_of_getrusage(monkeypatch):

@@ -40,6 +40,8 @@ def test_a_device_that_is_not_there(cards):
     for name in ("gpu", "cuda:", "cuda:-1", "cuda:x", "cuda1", "mps", "CUDA", ""):
         with pytest.raises(InputError, match="auto, cpu, cuda or cuda:N"):
             find_device(name)
+    with pytest.raises(InputError, match=r"cuda:1` with `executor=ray.*Ray gives each run its GPU"):
+        make_executor(ExecutionOptions(device="cuda:1", executor="ray"))
     with pytest.raises(InputError, match=r"cuda:2 .*torch finds cuda:0 \(card 0\), cuda:1 \(card 1\)\. Expected one"):
         find_device("cuda:2")
     cards(0)
@@ -70,8 +72,3 @@ def test_a_comparison_uses_every_gpu_or_the_named_one(cards, monkeypatch, visibl
     assert executor._gpus == gpus
     if gpus:
         assert executor.slots == len(gpus)
-
-
-def test_a_cluster_chooses_the_gpus_itself():
-    with pytest.raises(InputError, match=r"cuda:1` with `executor=ray.*Ray gives each run its GPU"):
-        make_executor(ExecutionOptions(device="cuda:1", executor="ray"))

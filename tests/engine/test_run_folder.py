@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
+from unittest import mock
 
 import pytest
 
@@ -12,19 +13,9 @@ from coliags_plugin.engine import run_folder
 from coliags_plugin.engine.run_folder import RunFolder
 
 
-@pytest.fixture
-def stopped_clock(monkeypatch):
-    """A clock that stands still."""
-
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz=None):
-            return cls(2026, 1, 2, 3, 4, 5)
-
-    monkeypatch.setattr(run_folder, "datetime", Clock)
-
-
-def test_runs_begun_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch, stopped_clock):
+def test_runs_begun_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
+    clock = mock.Mock(wraps=datetime, **{"now.return_value": datetime(2026, 1, 2, 3, 4, 5)})
+    monkeypatch.setattr(run_folder, "datetime", clock)
     monkeypatch.chdir(tmp_path)
     names = []
     for _ in range(12):
