@@ -10,20 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import map_coordinates
 
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
-from coliags_plugin.reconstruction.structure.matching import (
-    alike_pairs,
-    epipolar_inliers,
-    mutual_matches,
-)
+from coliags_plugin.reconstruction.structure.matching import alike_pairs, epipolar_inliers, mutual_matches
 from coliags_plugin.reconstruction.structure.point_tracks import shared_tracks, track_between, track_points
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings, TrackSettings
 from coliags_plugin.reconstruction.structure.texture import fineness, wall_textures
 from coliags_plugin.reconstruction.structure.video import MatchedVideo, cut_where_lost
 from coliags_plugin.reporting.image_files import write_png
-from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, tube_frames
+from tests.textured_tube import HEIGHT, INTRINSICS, WIDTH, texture, tube_frames
 
 
 def features(pixels, descriptors, scale=2.0):
@@ -117,22 +112,18 @@ COUNT = 7
 FEW = TrackSettings(corners=150)
 
 
-def wall(offset=(0.0, 0.0), size=(120, 160)):
+def wall(offset=(0.0, 0.0)):
     """A textured wall, moved by an offset."""
-    noise = np.random.default_rng(0).normal(size=(60, 70)).cumsum(axis=0).cumsum(axis=1)
-    noise = (noise - noise.mean()) / noise.std()
-    grain = np.random.default_rng(1).normal(size=(60, 70))
-    row, column = np.mgrid[: size[0], : size[1]].astype(float)
-    at = np.stack([(row - offset[1]) / 3.0 + 8.0, (column - offset[0]) / 3.0 + 8.0])
-    value = 120.0 + 20.0 * map_coordinates(noise, at, order=3) + 15.0 * map_coordinates(grain, at, order=3)
-    return np.repeat(np.clip(value, 10, 230).astype(np.uint8)[..., None], 3, axis=2)
+    row, column = np.mgrid[:120, :160].astype(float)
+    places = np.stack([column - offset[0], row - offset[1], 0.0 * row], axis=-1)
+    return np.rint(texture(places / 3.0)).astype(np.uint8)
 
 
-def write_video(folder, images):
-    folder.mkdir()
+def tracked(folder, images, settings=FEW, mask=None):
+    """The points of a video of images."""
     for index, image in enumerate(images):
         write_png(folder / f"{index}.png", image)
-    return sorted(folder.iterdir())
+    return track_points(sorted(folder.iterdir()), settings, mask)
 
 
 def moved(frames, first, second):
@@ -143,7 +134,7 @@ def moved(frames, first, second):
 
 def test_points_move_as_the_image_does(tmp_path):
     images = [wall(k * SHIFT) for k in range(COUNT)]
-    frames = track_points(write_video(tmp_path / "video", images), FEW)
+    frames = tracked(tmp_path, images)
     first, last = track_between(images, [None] * COUNT, FEW)
     assert len(first) > 60
     np.testing.assert_allclose(last - first, moved(frames, 0, COUNT - 1)[: len(first)], atol=1e-4)
@@ -156,10 +147,10 @@ def test_points_move_as_the_image_does(tmp_path):
 
 
 def test_larger_images_are_reduced_and_pixels_are_theirs_but_masked_ones(tmp_path):
-    paths = write_video(tmp_path / "video", [wall(k * SHIFT).repeat(2, axis=0).repeat(2, axis=1) for k in range(2)])
+    images = [wall(k * SHIFT).repeat(2, axis=0).repeat(2, axis=1) for k in range(2)]
     mask = np.ones((240, 320), bool)
     mask[:, 240:] = False
-    frames, again = (track_points(paths, FEW.model_copy(update={"side": 160}), mask) for _ in range(2))
+    frames, again = (tracked(tmp_path, images, FEW.model_copy(update={"side": 160}), mask) for _ in range(2))
     np.testing.assert_allclose(np.median(moved(frames, 0, 1), axis=0), 2 * SHIFT, atol=0.15)
     assert all(frame.pixels[:, 0].max() < 240 for frame in frames)
     np.testing.assert_array_equal(again[1].ids, frames[1].ids)
@@ -169,7 +160,7 @@ def test_larger_images_are_reduced_and_pixels_are_theirs_but_masked_ones(tmp_pat
 def test_points_are_found_again_behind_a_covered_frame(tmp_path):
     images = [wall(k * SHIFT) for k in range(COUNT)]
     images[3] = np.full_like(images[3], 90)
-    frames = track_points(write_video(tmp_path / "video", images), FEW)
+    frames = tracked(tmp_path, images)
     assert frames[3].followed == 0
     assert frames[3].sharpness == 0.0
     shifts = moved(frames, 2, 4)
@@ -181,8 +172,8 @@ def test_the_lamp_drops_out_of_the_texture():
     row = np.linspace(0.4, 1.0, 120)[:, None, None]
     bright, dim = wall(), np.clip(wall() * row, 0, 255).astype(np.uint8)
     inner = slice(20, -20)
-    for texture, dim_texture in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
-        assert np.corrcoef(texture[inner, inner].ravel(), dim_texture[inner, inner].ravel())[0, 1] > 0.95
+    for lit, dim_lit in zip(wall_textures(bright)[:2], wall_textures(dim)[:2], strict=True):
+        assert np.corrcoef(lit[inner, inner].ravel(), dim_lit[inner, inner].ravel())[0, 1] > 0.95
 
 
 def test_points_that_fit_no_motion_are_outliers():

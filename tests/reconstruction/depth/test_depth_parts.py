@@ -68,29 +68,14 @@ def test_sparse_depth_of_the_scene_counts():
     assert depth_range.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
     assert depth_range.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
     np.testing.assert_allclose(depth_range.medians, 40.0, rtol=1e-5)
-
-
-def test_given_ranges_and_frames_without_features():
     assert given_range(10.0, 40.0, 2).medians == (20.0, 20.0)
-    with pytest.raises(InputError, match="0 < near < far"):
-        given_range(0.0, 40.0, 2)
-    flat = torch.full((80, 96, 3), 90, dtype=torch.uint8)
-    frames = [frame.with_maps(image=flat) for frame in wall_frames(sideways(4))]
-    with pytest.raises(InputError, match="the depth range is unknown: 0 points"):
-        find_range(frames, FEATURES)
-
-
-def along(distances):
-    centers = np.zeros((len(distances), 3))
-    centers[:, 0] = distances
-    return centers
 
 
 def chosen(distances, axes=None, sources=None):
-    ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
-    directions, depths = ahead if axes is None else axes, [10.0] * len(distances)
-    sources = sources or range(len(distances))
-    return choose_neighbours(along(distances), directions, sources, depths, (0.1, 0.2))
+    centers = np.zeros((len(distances), 3))
+    centers[:, 0] = distances
+    axes = np.tile([0.0, 0.0, 1.0], (len(distances), 1)) if axes is None else axes
+    return choose_neighbours(centers, axes, sources or range(len(distances)), [10.0] * len(distances), (0.1, 0.2))
 
 
 HALVES = [0.5 * k for k in range(12)]
@@ -128,11 +113,11 @@ FLOAT = np.ones((80, 96), np.float32)
 NOWHERE = np.zeros((80, 96), np.float32)
 
 
-def lit_frame(law=2.0):
-    """A plane of one colour lit by a lamp at the lens: linear intensity ~ depth^-law; and its depth."""
+def lit_frame():
+    """A plane of one colour lit by a lamp at the lens: linear intensity ~ depth^-2; and its depth."""
     frame = wall_frames(sideways(1))[0]
     depth = wall_depth(frame.camera)
-    linear = 0.9 * (depth.min() / depth) ** law
+    linear = 0.9 * (depth.min() / depth) ** 2
     image = np.repeat(np.rint(255.0 * linear ** (1 / 2.2)).astype(np.uint8)[..., None], 3, axis=2)
     return Frame.of("lit", 0, torch.from_numpy(image), frame.camera), depth
 
@@ -150,8 +135,7 @@ def test_a_robust_fit_ignores_a_third_of_outliers():
 def test_brightness_gives_depth():
     frame, depth = lit_frame()
     log_depth = np.log(depth).astype(np.float32)
-    half = FLOAT.copy()
-    half[:, ::2] = 0.0
+    half = np.where(np.arange(96) % 2, FLOAT, 0.0)
     prior = np.exp(LightPrior().log_depth(frame, ALL, log_depth, half, 40.0))
     assert np.abs(prior / depth - 1.0)[5:-5, 5:-5].max() < 0.03
     # Without known depth the law of a lamp at the lens holds.
@@ -204,20 +188,15 @@ def test_confidence_rises_with_support_and_falls_at_edges():
     assert depth_confidence(flat, 3.0 * FLOAT, 0.01 * FLOAT, ALL)[40, 40] < levels[3]
 
 
-def camera_pose(x):
-    matrix = np.eye(4)
-    matrix[0, 3] = x
-    return Pose.of(Camera(60.0, 60.0, 48.0, 40.0, 96, 80, torch.from_numpy(matrix)))
-
-
 def test_points_are_where_three_frames_are_sure():
     image = np.full((80, 96, 3), 100, np.uint8)
     voxels = VoxelPoints(2.0, np.zeros(3))
-    for x in (0.0, 0.3, 0.6):
-        voxels.add(camera_pose(x), 31.0 * FLOAT, FLOAT, image)
     # A fourth frame that disagrees makes no shell, and one without confidence nothing at all.
-    voxels.add(camera_pose(0.9), 41.0 * FLOAT, FLOAT, image)
-    voxels.add(camera_pose(1.2), 51.0 * FLOAT, 0.5 * FLOAT, image)
+    for x, depth, confidence in ((0.0, 31, 1), (0.3, 31, 1), (0.6, 31, 1), (0.9, 41, 1), (1.2, 51, 0.5)):
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[0, 3] = x
+        pose = Pose.of(Camera(60.0, 60.0, 48.0, 40.0, 96, 80, matrix))
+        voxels.add(pose, np.float32(depth) * FLOAT, np.float32(confidence) * FLOAT, image)
     positions, colors = voxels.points()
     np.testing.assert_allclose(positions[:, 2], 31.0, atol=1e-4)
     assert (colors == 100).all()
@@ -260,12 +239,8 @@ def test_files_that_do_not_fit_are_refused(tmp_path):
         FilePrior.of(tmp_path, [frame])
 
 
-def grid(size=12):
-    return np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).reshape(-1, 2) * 5.0
-
-
 def test_a_point_unlike_its_neighbours_stands_out_and_an_edge_does_not():
-    pixels = grid()
+    pixels = np.stack(np.meshgrid(np.arange(12), np.arange(12)), axis=-1).reshape(-1, 2) * 5.0
     log_depth = np.where(pixels[:, 0] < 30.0, 3.0, 4.0)
     clean = difference_from_neighbours(pixels, log_depth)
     np.testing.assert_array_equal(clean, 0.0)
