@@ -69,9 +69,8 @@ def test_points_that_are_seen_for_long_carry_the_scale(long, is_weak):
         assert not links[GAP - 1].holds
 
 
-@pytest.mark.parametrize(
-    ("link", "holds", "reason"),
-    [
+def test_too_few_common_points_tell_no_scale():
+    for link, holds, reason in (
         (Link(0, 19, None, None, spanning=4), False, ""),
         (Link(0, 20, None, None, spanning=4), True, ""),
         (Link(0, 99, None, None, spanning=3), False, ""),
@@ -80,10 +79,8 @@ def test_points_that_are_seen_for_long_carry_the_scale(long, is_weak):
         (Link(0, 9, 0.0, 0.2), False, ""),
         (Link(0, 3, None, None), False, "too few to compare"),
         (Link(0, 99, None, None), False, "not mapped together"),
-    ],
-)
-def test_too_few_common_points_tell_no_scale(link, holds, reason):
-    assert link.holds == holds and reason in link.reason
+    ):
+        assert link.holds == holds and reason in link.reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
@@ -156,11 +153,6 @@ def test_adjustment_brings_poses_back_and_leaves_outliers_out():
     assert not model.images[5].points2D[3].has_point3D()
 
 
-@pytest.fixture(scope="module")
-def tracked(tmp_path_factory):
-    return reconstruct(list_images(write_tube(tmp_path_factory.mktemp("tube") / "scene", 8, 2.0) / "images"), TRACKED)
-
-
 @pytest.mark.thorough
 def test_blurred_images_get_no_poses(tmp_path):
     images = list_images(write_tube(tmp_path / "scene", 8, 2.0) / "images")
@@ -197,7 +189,8 @@ def test_a_wall_that_moves_is_split(tmp_path, monkeypatch, caplog):
     assert "what is seen moves, as rigid for 10 frames: split in 2 models" in caplog.text
 
 
-def test_tracks_give_every_frame_a_pose_and_the_atlas_is_written(tracked, tmp_path):
+def test_tracks_give_every_frame_a_pose_and_the_atlas_is_written(tmp_path):
+    tracked = reconstruct(list_images(write_tube(tmp_path / "tube", 8, 2.0) / "images"), TRACKED)
     assert tracked.lost == {} and tracked.submaps() == [(0, range(8))]
     assert tracked.largest.registered == tuple(range(8))
     assert tracked.largest.test_error < 0.6

@@ -280,29 +280,26 @@ def test_folders_without_images_are_refused(tmp_path):
 # Images, masks and settings
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".bmp"])
-@pytest.mark.parametrize("kind", ["grey", "16 bits", "alpha"])
-def test_images_are_written_as_readers_take_them(atlas, largest, tmp_path, suffix, kind):
-    if suffix in {"grey": (), "16 bits": (".jpg", ".bmp"), "alpha": (".jpg", ".bmp")}[kind]:
-        return
-    change = {
-        "grey": lambda rgb: rgb[..., 1],
-        "16 bits": lambda rgb: rgb.astype(np.uint16) * 257,
-        "alpha": lambda rgb: np.dstack([rgb, np.where(np.arange(rgb.shape[1]) < 40, 0, 255)[None].repeat(len(rgb), 0)]),
-    }[kind]
+KINDS = ("grey", "16 bits", "alpha")
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [("grey", ".jpg"), ("grey", ".bmp"), *((kind, suffix) for kind in KINDS for suffix in (".png", ".tif"))],
+)
+def test_images_are_written_as_readers_take_them(atlas, largest, tmp_path, kind, suffix):
     expected = {path.stem: read_rgb(path) for path in largest.images}
-    images = [tmp_path / f"{stem}{suffix}" for stem in expected]
+    images = tuple(tmp_path / f"{stem}{suffix}" for stem in expected)
     for path, rgb in zip(images, expected.values(), strict=True):
-        pixels = change(rgb)
-        write_image(path, pixels.astype(np.uint8) if kind == "alpha" else pixels)
+        shown = np.where(np.arange(rgb.shape[1]) < 40, 0, 255).astype(np.uint8)[None].repeat(len(rgb), 0)
+        kinds = {"grey": rgb[..., 1], "16 bits": rgb.astype(np.uint16) * 257, "alpha": np.dstack([rgb, shown])}
+        write_image(path, kinds[kind])
     model = pycolmap.Reconstruction(largest.model)
     for image in model.images.values():
         image.name = Path(image.name).stem + suffix
-    names = tuple(path.name for path in images)
-    changed = replace(largest, model=model, images=tuple(images), names=names)
-    write_sfm_scene(tmp_path / "scene", replace(atlas, images=tuple(images), models=(changed,)))
-    scene = open_scene(tmp_path / "scene", options=["split=all-train"])
-    for frame in scene.train:
+    changed = replace(largest, model=model, images=images, names=tuple(path.name for path in images))
+    write_sfm_scene(tmp_path / "scene", replace(atlas, images=images, models=(changed,)))
+    for frame in open_scene(tmp_path / "scene", options=["split=all-train"]).train:
         rgb = expected[frame.name]
         rgb = np.dstack([rgb[..., 1]] * 3) if kind == "grey" else rgb
         np.testing.assert_allclose(frame.image.numpy().astype(int), rgb, atol=12 if suffix == ".jpg" else 0)

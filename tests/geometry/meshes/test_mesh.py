@@ -22,30 +22,26 @@ from coliags_plugin.geometry.meshes.truth import (
 )
 from tests.surface.coverage.tubes import plane as grid_square
 
-
-@pytest.fixture
-def two_triangles():
-    vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]], np.float32)
-    colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
-    return TriangleMesh(vertices, np.array([[0, 1, 2], [0, 3, 1]]), colors)
+CORNERS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]], np.float32)
+TWO = TriangleMesh(CORNERS, np.array([[0, 1, 2], [0, 3, 1]]), np.arange(15, dtype=np.uint8).reshape(5, 3))
 
 
-def test_areas_normals_centers_and_the_border_of_edges_of_one_triangle(two_triangles):
-    assert two_triangles.areas == pytest.approx([3.0, 4.0])
-    assert two_triangles.normals == pytest.approx(np.array([[0, 0, 1], [0, 1, 0]]))
-    assert two_triangles.centers == pytest.approx(np.array([[2 / 3, 1, 0], [2 / 3, 0, 4 / 3]]))
+def test_areas_normals_centers_and_the_border_of_edges_of_one_triangle():
+    assert TWO.areas == pytest.approx([3.0, 4.0])
+    assert TWO.normals == pytest.approx(np.array([[0, 0, 1], [0, 1, 0]]))
+    assert TWO.centers == pytest.approx(np.array([[2 / 3, 1, 0], [2 / 3, 0, 4 / 3]]))
     flat = TriangleMesh(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]), np.array([[0, 1, 2]]))
     assert flat.areas == pytest.approx([0.0]) and flat.normals == pytest.approx(np.zeros((1, 3)))
-    assert sorted(map(tuple, two_triangles.border)) == [(0, 3), (1, 2), (2, 0), (3, 1)]
-    assert two_triangles.on_border.tolist() == [True, True, True, True, False]
+    assert sorted(map(tuple, TWO.border)) == [(0, 3), (1, 2), (2, 0), (3, 1)]
+    assert TWO.on_border.tolist() == [True, True, True, True, False]
 
 
-def test_a_part_keeps_places_and_colours_of_its_triangles_only(two_triangles):
-    part = two_triangles.part(np.array([False, True]))
+def test_a_part_keeps_places_and_colours_of_its_triangles_only():
+    part = TWO.part(np.array([False, True]))
     assert len(part) == 1
     assert len(part.vertices) == 3
-    assert part.vertices[part.triangles] == pytest.approx(two_triangles.vertices[two_triangles.triangles[[1]]])
-    assert np.array_equal(part.colors[part.triangles], two_triangles.colors[two_triangles.triangles[[1]]])
+    assert part.vertices[part.triangles] == pytest.approx(TWO.vertices[TWO.triangles[[1]]])
+    assert np.array_equal(part.colors[part.triangles], TWO.colors[TWO.triangles[[1]]])
 
 
 def squares(*edges: float) -> TriangleMesh:
@@ -153,7 +149,7 @@ def test_damaged_files_are_refused(name, content, message, tmp_path):
         read_mesh(tmp_path / "gone.ply")
 
 
-VERTICES = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0.25 0.5\nvt 0.75 0.5\n"
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0.25 0.5\nvt 0.75 0.5\n"
 
 
 def test_a_phantom_whose_flags_of_another_mesh_are_refused(tmp_path):
@@ -177,7 +173,7 @@ def test_a_phantom_whose_flags_of_another_mesh_are_refused(tmp_path):
     "faces", ["f 1/1 2/1 3/1\nf 1/2 3/2 4/2\n", "vn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf -4/2/1 -2/2/1 -1/2/1\n"]
 )
 def test_c3vd_and_faces_of_any_form(tmp_path, faces):
-    (tmp_path / "coverage_mesh.obj").write_text(VERTICES + faces)
+    (tmp_path / "coverage_mesh.obj").write_text(SQUARE + faces)
     surface = read_true_surface(tmp_path)
     assert surface.seen.tolist() == [True, False]
     assert "vt 1" in surface.seen_by
@@ -186,23 +182,18 @@ def test_c3vd_and_faces_of_any_form(tmp_path, faces):
 
 def test_a_mesh_alone_says_nothing_about_what_was_seen(tmp_path):
     write_mesh(tmp_path / "wall.ply", squares(1))
-    surface = read_true_surface(tmp_path / "wall.ply")
-    assert surface.seen.all() and surface.seen_by == ""
-    # Other texture indices are no flags.
-    (tmp_path / "textured.obj").write_text(VERTICES + "vt 1 1\nf 1/1 2/2 3/3\n")
-    assert read_true_surface(tmp_path / "textured.obj").seen_by != ""
+    (tmp_path / "textured.obj").write_text(SQUARE + "vt 1 1\nf 1/3 2/3 3/3\n")  # other indices are no flags
+    for name in ("wall.ply", "textured.obj"):
+        surface = read_true_surface(tmp_path / name)
+        assert surface.seen.all() and surface.seen_by == ""
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [(None, r"no true surface.*coverage_mesh\.obj"), (VERTICES + "f 1/2 2/2 3/2\n", "marks no triangle")],
-)
-def test_a_scene_without(tmp_path, text, message):
-    if text is None:
-        assert find_true_surface(tmp_path) is None
-    else:
-        (tmp_path / "coverage_mesh.obj").write_text(text)
-    with pytest.raises(InputError, match=message):
+def test_a_scene_without_a_true_surface(tmp_path):
+    assert find_true_surface(tmp_path) is None
+    with pytest.raises(InputError, match=r"no true surface.*coverage_mesh\.obj"):
+        read_true_surface(tmp_path)
+    (tmp_path / "coverage_mesh.obj").write_text(SQUARE + "f 1/2 2/2 3/2\n")
+    with pytest.raises(InputError, match="marks no triangle"):
         read_true_surface(tmp_path)
 
 

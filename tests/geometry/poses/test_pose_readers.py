@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import astuple
 from unittest import mock
 
 import numpy as np
@@ -46,13 +47,10 @@ def test_quaternions_by_the_formula(numbers):
     assert min(np.abs(back - sign * quat / np.linalg.norm(quat)).max() for sign in (1, -1)) < 1e-7
 
 
-@pytest.mark.parametrize("quat", [[0, 0, 0, 0], [1e-12, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
-def test_what_is_no_rotation_is_refused(quat):
-    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is not a rotation"):
-        rotations_from_wxyz(np.array([[1, 0, 0, 0], quat], float), lambda index: f"frame {index}", unit=False)
-
-
-def test_small_angles_are_exact():
+def test_what_is_no_rotation_is_refused_and_small_angles_are_exact():
+    for quat in ([0, 0, 0, 0], [1e-12, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]):
+        with pytest.raises(InputError, match=r"frame 1: the quaternion .* is not a rotation"):
+            rotations_from_wxyz(np.array([[1, 0, 0, 0], quat], float), lambda index: f"frame {index}", unit=False)
     turn = Rotation.from_rotvec([[1e-7, 0, 0], [0, np.pi, 0]]).as_matrix()
     np.testing.assert_allclose(rotation_angles_deg(turn), np.rad2deg([1e-7, np.pi]), rtol=1e-6)
 
@@ -83,20 +81,18 @@ def test_tum_in_every_spelling(tmp_path, comment, separator, encoding):
     np.testing.assert_array_equal(read.timestamps, trajectory.timestamps)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
+def test_tum_almost(tmp_path):
+    path = tmp_path / "poses.txt"
+    for line, message in (
         ("0 0.5 1 2 3 0 0 0 1", "line 2: '0 0.5 1 2 3 0 0 0 1'. Expected 8 finite numbers"),
         ("0,5 1,0 2,0 3,0 0,0 0,0 0,0 1,0", "line 2: '0,5 1,0 .*with decimal points"),
         ("0,5;1,0;2,0;3,0;0,0;0,0;0,0;1,0", "line 2: '0,5;1,0;.*with decimal points"),
-    ],
-)
-def test_tum_almost(tmp_path, line, message):
-    (tmp_path / "poses.txt").write_text(f"# a comment\n{line}\n")
-    with pytest.raises(InputError, match=message):
-        tum.read(tmp_path / "poses.txt")
-    with pytest.raises(InputError, match=re.escape(f"'{line}'")):
-        format_of(tmp_path / "poses.txt")
+    ):
+        path.write_text(f"# a comment\n{line}\n")
+        with pytest.raises(InputError, match=message):
+            tum.read(path)
+        with pytest.raises(InputError, match=re.escape(f"'{line}'")):
+            format_of(path)
 
 
 def stored_w_first(path, trajectory, names=""):
@@ -118,17 +114,6 @@ def smooth(seed: int, forward: bool, count: int = 40) -> Trajectory:
 
 
 @pytest.mark.parametrize(
-    "names",
-    [f"# {W_FIRST}", W_FIRST.replace(" ", ","), "#timestamp [ns], p_x, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"],
-)
-def test_names_of_columns_may_put_w_first(tmp_path, caplog, names):
-    trajectory = winding(5)
-    read = tum.read(stored_w_first(tmp_path / "poses.txt", trajectory, names))
-    np.testing.assert_allclose(read.camera_to_world, trajectory.camera_to_world, atol=1e-12)
-    assert "w first" in read.stored_as and not caplog.messages
-
-
-@pytest.mark.parametrize(
     "trajectory",
     [
         Trajectory(np.linalg.inv(winding(6).camera_to_world[0]) @ winding(6).camera_to_world),
@@ -136,14 +121,16 @@ def test_names_of_columns_may_put_w_first(tmp_path, caplog, names):
         *(smooth(seed, forward=True) for seed in (0, 1)),
     ],
 )
-def test_w_first_is_suspected_where_it_explains_the_path(tmp_path, caplog, trajectory):
+def test_names_of_columns_may_put_w_first_which_is_suspected_where_it_explains_the_path(tmp_path, caplog, trajectory):
     path = stored_w_first(tmp_path / "poses.txt", trajectory)
     tum.read(path)
     assert "look as if w came first" in caplog.text and f"'# {W_FIRST}'" in caplog.text
     caplog.clear()
-    stored_w_first(path, trajectory, f"# {W_FIRST}")
-    np.testing.assert_allclose(tum.read(path).camera_to_world, trajectory.camera_to_world, atol=1e-12)
-    assert not caplog.messages
+    euroc = "#timestamp [ns], p_x, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+    for names in (f"# {W_FIRST}", W_FIRST.replace(" ", ","), euroc):
+        read = tum.read(stored_w_first(path, trajectory, names))
+        np.testing.assert_allclose(read.camera_to_world, trajectory.camera_to_world, atol=1e-12)
+        assert "w first" in read.stored_as and not caplog.messages
 
 
 @given(seed=st.integers(0, 2**31), forward=st.booleans(), count=st.sampled_from([1, 2, 3, 12, 60]))
@@ -159,10 +146,9 @@ def test_w_last_is_not_suspected(tmp_path_factory, seed, forward, count):
 
 
 def transforms(path, matrices, names=None, frame=None, **content):
-    names = names or [f"{index}.png" for index in range(len(matrices))]
     frames = [
-        {"file_path": name, "transform_matrix": np.asarray(matrix).tolist(), **(frame or {})}
-        for name, matrix in zip(names, matrices, strict=True)
+        {"file_path": names[index] if names else f"{index}.png", "transform_matrix": matrix.tolist(), **(frame or {})}
+        for index, matrix in enumerate(matrices)
     ]
     path.write_text(json.dumps({**content, "frames": frames}))
     return path
@@ -224,9 +210,7 @@ def test_intrinsics(tmp_path, content, frame, expected, remark):
         assert read.intrinsics is None
         assert remark in read.remarks[-1]
     else:
-        k = read.intrinsics
-        numbers = (k.fx, k.fy, k.cx, k.cy, k.width, k.height)
-        np.testing.assert_allclose(numbers, expected)
+        np.testing.assert_allclose(astuple(read.intrinsics), expected)
         assert not read.remarks
     if content is PINHOLE:
         changed = json.loads((tmp_path / "t.json").read_text())
@@ -236,12 +220,7 @@ def test_intrinsics(tmp_path, content, frame, expected, remark):
         assert several == ("no common pinhole: the images have 2 different cameras",)
 
 
-def frames(matrix, **content):
-    """The content of a file with a frame of this matrix."""
-    return {**content, "frames": [{"file_path": "a", "transform_matrix": matrix}]}
-
-
-IDENTITY = np.eye(4).tolist()
+FRAME = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
 
 
 @pytest.mark.parametrize(
@@ -249,11 +228,11 @@ IDENTITY = np.eye(4).tolist()
     [
         ([1], "holds a JSON list"),
         ({"frames": [3]}, "frame 0: no file_path"),
-        (frames([[1, 2], [3]]), "4 .or 3. rows of 4 finite numbers"),
-        (frames(IDENTITY, applied_transform="x"), "applied_transform is not a matrix"),
-        (frames(IDENTITY, applied_scale=0), "applied_scale is 0"),
-        (frames(IDENTITY, applied_scale=True), "applied_scale is True"),
-        (frames(IDENTITY, **{**PINHOLE, "w": 0}), "t.json: intrinsics .* image 0 x 48"),
+        ({"frames": [{**FRAME, "transform_matrix": [[1, 2], [3]]}]}, "4 .or 3. rows of 4 finite numbers"),
+        ({"frames": [FRAME], "applied_transform": "x"}, "applied_transform is not a matrix"),
+        ({"frames": [FRAME], "applied_scale": 0}, "applied_scale is 0"),
+        ({"frames": [FRAME], "applied_scale": True}, "applied_scale is True"),
+        ({"frames": [FRAME], **PINHOLE, "w": 0}, "t.json: intrinsics .* image 0 x 48"),
     ],
 )
 def test_broken_transforms_are_refused(tmp_path, content, message):
