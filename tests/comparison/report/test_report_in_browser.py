@@ -230,13 +230,3 @@ def test_a_dark_page_is_dark(browser, page):
         colors.append(browser.run("getComputedStyle(document.body).backgroundColor"))
     browser.dark(False)
     assert colors == ["rgb(255, 255, 255)", "rgb(20, 23, 27)"]
-
-
-def test_a_console_error_would_be_seen(browser, tmp_path):
-    """A page that fails in three ways, which the driver reports."""
-    broken = tmp_path / "broken.html"
-    broken.write_text("<img src='missing.png'><script>console.error('one'); undefinedFunction();</script>")
-    browser.open(broken, DESKTOP)
-    errors = " ".join(browser.errors())
-    assert "one" in errors and "undefinedFunction" in errors and "ERR_FILE_NOT_FOUND" in errors
-    assert len(browser.requests()) == 2

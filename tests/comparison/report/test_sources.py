@@ -21,12 +21,6 @@ def refuses(paths, match, **options):
         read_study(paths, **options)
 
 
-def written(tmp_path, result):
-    path = tmp_path / f"{result.key}.json"
-    write_result(path, result)
-    return path
-
-
 def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
     result = result_of("coliags")
     run = write_run(tmp_path / "run", result)
@@ -42,9 +36,9 @@ def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
 
 
 def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
-    result, other = result_of("coliags"), result_of("3dgs")
-    run = write_run(tmp_path / "run", result)
-    file = written(tmp_path, result)
+    result = result_of("coliags")
+    run, file = write_run(tmp_path / "run", result), tmp_path / "result.json"
+    write_result(file, result)
     folder = write_comparison(tmp_path / "comparison", [result])
     for path in (run, file, folder, folder / "results"):
         study = read_study([path])
@@ -52,8 +46,8 @@ def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
         assert study.missing == ()
     assert read_study([run]).runs[0].run == run
     assert read_study([file]).runs[0].run is None
-    mixed = read_study([run, written(tmp_path, other)])
-    assert mixed.methods == ["coliags", "3dgs"]
+    other = write_run(tmp_path / "other", result_of("3dgs"))
+    assert read_study([file, other]).methods == ["coliags", "3dgs"]
 
 
 def test_some_methods_alone_in_the_order_asked_for(tmp_path):
@@ -94,12 +88,6 @@ def compared(tmp_path):
     return folder
 
 
-def holm_of(study):
-    (test_set,) = [each for each in study.test_sets if each.set_name == "test"]
-    column = Column("psnr", direction="higher")
-    return {row.rival: row.tests.wilcoxon_holm for row in compare(test_set, column, "coliags")}
-
-
 def test_the_family_is_all_that_was_planned_shown_or_not(compared):
     def values(study, method):
         return [run.result.sets["test"].mean("psnr") for run in study.runs if run.method == method]
@@ -110,7 +98,9 @@ def test_the_family_is_all_that_was_planned_shown_or_not(compared):
         rivals = [name for name in study.methods if name != "coliags"]
         raw = [stats.wilcoxon(values(study, "coliags"), values(study, name)).pvalue for name in rivals]
         expected = multipletests([*raw, *[1.0] * (4 - len(raw))], method="holm")[1]  # the others may have any p
-        assert [holm_of(study)[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
+        rows = compare(study.test_sets[0], Column("psnr", direction="higher"), "coliags")
+        adjusted = {row.rival: row.tests.wilcoxon_holm for row in rows}
+        assert [adjusted[name] for name in rivals] == pytest.approx(expected[: len(raw)].tolist())
         page = report_page(study, ReportOptions())
         text = " ".join(block.text for block in page.sections[0].blocks if isinstance(block, Paragraph))
         assert "after Holm's adjustment for 4 rivals: every method that was planned or given." in text
@@ -118,16 +108,12 @@ def test_the_family_is_all_that_was_planned_shown_or_not(compared):
 
 def test_a_decision_holds_where_all_plans_have_it(tmp_path):
     decision = {"reference": "coliags", "primary": ["psnr"], "date": "2026-11-01"}
-    folders = [
-        write_comparison(tmp_path / name, [result_of(name, scene) for scene in "pq"]) for name in ("coliags", "3dgs")
-    ]
-    for folder, name in zip(folders, ("coliags", "3dgs"), strict=True):
-        write_plan(folder, [result_of(name, scene) for scene in "pq"], decided=decision)
-    study = read_study(folders)
-    assert study.decided.primary == ("psnr",)
-    write_plan(folders[1], [result_of("3dgs", scene) for scene in "pq"])
-    study = read_study(folders)
-    assert study.decided is None
+    results = {tmp_path / name: [result_of(name, scene) for scene in "pq"] for name in ("coliags", "3dgs")}
+    for folder, each in results.items():
+        write_plan(write_comparison(folder, each), each, decided=decision)
+    assert read_study([*results]).decided.primary == ("psnr",)
+    write_plan(folder, each)
+    assert read_study([*results]).decided is None
 
 
 def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
@@ -139,7 +125,7 @@ def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
     assert [cell.run for cell in read_study([folder]).runs] == [run, run, None]
 
 
-def test_nothing_is_refused(tmp_path):
+def test_nothing_what_was_not_evaluated_and_what_is_there_twice_are_refused(tmp_path):
     refuses([], "no results")
     refuses([tmp_path / "none"], "none.json|none")
     refuses([tmp_path], "holds no results")
@@ -147,27 +133,19 @@ def test_nothing_is_refused(tmp_path):
     refuses([tmp_path], "holds no results. Expected at least one finished cell")
     failed = write_comparison(tmp_path / "f", [], [("cecum", "3dgs", 0, "no <memory>")])
     refuses([failed], "holds no results of 1 cells; 3dgs on cecum: no <memory>")
-
-
-def test_what_was_not_evaluated_is_refused(tmp_path):
     run = write_run(tmp_path / "run", result_of("coliags"))
     refuses([run], f"Run `coliags eval {run} --protocol authors-code` first", protocol="authors-code")
     refuses([run, run / ".." / "run"], "twice")
 
 
-@pytest.mark.parametrize(
-    ("kind", "content", "match"),
-    [
-        ("results", "{", "is not JSON"),
-        ("results", "{}", "not a results file"),
-        ("failures", "{", "is not JSON"),
-    ],
-)
-def test_a_damaged_file_is_refused_by_name(tmp_path, kind, content, match):
+def test_a_damaged_file_is_refused_by_name(tmp_path):
     folder = write_comparison(tmp_path, [result_of("coliags")], [("cecum", "3dgs", 0, "")])
-    (file,) = folder.glob(f"{kind}/*/*/*.json")
-    file.write_text(content)
-    refuses([folder], f"{file.name}.*{match}")
+    for kind, content, match in (("failures", "{", "is not JSON"), ("results", "{}", "not a results file")):
+        (file,) = folder.glob(f"{kind}/*/*/*.json")
+        whole = file.read_text()
+        file.write_text(content)
+        refuses([folder], f"{file.name}.*{match}")
+        file.write_text(whole)
 
 
 @pytest.mark.parametrize(
@@ -179,41 +157,26 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, kind, content, match):
         ({"split": "block"}, "coliags has cecum by split 'every-8th', the other methods have cecum by split 'block'"),
         ({"train": ("0001", "0003")}, r"training set has 2 and 2 frames, which differ in 0002, 0003"),
         ({"frames": FRAMES | {"test": (*FRAMES["test"][:-1], "0037")}}, "5 and 5 frames, which differ in 0036, 0037"),
-        ({"frames": {"test": ("0004",)}}, "5 and 1 frames"),
+        ({"truth_sha256": "f" * 64}, "true images or depths of set 'test' differ"),
         ({"frames": {"test": FRAMES["test"]}}, "set 'rotation' has 2 and 0 frames"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(study_of, options, match):
+    other = {name: value for name, value in options.items() if name == "truth_sha256"}
+    rival = result_of("3dgs", **{name: value for name, value in options.items() if name not in other})
+    sets = {name: part.model_copy(update=other) for name, part in rival.sets.items()}
     with pytest.raises(InputError, match=match):
-        study_of([result_of("coliags"), result_of("3dgs", **options)])
+        study_of([result_of("coliags"), rival.model_copy(update={"sets": sets})])
 
 
-def test_other_true_images_are_refused(study_of):
-    other = result_of("3dgs")
-    moved = {name: part.model_copy(update={"truth_sha256": "f" * 64}) for name, part in other.sets.items()}
-    with pytest.raises(InputError, match="true images or depths of set 'test' differ"):
-        study_of([result_of("coliags"), other.model_copy(update={"sets": moved})])
-
-
-def test_another_scene_may_have_another_size_and_other_sets(study_of):
-    results = [result_of(method, **options) for method in ("a", "b") for options in ({}, OTHER_SCENE)]
-    study = study_of(results)
-    assert study.scenes == ["cecum", "sigmoid"]
-    assert study.test_sets[1].scenes == ["cecum"]
-    assert [(each.split, each.set_name) for each in study.test_sets] == [
-        ("every-8th", "test"),
-        ("every-8th", "rotation"),
-    ]
-
-
-OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
-
-
-def test_splits_are_parts_of_their_own(study_of):
-    study = study_of([result_of(method, split=split) for split in ("every-8th", "block") for method in ("a", "b")])
+def test_scenes_may_differ_in_size_and_sets_and_splits_are_parts_of_their_own(study_of):
+    other_scene = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
+    options = ({}, other_scene, {"split": "block"})
+    study = study_of([result_of(method, **each) for each in options for method in ("a", "b")])
+    assert study.scenes == ["cecum", "sigmoid"] and study.methods == ["a", "b"]
     expected = [(split, name) for split in ("every-8th", "block") for name in ("test", "rotation")]
     assert [(each.split, each.set_name) for each in study.test_sets] == expected
-    assert study.methods == ["a", "b"]
+    assert study.test_sets[1].scenes == ["cecum"]
 
 
 @pytest.mark.parametrize(
