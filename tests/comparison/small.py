@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -55,30 +52,6 @@ def hashes(folder: Path) -> dict[str, str]:
     return by_place
 
 
-def trainings(folder: Path) -> dict[str, list[int]]:
-    """Steps from which training was started or resumed, by run."""
-    return {
-        path.relative_to(folder / "logs").with_suffix("").as_posix(): [
-            int(step) for step in re.findall(r"training from step (\d+)", path.read_text(encoding="utf-8"))
-        ]
-        for path in sorted((folder / "logs").rglob("*.log"))
-    }
-
-
-def start_compare(methods, wall, folder, steps, *words, stderr=subprocess.PIPE):
-    """``coliags compare`` as a process, alone in its group; each run on one CPU thread."""
-    argv = ["compare", *methods, "--scenes", wall, "--output", folder, "--steps", steps, "--threads", 1, *words]
-    sets = [word for each in OFTEN for word in ("--set", each)]
-    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]
-    return subprocess.Popen([*command, "--device", "cpu", *sets], stderr=stderr, text=True, start_new_session=True)
-
-
-def undisturbed_hashes(methods, wall, folder, steps):
-    """Hashes of a comparison that nobody disturbs, each run on one CPU thread."""
-    assert not compare_inline(methods, [wall], folder, steps=steps, overrides=OFTEN).failures
-    return hashes(folder)
-
-
 def lock_holder(folder, pattern):
     """A process that one of these locks names, at work or killed; None where nobody has one."""
     for lock in folder.glob(pattern):
@@ -94,11 +67,3 @@ def until(what, value):
         assert time.monotonic() < end, f"no {what}"
         time.sleep(0.005)
     return result
-
-
-def check_logs(folder, steps):
-    """Every run has logged every step once, and went on from further and further steps."""
-    for run, begun in trainings(folder).items():
-        log = (folder / "runs" / run / "metrics.jsonl").read_text(encoding="utf-8")
-        assert [json.loads(line)["step"] for line in log.splitlines()] == list(range(1, steps + 1))
-        assert begun[0] == 0 and begun == sorted(set(begun)), f"{run} was begun at {begun}"
