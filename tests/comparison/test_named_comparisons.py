@@ -35,6 +35,9 @@ def test_every_shipped_benchmark_is_valid_and_described(name):
         name_of_format = entry.format or benchmark.format
         config = load_method("coliags", benchmark.overrides(scene), name_of_format).config
         assert config.datamanager.settings.split == (benchmark.split or "every-8th")
+    if name == "c3vd-endogslam":
+        assert len(benchmark.scenes) == 10 and benchmark.scenes.keys() < load_benchmark("c3vd").scenes.keys()
+        assert (benchmark.split, benchmark.format) == ("endogslam", "c3vd-endogslam")
 
 
 def test_c3vd_is_the_official_list(shared_data):
@@ -45,12 +48,6 @@ def test_c3vd_is_the_official_list(shared_data):
     assert {name: entry.folders(name) for name, entry in scenes.items()} == {
         old: (old, new) for old, new in official.items()
     }
-
-
-def test_the_ten_of_endogslam_are_of_c3vd():
-    ten = load_benchmark("c3vd-endogslam")
-    assert len(ten.scenes) == 10 and ten.scenes.keys() < load_benchmark("c3vd").scenes.keys()
-    assert (ten.split, ten.format) == ("endogslam", "c3vd-endogslam")
 
 
 def test_options_become_changes_of_the_data_manager(written):
@@ -69,23 +66,15 @@ def test_options_become_changes_of_the_data_manager(written):
 @pytest.mark.parametrize(
     ("load", "text", "message"),
     [
-        (load_benchmark, "", "mine.yaml:1: scenes: is missing"),
         (load_benchmark, "scenes: {}", "mine.yaml:2: scenes"),
         (load_benchmark, "scenes:\n  a: {phantm: {seed: 0}}", r"mine.yaml:3: scenes.a.phantm: unknown key 'phantm'"),
         (load_benchmark, "scenes:\n  a:\n    phantom: {seeds: 0}", "mine.yaml:4: scenes.a.phantom.seeds: .*'seeds'"),
-        (
-            load_benchmark,
-            "scenes:\n  a: {phantom: {light: sun}}",
-            "mine.yaml:3: scenes.a.phantom.light: Input should be",
-        ),
         (load_benchmark, "scenes: {../a: {}}", r"scene name '\.\./a'"),
         (load_benchmark, "format: c3dv\nscenes: {a: {}}", "mine.yaml:2: format: .*Did you mean 'c3vd'"),
-        (load_benchmark, "scenes: [a]", "mine.yaml:2: scenes"),
         (load_benchmark, "scenes: {a: {}}\nscenes: {a: {}}", "key 'scenes' is there twice"),
         (load_ablation, "variants: {a: [field.features=8]}", "variant 'a' names no method, and there is no base"),
         (load_ablation, "base: coliags\nvariants: {}", "mine.yaml:3: variants"),
         (load_ablation, "base: coliags\nvariants: {a: {sets: []}}", "unknown key 'sets'.*Did you mean 'set'"),
-        (load_ablation, "base: coliags\nvariants: {a: 3}", "mine.yaml:3: variants.a"),
         (load_ablation, "base: coliags\nvariants: {a: [[[b]]]}", "mine.yaml:3: variants.a.set"),
     ],
 )
@@ -106,33 +95,24 @@ def test_an_unknown_name_says_which_was_meant(written):
 # Ablations
 
 
-@pytest.mark.parametrize("name", shipped(ABLATIONS))
-def test_every_shipped_ablation_is_valid_and_described(name):
-    assert descriptions(shipped(ABLATIONS))[name]
-    for variant in load_ablation(name):
-        assert load_method(variant.method, variant.overrides).config
-
-
-def heads(variant):
-    field = load_method(variant.method, variant.overrides).config.field.settings
-    return field.geometry_head, field.appearance_head
-
-
-def test_variants_have_what_their_names_say():
-    for variant in load_ablation("paper-rows"):
-        parts, (geometry, appearance) = {*variant.name.split("-")}, heads(variant)
-        sees_distance = appearance.name == "plain" and appearance.settings.distance
-        has_depth = "depth" in load_method(variant.method, variant.overrides).config.losses
-        used = (geometry.name == "imve", appearance.name == "imia", sees_distance, has_depth)
-        assert used == tuple(part in parts for part in ("imve", "imia", "distance", "depth"))
-    for variant in load_ablation("rivals"):
-        config = load_method(variant.method, variant.overrides).config
-        supervised = "depth" in config.losses
-        assert supervised != (variant.name.endswith("no-depth") or variant.name in ("scaffold-gs", "3dgs", "2dgs"))
-        assert ("exposure" in config.modules) == (variant.name.endswith("gain") or variant.name == "coliags-plus")
-    for variant in load_ablation("embedding-sizes"):
-        geometry, appearance = heads(variant)
-        assert variant.name == f"{geometry.settings.frequencies}-{appearance.settings.frequencies}"
+@pytest.mark.parametrize("ablation", shipped(ABLATIONS))
+def test_every_shipped_ablation_is_described_and_its_variants_have_what_their_names_say(ablation):
+    assert descriptions(shipped(ABLATIONS))[ablation]
+    for variant in load_ablation(ablation):
+        config, name = load_method(variant.method, variant.overrides).config, variant.name
+        has_depth = "depth" in config.losses
+        if ablation == "rivals":
+            assert has_depth != (name.endswith("no-depth") or name in ("scaffold-gs", "3dgs", "2dgs"))
+            assert ("exposure" in config.modules) == (name.endswith("gain") or name == "coliags-plus")
+        elif ablation in ("paper-rows", "embedding-sizes"):
+            geometry, appearance = config.field.settings.geometry_head, config.field.settings.appearance_head
+            sees_distance = appearance.name == "plain" and appearance.settings.distance
+            uses = (geometry.name == "imve", appearance.name == "imia", sees_distance, has_depth)
+            parts = [part in name.split("-") for part in ("imve", "imia", "distance", "depth")]
+            if ablation == "paper-rows":
+                assert [*uses] == parts
+            else:
+                assert name == f"{geometry.settings.frequencies}-{appearance.settings.frequencies}"
 
 
 def test_short_forms(written, tmp_path):
@@ -196,11 +176,10 @@ def test_scenes_that_cannot_be_meant(tmp_path, names, data, message):
     ("changes", "message"),
     [
         ({}, None),
-        ({"wave": 2.0}, r"wave 2\.0 instead of 0\.0"),
         ({"seed": 4}, "another phantom than the benchmark's: seed 4 instead of 3"),
         (
             {"tilt": 1.0},
-            r"tilt 1\.0 instead of 'none'\. .*as this version makes it.*Remove it, so that it is made again",
+            r"tilt 1\.0 instead of 'none'\. .*as this version makes it.*Remove it, so that it is made",
         ),
         (None, "is not a phantom"),
     ],

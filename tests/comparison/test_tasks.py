@@ -48,37 +48,24 @@ def test_the_environment_names_threads_package_and_variables(task):
     assert second == "mine" and os.path.isdir(os.path.join(first, "coliags_plugin"))
 
 
-@pytest.mark.parametrize(
-    "outcome", [TaskOutcome("done"), TaskOutcome("failed", 'no "depth"\nat all'), TaskOutcome("stopped", "x")]
-)
-def test_an_outcome_is_read_from_the_last_line(outcome):
-    assert TaskOutcome.read(1, f"noise\n{outcome.line()}\n") == outcome
+def test_an_outcome_is_read_from_the_last_line_and_a_process_that_says_nothing_has_died():
+    for outcome in (TaskOutcome("done"), TaskOutcome("failed", 'no "depth"\nat all')):
+        assert TaskOutcome.read(1, f"noise\n{outcome.line()}\n") == outcome
+    for returncode, printed, reason in (
+        (-signal.SIGKILL, "", "was ended by SIGKILL; the system does so when memory runs out"),
+        (-signal.SIGSEGV, "half a li", "was ended by SIGSEGV"),
+        (0, "[1]", "ended with status 0 without a message"),
+    ):
+        assert TaskOutcome.read(returncode, printed) == TaskOutcome("died", f"the process {reason}")
 
 
-@pytest.mark.parametrize(
-    ("returncode", "printed", "reason"),
-    [
-        (-signal.SIGKILL, "", "the process was ended by SIGKILL; the system does so when memory runs out"),
-        (-signal.SIGSEGV, "half a li", "the process was ended by SIGSEGV"),
-        (1, "", "the process ended with status 1 without a message"),
-        (0, "[1]", "the process ended with status 0 without a message"),
-    ],
-)
-def test_a_process_that_says_nothing_has_died(returncode, printed, reason):
-    assert TaskOutcome.read(returncode, printed) == TaskOutcome("died", reason)
-
-
-def test_a_scene_that_is_gone_is_the_reason(task):
+def test_a_scene_that_is_gone_and_a_run_that_another_process_has_are_the_reason(task):
     outcome = task.attempt()
     assert outcome.ending == "failed" and f"no folder {task.data}" in outcome.reason
-
-
-def test_a_run_that_another_process_has_is_left_alone(task):
     with RunFolder(task.folder).owned():
         outcome = replace(task, lock_seconds=0.3).attempt()
-    assert outcome.ending == "failed"
     owner = f"{task.folder} is in use by process {os.getpid()} on {os.uname().nodename} since 20"
-    assert outcome.reason.startswith(owner)
+    assert outcome.ending == "failed" and outcome.reason.startswith(owner)
 
 
 class Sleeper(CellTask):
