@@ -1,4 +1,4 @@
-"""``coliags check`` as a user meets it."""
+"""``coliags check`` and ``coliags mesh`` as a user meets them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from coliags_plugin.api.runs import Run
 from coliags_plugin.checks.results import CheckResult, line, summary
 from coliags_plugin.config import registry
 from coliags_plugin.testing import METHOD_CHECKS, name_of_check
 from tests.commands import refused, run
 from tests.scenes import write_wall
+from tests.surface.meshing.exact import exact_run
 
 PLUGIN = """
 from coliags_plugin.contracts import Loss, LossSettings
@@ -77,13 +79,6 @@ def test_input_that_cannot_be_checked(tmp_path, capsys):
     assert "no folder" in refused(capsys, "check", "coliags", "--data", tmp_path / "gone")
 
 
-def test_a_config_that_is_not_valid_fails_the_first_check(capsys):
-    assert run("check", "coliags", "--set", "field.voxels=1") == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert re.match(r"✗ resolves .* unknown key 'voxels'", lines[0])
-    assert {text[0] for text in lines[1:-1]} == {"-"}
-
-
 def test_words_stand_for_ticks_that_cannot_be_printed(monkeypatch, capsys):
     results = [
         CheckResult("one", "passed", "fine", 0.04),
@@ -104,4 +99,23 @@ def test_words_stand_for_ticks_that_cannot_be_printed(monkeypatch, capsys):
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii", write_through=True))
     assert run("check", "coliags", "--set", "field.voxels=1") == 1
-    assert written.getvalue().startswith(b"FAIL resolves")
+    first, *others, _ = written.getvalue().decode("ascii").splitlines()
+    assert re.match("FAIL resolves .* unknown key 'voxels'", first) and {text[0] for text in others} == {"-"}
+
+
+# Meshes
+
+
+def test_the_mesh_of_a_run_and_options_that_are_refused_before_it_is_made(tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "run"
+    monkeypatch.setattr(Run, "__init__", lambda self, path, **_: setattr(self, "path", folder))
+    monkeypatch.setattr(Run, "load", lambda self: exact_run(frames=9))
+    assert "Did you mean 'depth'" in refused(capsys, "mesh", folder, "--set", "dept=median")
+    assert "voxel_size" in refused(capsys, "mesh", folder, "--voxel", -1)
+    assert run("mesh", folder, "--format", "stl") == 2 and not folder.exists()
+    options = ("--voxel", 0.4, "--format", "ply", "glb", "--set", "depth=expected", "--texture")
+    assert run("mesh", folder, *options) == 0
+    assert f"written: {folder / 'mesh'}\n" in capsys.readouterr().out
+    assert {path.name for path in (folder / "mesh").iterdir()} == {"mesh.ply", "mesh.glb", "mesh.json"}
+    text = (folder / "mesh/mesh.json").read_text()
+    assert '"voxel_size": 0.4' in text and '"depth": "expected"' in text and '"texture": 4.0' in text

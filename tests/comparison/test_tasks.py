@@ -59,7 +59,10 @@ def test_an_outcome_is_read_from_the_last_line_and_a_process_that_says_nothing_h
         assert TaskOutcome.read(returncode, printed) == TaskOutcome("died", f"the process {reason}")
 
 
-def test_a_scene_that_is_gone_and_a_run_that_another_process_has_are_the_reason(task):
+def test_a_crash_a_scene_that_is_gone_and_a_run_that_another_process_has_are_the_reason(task, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(CellTask, "complete", lambda self: 1 / 0)
+        assert task.attempt() == TaskOutcome("failed", "ZeroDivisionError: division by zero")
     outcome = task.attempt()
     assert outcome.ending == "failed" and f"no folder {task.data}" in outcome.reason
     with RunFolder(task.folder).owned():
