@@ -89,10 +89,15 @@ def test_images_without_a_pose_or_depth_are_left_out_and_counted(mine, caplog):
     indices = [index for index in range(FRAMES) if index not in (2, 4, 10)]
     assert names(scene.video) == [stamps(TIMES)[index] for index in indices]
     assert_right(scene.video, indices)
-    assert all(frame.seen is None for frame in scene.video), "masks are numbered by image: they would be of others"
     assert scene.provenance.association["without_pose"] == 2
     assert scene.provenance.association["without_depth"] == 1
     assert "of 11 images 2 have no pose and 1 no depth" in caplog.text
+    for stamp in {*stamps(TIMES)} - {*names(scene.video)}:
+        (mine / f"rgb/{stamp}.png").unlink()
+    fewer = load(mine)
+    assert names(fewer.video) == names(scene.video)
+    # Seen masks are numbered by image and would now be those of others.
+    assert all(frame.seen is None for frame in (*scene.video, *fewer.video))
 
 
 def test_a_name_that_is_no_time(numbered):
