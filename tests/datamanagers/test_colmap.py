@@ -173,7 +173,7 @@ def test_a_rig_of_two_cameras(tmp_path):
     "pattern",
     ["masks/{}.png.png", "masks/{}.png", "mask/{}.PNG", "masks/{}.png.JPG", "masks/{}.jpg", "mask/{}.tif"],
 )
-def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
+def test_masks_in_every_way_of_naming_them_hide_what_they_and_alpha_hide(mine, caplog, pattern):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:8, :16] = 0
     (mine / pattern).parent.mkdir()
@@ -186,6 +186,10 @@ def test_masks_in_every_way_of_naming_them(mine, caplog, pattern):
     assert f"1 of {COUNT} frames have a mask; 1 other files beside the masks" in caplog.text
     np.testing.assert_array_equal(scene.train[0].mask.numpy(), mask > 0)
     assert scene.train[1].mask is None and scene.provenance.masks == 1
+    alpha = np.full_like(mask, 255)
+    alpha[-8:] = 0
+    cv2.imwrite(str(mine / "images/1.png"), np.dstack([cv2.imread(str(mine / "images/1.png")), alpha]))
+    np.testing.assert_array_equal(load(mine).train[0].mask.numpy(), np.minimum(mask, alpha) > 0)
 
 
 def test_files_of_images_with_names_of_windows(tmp_path):
