@@ -119,25 +119,17 @@ def test_a_frame_without_depth_says_how_to_go_on(name, image, rgb, depth):
 # -------------------------------------------------------------------------------------------------------- photometric
 
 
-def test_l1_is_the_mean_over_valid_pixels_and_channels():
+def test_l1_and_the_mean_square_of_either_image_are_means_over_valid_pixels_and_channels():
     image = torch.zeros(1, 2, 3, dtype=torch.uint8)
     image[0, 0] = torch.tensor([255, 51, 0])
-    rgb = torch.zeros(1, 2, 3)
-    rgb[0, 1] = 0.5
-    assert make("l1")(make_output(rgb), make_frame(image)).item() == pytest.approx((1.0 + 0.2 + 3 * 0.5) / 6)
-    mask = torch.tensor([[True, False]])
-    assert make("l1")(make_output(rgb), make_frame(image, mask=mask)).item() == pytest.approx((1.0 + 0.2) / 3)
-
-
-def test_the_mean_square_of_either_image():
-    image = torch.zeros(1, 2, 3, dtype=torch.uint8)
-    image[0, 0] = torch.tensor([255, 51, 0])
-    rgb, coarse = torch.zeros(1, 2, 3), torch.full((1, 2, 3), 0.5)
+    rgb, coarse = torch.tensor([[[0.0] * 3, [0.5] * 3]]), torch.full((1, 2, 3), 0.5)
     seen = RenderOutput(rgb, torch.ones(1, 2), None, {"rgb_coarse": coarse})
-    mean = make("mse")(seen, make_frame(image, mask=torch.tensor([[True, False]])))
-    assert mean.item() == pytest.approx((1.0 + 0.04) / 3)
+    frame, masked = make_frame(image), make_frame(image, mask=torch.tensor([[True, False]]))
+    assert make("l1")(seen, frame).item() == pytest.approx((1.0 + 0.2 + 3 * 0.5) / 6)
+    assert make("l1")(seen, masked).item() == pytest.approx((1.0 + 0.2) / 3)
+    assert make("mse")(seen, masked).item() == pytest.approx((1.0 + 0.04) / 3)
     other = make("mse", image="rgb_coarse")
-    assert other(seen, make_frame(image)).item() == pytest.approx((0.25 + 0.09 + 0.25 + 3 * 0.25) / 6)
+    assert other(seen, frame).item() == pytest.approx((0.25 + 0.09 + 0.25 + 3 * 0.25) / 6)
     assert other.loss.wants == {"rgb_coarse"} and make("mse").loss.wants == frozenset()
     assert registry.losses.get("mse").needs == frozenset()
 

@@ -204,27 +204,20 @@ def test_depth_that_tells_nothing_of_the_brightness_gives_no_response():
         assert metered.metering.response(module.log_gains().detach().double().mean(1), 3, 4) == 0.0
 
 
-def test_metering_leaves_other_views_alone():
+def test_metering_leaves_other_views_alone_and_keeps_brightness_from_training_alone():
     module, scene, _ = exposed()
-    output = rendering(0.3)
-    plain = make(module.log_gain.detach(), scene)
-    for view in (scene.train[3].view(trained=True), None):
+    output, train = rendering(0.3), scene.train[3].view(trained=True)
+    plain, before = make(module.log_gain.detach(), scene), module.metering.brightness.clone()
+    for view in (train, None):
         assert torch.equal(module.shade(output, view).rgb, plain.shade(output, view).rgb)
-    fixed, scene, _ = exposed(answer=0.0)
-    held_out = scene.test_sets["test"][1].view(trained=False)
-    torch.testing.assert_close(fixed.shade(output, held_out).rgb, output.rgb)
-
-
-def test_brightness_is_kept_from_training_alone():
-    module, scene, _ = exposed()
-    before = module.metering.brightness.clone()
-    train, held_out = scene.train[3].view(trained=True), scene.test_sets["test"][0].view(trained=False)
-    module.shade(rendering(0.9), train)
-    module.after_step(held_out, rendering(0.9))
+    module.after_step(scene.test_sets["test"][0].view(trained=False), rendering(0.9))
     assert torch.equal(module.metering.brightness, before)
     module.after_step(train, rendering(0.9))
     before[3] = 0.9
     torch.testing.assert_close(module.metering.brightness, before)
+    fixed, scene, _ = exposed(answer=0.0)
+    held_out = scene.test_sets["test"][1].view(trained=False)
+    torch.testing.assert_close(fixed.shade(output, held_out).rgb, output.rgb)
 
 
 @pytest.mark.parametrize("frames", [3, 5, 33])
