@@ -124,11 +124,7 @@ def test_models_of_the_same_frames_are_joined_by_the_similarity_between_them():
     for name in ("frame_000012", "frame_000019"):
         place = np.array(join.transform) @ second.c2w[name][:, 3]
         np.testing.assert_allclose(place, first.c2w[name][:, 3], atol=1e-9)
-    assert (
-        join.joined
-        and join.rotation_deg == pytest.approx(0.0, abs=1e-5)
-        and join.position == pytest.approx(0.0, abs=1e-9)
-    )
+    assert join.joined and (join.rotation_deg, join.position) == pytest.approx((0.0, 0.0), abs=1e-5)
     assert "3 frames have a pose on both sides" in joins(BOTH, [posed(15)], [posed(9, other, first=12)])[0].reason
     assert "do not agree" in joins(BOTH, [first], [posed(30, other, 20.0, first=12)])[0].reason
     both = joins(BOTH, [first, posed(9, model="sparse/1", first=31)], [second])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,12 +47,5 @@ class ExactModel:
 
 def exact_run(frames: int = 17, square: bool = False, scene: Scene | None = None, **model) -> TrainedRun:
     """A run on the wall, 160x120, with such a model."""
-    scene = scene or wall_scene(frames, 160, 120)
-    config = SimpleNamespace()
-    renderer = ExactModel(square, **model)
-    return TrainedRun(RunFolder(Path("run")), config, "exact", scene, renderer, 100, torch.device("cpu"), 0, {})
-
-
-def with_provenance(scene: Scene, **provenance) -> Scene:
-    """The scene with more of its origin known."""
-    return replace(scene, provenance=scene.provenance.model_copy(update=provenance))
+    scene, place, config = scene or wall_scene(frames, 160, 120), RunFolder(Path("run")), SimpleNamespace()
+    return TrainedRun(place, config, "exact", scene, ExactModel(square, **model), 100, torch.device("cpu"), 0, {})

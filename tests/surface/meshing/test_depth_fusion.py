@@ -11,6 +11,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.provenance import Provenance
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.scene_settings import write_unit
@@ -29,7 +30,7 @@ from coliags_plugin.surface.meshing.views import (
 )
 from tests.scenes import camera_at, wall_color, wall_scene, write_wall
 from tests.surface.coverage.tubes import plane
-from tests.surface.meshing.exact import SQUARE, WALL, exact_run, with_provenance
+from tests.surface.meshing.exact import SQUARE, WALL, exact_run
 
 
 def test_a_wall_has_the_colours_of_the_wall_and_so_has_its_texture():
@@ -257,7 +258,8 @@ def test_truth_of_another_unit_is_refused(tmp_path):
 def test_a_scene_of_unknown_scale(truth, tmp_path):
     """Figures name its unit, and truth in mm is only that of a scene with the same poses."""
     folder = write_wall(tmp_path / "wall", 9, 160, 120)
-    run = exact_run(scene=with_provenance(wall_scene(9, 160, 120), unit="unknown"))
+    scene = replace(wall_scene(9, 160, 120), provenance=Provenance(unit="unknown"))
+    run = exact_run(scene=scene)
     with pytest.raises(InputError, match="unknown scale"):
         mesh_run(run, tmp_path / "mesh", SETTINGS, truth=truth)
     (folder / "truth").mkdir()
@@ -270,14 +272,8 @@ def test_a_scene_of_unknown_scale(truth, tmp_path):
     compared = mesh_run(run, tmp_path / "unknown", SETTINGS, formats=("ply",), truth=folder).comparison
     printed = terminal_text(comparison_blocks(compared))
     assert f"{compared.chamfer:.3f} units" in printed and "mm" not in printed
-    scene = wall_scene(9, 160, 120)
-    shift = torch.zeros(4, 4)
-    shift[0, 3] = 3.0
-    moved = [
-        replace(frame, camera=replace(frame.camera, camera_to_world=frame.camera.camera_to_world + shift))
-        for frame in scene.train
-    ]
-    other = exact_run(scene=with_provenance(replace(scene, train=moved), unit="unknown"))
+    elsewhere = [replace(frame, camera=camera_at(index, 3.0, 0.0, 160, 120)) for index, frame in enumerate(scene.train)]
+    other = exact_run(scene=replace(scene, train=elsewhere))
     with pytest.raises(InputError, match="same poses"):
         mesh_run(other, tmp_path / "third", SETTINGS, truth=folder)
 

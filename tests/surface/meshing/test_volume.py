@@ -50,6 +50,15 @@ def test_a_sphere_is_where_it_is():
     assert ((mesh.normals * mesh.centers).sum(1) < 0).mean() > 0.999
 
 
+def test_pixel_centres():
+    """Half a pixel of shift would move this oblique wall, z + 0.3 x = 20, by 0.035."""
+    camera = turned(0.0)
+    x = (torch.arange(120) + 0.5 - camera.cx) / camera.fx
+    mesh = Volume([view_of(camera, (20.0 / (1.0 + 0.3 * x)).expand(90, 120))], 0.5, 4.0).mesh(1, 0.0)
+    local = (mesh.vertices - camera.center.numpy()) @ camera.camera_to_world[:3, :3].numpy()
+    assert abs((local[:, 2] + 0.3 * local[:, 0]).mean() - 20.0) < 0.015
+
+
 def test_places_of_few_views_are_left_out():
     camera, depth = turned(0.0), torch.full((90, 120), 20.0)
     right = depth * (torch.arange(120) >= 60)
@@ -114,36 +123,23 @@ def test_a_mesh_does_not_depend_on_the_order_in_which_its_parts_are_found():
     assert len(np.unique(first.vertices, axis=0)) == len(first.vertices)
 
 
-def looking(x: float, depth: torch.Tensor, quality: float, value: int) -> DepthView:
-    """A view along z of one colour."""
+def looking(x: float, depth: float, quality: float, value: int) -> DepthView:
+    """A view along z of a wall of one colour."""
     image = torch.full((40, 60, 3), value, dtype=torch.uint8)
     camera = camera_at(x, 0.0, 0.0, 60, 40)
-    return DepthView(camera, depth, torch.full((40, 60), quality), lambda: image)
+    return DepthView(camera, torch.full((40, 60), depth), torch.full((40, 60), quality), lambda: image)
 
 
-def test_the_better_view_counts_by_the_fourth_power_of_its_quality():
-    depth = torch.full((40, 60), 20.0)
-    views = [looking(0.0, depth, 1.0, 200), looking(0.5, depth, 0.5, 30)]
-    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), views) == round((200 + 30 / 16) / (1 + 1 / 16))).all()
-
-
-def test_what_hides_a_point_does_not_colour_it():
-    hidden, open_ = (
-        looking(0.0, torch.full((40, 60), 10.0), 1.0, 200),
-        looking(0.0, torch.full((40, 60), 20.0), 0.1, 30),
-    )
-    assert (best_colors(np.array([[0.0, 0.0, 20.0]]), [hidden, open_]) == 30).all()
-
-
-def test_points_that_no_view_sees_take_the_nearest_colour():
-    view = looking(0.0, torch.full((40, 60), 20.0), 1.0, 90)
-    points = np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 30.0]])
-    assert (best_colors(points, [view]) == 90).all()
-    assert (best_colors(points[1:], [view]) == 0).all()
+def test_the_better_view_counts_by_the_fourth_power_of_its_quality_and_none_where_it_is_hidden():
+    points, sides = np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 30.0]]), ((0.0, 20.0, 1.0, 200), (0.5, 20.0, 0.5, 30))
+    assert (best_colors(points[:1], [looking(*side) for side in sides]) == round((200 + 30 / 16) / (1 + 1 / 16))).all()
+    assert (best_colors(points[:1], [looking(0.0, 10.0, 1.0, 200), looking(0.0, 20.0, 0.1, 30)]) == 30).all()
+    assert (best_colors(points, [looking(0.0, 20.0, 1.0, 90)]) == 90).all(), "what no view sees takes the nearest"
+    assert (best_colors(points[1:], [looking(0.0, 20.0, 1.0, 90)]) == 0).all()
 
 
 def test_samples_are_bilinear_at_pixel_centres():
-    view = looking(0.0, torch.full((40, 60), 20.0), 1.0, 0)
+    view = looking(0.0, 20.0, 1.0, 0)
     ramp = torch.arange(60, dtype=torch.uint8)[None, :, None].expand(40, 60, 3) * 4
     at = torch.tensor([[20.5, 10.5], [21.0, 10.5]], dtype=torch.float64)
     camera = view.camera
@@ -163,8 +159,7 @@ def without(mesh: TriangleMesh, *centers: tuple[float, float], radius: float = 1
 
 def view(depth: float = 20.0) -> DepthView:
     """A view along z from the origin, of a wall at such a depth."""
-    camera = camera_at(0.0, 0.0, 0.0, 60, 40)
-    return DepthView(camera, torch.full((40, 60), depth), torch.ones(40, 60), lambda: None)
+    return looking(0.0, depth, 1.0, 0)
 
 
 def test_the_wall_goes_on_as_it_bends():
