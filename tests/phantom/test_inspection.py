@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.phantom import trajectory
-from coliags_plugin.phantom.colon import CentreLine, build_surface, grow_anatomy
+from coliags_plugin.phantom.colon import build_surface, grow_anatomy
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.phantom.tracing import Tracer
@@ -26,26 +26,18 @@ COARSE = {"trajectory": "inspection", "mesh_spacing": 1.6, "frames": FRAMES}
 FAR, NEAR = [0, 40, 80, 120], [20, 60, 100]
 
 
-@dataclass(frozen=True)
-class Colon:
-    """A colon, and the paths through it by preset."""
-
-    settings: PhantomSettings
-    centre_line: CentreLine
-    tracer: Tracer
-    paths: dict[str, np.ndarray]
-
-
-def path_of(colon: Colon, **changes) -> np.ndarray:
+def path_of(colon: SimpleNamespace, **changes) -> np.ndarray:
     return camera_path(colon.centre_line, colon.settings.model_copy(update=changes), colon.tracer)
 
 
 @pytest.fixture(scope="module", params=[1, 4])
 def colon(request):
+    """A colon, and the paths through it by preset."""
     chosen = PhantomSettings(**COARSE, seed=request.param)
     anatomy = grow_anatomy(chosen)
-    colon = Colon(chosen, anatomy.centre_line, Tracer(build_surface(anatomy, chosen)), {})
-    colon.paths.update({light: path_of(colon, light=light) for light in PRESETS})
+    tracer = Tracer(build_surface(anatomy, chosen))
+    colon = SimpleNamespace(settings=chosen, centre_line=anatomy.centre_line, tracer=tracer)
+    colon.paths = {light: path_of(colon, light=light) for light in PRESETS}
     return colon
 
 

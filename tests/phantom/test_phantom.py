@@ -244,48 +244,24 @@ def test_bad_settings_are_named(options, named):
         phantom_settings(options)
 
 
-def test_presets_fill_what_is_left_open():
+def test_presets_fill_what_is_left_open_and_the_record_is_read_back():
     strong = PhantomSettings(light="strong")
     assert (strong.gain, strong.light_offset, strong.white_balance_drift) == ("fixed", (0.0, 0.0, 0.0), 0.0)
     assert phantom_settings({"lamps": [[3.0, 0.0, 0.0]]}).lamps == ((3.0, 0.0, 0.0),)
     mild = phantom_settings({"gain": "fixed", "layout": "nerfstudio", "white_balance_drift": 0.0})
     assert (mild.gain, mild.white_balance_drift, mild.light_offset) == ("fixed", 0.0, (0.0, 0.0, -3.6))
-
-
-def test_settings_that_are_given_win_over_the_preset_and_the_record_is_read_back():
     settings = phantom_settings({"preset": "in-vivo", "wave": 0.0, "frames": 30})
     assert settings.wave == 0.0 and settings.frames == 30 and settings.breathing == IN_VIVO["breathing"]
     assert PhantomSettings(**settings.model_dump()) == settings
     assert phantom_settings({}).model_dump() == PhantomSettings().model_dump()
 
 
-#: Settings that are the light, the camera or the errors of no method's model.
-UNASSUMED = {"lamps", "diffuse_roughness", "s_curve", "color_matrix", "metering", "gain_steps", "sharpening"} | {
-    *("compression", "pose_noise", "depth_noise", "gamma"),
-}
-
-
-def departures(settings: PhantomSettings) -> set[str]:
-    return {name for name in UNASSUMED if getattr(settings, name) != PhantomSettings.model_fields[name].default}
-
-
-@pytest.mark.parametrize(("name", "unassumed"), [("phantoms-12", 7), ("phantoms-tuning", 2)])
-def test_the_benchmarks_have_both_kinds_of_scenes(name, unassumed):
-    scenes = {key: scene.phantom for key, scene in load_benchmark(name).scenes.items()}
-    assert all(key.endswith(f"-{chosen.seed}") for key, chosen in scenes.items())
-    kinds = [kind for chosen in scenes.values() if (kind := departures(chosen))]
-    assert len(kinds) == len({frozenset(kind) for kind in kinds}) == unassumed < len(scenes)
-    assert all(len(kind) >= 4 and "lamps" in kind for kind in kinds)
-    if name == "phantoms-12":
-        assert set.union(*kinds) == UNASSUMED and sum(chosen.moves for chosen in scenes.values()) == 2
-        assert {chosen.trajectory for chosen in scenes.values()} == {"pullback", "rotation", "inspection"}
-
-
-def test_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
-    scenes = {key: scene.phantom for key, scene in load_benchmark("phantoms-tracked").scenes.items()}
+def test_benchmarks_name_seeds_and_an_exact_twin_lacks_nothing_but_the_errors_of_its_scene():
+    for name in ("phantoms-8", "phantoms-12", "phantoms-tuning", "phantoms-tracked"):
+        scenes = {key: scene.phantom for key, scene in load_benchmark(name).scenes.items()}
+        assert name == "phantoms-8" or all(key.endswith(f"-{chosen.seed}") for key, chosen in scenes.items())
     errors = {"pose_noise": (0.17, 0.09), "depth_noise": 0.03}
     for key, chosen in scenes.items():
-        assert key.endswith(f"-{chosen.seed}")
         if key.startswith("exact"):
             assert chosen.model_copy(update=errors) == scenes[key.replace("exact", "tracked")]
         else:
