@@ -35,6 +35,9 @@ def test_colon_has_the_anatomy_it_claims(colon):
     assert all(0.33 <= polyp.height / polyp.width <= 0.39 for polyp in anatomy.polyps)
     assert np.isfinite(surface.vertices).all()
     np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1.0, atol=1e-5)
+    frames = anatomy.centre_line.at(np.linspace(0.0, 230.0, 77))[1]
+    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.tile(np.eye(3), (77, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
 
 
 def test_normals_point_into_the_lumen_as_the_triangles_turn(colon):
