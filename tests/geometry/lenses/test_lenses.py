@@ -195,11 +195,9 @@ def test_every_pixel_shows_what_its_pinhole_ray_sees(name, size):
     undistortion = Undistortion(lens, pinhole, octagon_mask(675, 540))
     assert undistortion.valid.all()
     result = undistortion.image(np.dstack([image, image[..., :1]]))
-    x = (np.arange(size[0]) + 0.5 - pinhole.cx) / pinhole.fx
-    y = (np.arange(size[1]) + 0.5 - pinhole.cy) / pinhole.fy
+    rays = PinholeLens.of(pinhole).unproject(grid(*size, 1))[:, :2].reshape(size[1], size[0], 2)
     # One grey level is 0.01; rounding at the start, in OpenCV's 1/32 pixel and at the end add up to less than two.
-    np.testing.assert_allclose(result[..., 0], np.broadcast_to(128 + 100 * x, result.shape[:2]), atol=1.6)
-    np.testing.assert_allclose(result[..., 1], np.broadcast_to(128 + 100 * y[:, None], result.shape[:2]), atol=1.6)
+    np.testing.assert_allclose(result[..., :2], 128.0 + 100.0 * rays, atol=1.6)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -210,10 +208,7 @@ def test_nearest_is_within_half_a_source_pixel_and_keeps_16_bits(name):
     columns, rows = np.meshgrid(np.arange(675, dtype=np.uint16), np.arange(540, dtype=np.uint16))
     column, row = undistortion.nearest(columns, 0), undistortion.nearest(rows, 0)
     assert column.dtype == np.uint16
-    x = (np.arange(338) + 0.5 - pinhole.cx) / pinhole.fx
-    y = (np.arange(270) + 0.5 - pinhole.cy) / pinhole.fy
-    x, y = np.meshgrid(x, y)
-    exact = lens.project(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)).reshape(270, 338, 2)
+    exact = lens.project(PinholeLens.of(pinhole).unproject(grid(338, 270, 1))).reshape(270, 338, 2)
     assert np.abs(np.stack([column, row], -1) + 0.5 - exact).max() <= 0.5 + 1e-4
 
 

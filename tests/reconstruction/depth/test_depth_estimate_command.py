@@ -63,17 +63,9 @@ def contents(folder):
 
 
 @pytest.mark.thorough
-def test_the_data_check_trusts_the_estimate_and_contradicts_other_poses(estimated, tmp_path, capsys):
+def test_the_data_check_trusts_the_estimate(estimated, capsys):
     assert run("data", "check", estimated) == 0
     assert "nothing suspect" in capsys.readouterr().out
-    wrong = shutil.copytree(estimated, tmp_path / "wrong")
-    content = json.loads((wrong / "transforms.json").read_text())
-    for frame in content["frames"]:
-        for row in frame["transform_matrix"][:3]:
-            row[3] *= 1.5
-    (wrong / "transforms.json").write_text(json.dumps(content))
-    assert run("data", "check", wrong) == 1
-    assert "depth and poses are in different units" in capsys.readouterr().out
 
 
 def test_a_wall(wall, estimated):
@@ -104,18 +96,11 @@ def test_a_wall(wall, estimated):
     assert (error[confidence > 0.8] < 0.05).mean() > 0.9
 
 
-def held_out_replaced(folder, source):
-    """The scene with noise in the place of its test frames' images."""
-    changed = shutil.copytree(source, folder)
-    rng = np.random.default_rng(0)
-    for frame in open_scene(source).test_sets["test"]:
-        write_image(changed / "images" / f"{frame.name}.png", rng.integers(0, 256, frame.image.shape, dtype=np.uint8))
-    return changed
-
-
 @pytest.mark.parametrize("split", ["every-8th", pytest.param("all-train", marks=pytest.mark.thorough)])
 def test_the_depth_of_training_frames_does_not_depend_on_the_images_of_test_frames(wall, estimated, tmp_path, split):
-    noise = held_out_replaced(tmp_path / "noise", wall)
+    noise, rng = shutil.copytree(wall, tmp_path / "noise"), np.random.default_rng(0)
+    for frame in open_scene(wall).test_sets["test"]:
+        write_image(noise / "images" / f"{frame.name}.png", rng.integers(0, 256, frame.image.shape, dtype=np.uint8))
     outs = [estimated if split == "every-8th" else tmp_path / "whole", tmp_path / "out"]
     for source, out in zip((wall, noise), outs, strict=True):
         if not out.exists():
