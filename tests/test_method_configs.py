@@ -15,21 +15,16 @@ METHODS = sorted(name for name, path in method_files().items() if path.is_relati
 
 #: Methods of the quick suite; ``make test-thorough`` checks the others, which take longer or differ by few options.
 QUICK = {"coliags", "3dgs"}
-#: Networks so small that a CPU trains them in seconds, by the field's name.
-SMALL_NETWORKS = {
-    "reim-nerf": (
-        *("field.width=32", "field.color_width=16", "sampler.pixels=256"),
-        *("renderer.samples=16", "renderer.importance_samples=16"),
-    )
-}
 
 
 @pytest.fixture(
     scope="module", params=[pytest.param(name, marks=[pytest.mark.thorough] * (name not in QUICK)) for name in METHODS]
 )
 def context(request, tmp_path_factory):
-    overrides = SMALL_NETWORKS.get(load_method(request.param).config.field.name, ())
-    return CheckContext(request.param, tmp_path_factory.mktemp("check"), overrides)
+    small = ("field.width=32", "field.color_width=16", "sampler.pixels=256")  # a CPU trains them in seconds
+    small += ("renderer.samples=16", "renderer.importance_samples=16")
+    has_networks = load_method(request.param).config.field.name == "reim-nerf"
+    return CheckContext(request.param, tmp_path_factory.mktemp("check"), small if has_networks else ())
 
 
 @pytest.mark.parametrize("check", METHOD_CHECKS, ids=name_of_check)

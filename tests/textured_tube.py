@@ -47,18 +47,15 @@ def tube_frames(
     frames = []
     for index in range(count):
         c2w = np.eye(4)
-        c2w[:3, :3] = Rotation.from_euler(
-            "xyz", [2.0 * index / count, 5.0 * np.sin(index / 3), index], True
-        ).as_matrix()
+        turn = [2.0 * index / count, 5.0 * np.sin(index / 3), index]
+        c2w[:3, :3] = Rotation.from_euler("xyz", turn, True).as_matrix()
         c2w[:3, 3] = 4.0 * np.sin(index / 2.5), 3.0 * np.cos(index / 3.0), step * index
         camera = Camera(*INTRINSICS, WIDTH, HEIGHT, torch.from_numpy(c2w)).resized(*size)
         rays = camera.rays().numpy()
         depth = depth_along(c2w[:3, 3], rays)
         points = c2w[:3, 3] + depth[..., None] * rays
-        image = np.rint(texture(points / coarseness)).astype(np.uint8)
-        frames.append(
-            Frame.of(f"{index:04d}", index, torch.from_numpy(image), camera, torch.from_numpy(depth.astype(np.float32)))
-        )
+        image = torch.from_numpy(np.rint(texture(points / coarseness)).astype(np.uint8))
+        frames.append(Frame.of(f"{index:04d}", index, image, camera, torch.from_numpy(depth.astype(np.float32))))
     return frames
 
 

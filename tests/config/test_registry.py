@@ -21,16 +21,11 @@ def test_every_builtin_can_be_imported_and_has_settings_where_its_kind_has_some(
             assert kind in WITHOUT_SETTINGS or component.Settings is not None
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "message"),
-    [
-        ("renderers", "troch", "Did you mean 'torch'"),
-        ("pose_formats", "tumm", r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"),
-    ],
-)
-def test_unknown_name_says_what_was_meant(kind, name, message):
-    with pytest.raises(InputError, match=message):
-        REGISTRIES[kind].get(name)
+def test_unknown_name_says_what_was_meant():
+    with pytest.raises(InputError, match="Did you mean 'torch'"):
+        REGISTRIES["renderers"].get("troch")
+    with pytest.raises(InputError, match=r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"):
+        REGISTRIES["pose_formats"].get("tumm")
 
 
 def test_entry_points_are_found_once(monkeypatch):
@@ -63,16 +58,12 @@ def test_plugin_path_files_are_found(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        *(("x = 1\n", "COMPONENTS"), ("COMPONENTS = {'nonsense': {}}\n", "COMPONENTS")),
-        *(("COMPONENTS = {'fields': ['mine']}\n", "COMPONENTS"), (None, "not a file")),
-    ],
+    "text", ["x = 1\n", "COMPONENTS = {'nonsense': {}}\n", "COMPONENTS = {'fields': ['mine']}\n", None]
 )
-def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text, message):
+def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text):
     plugin = tmp_path / "bad.py"
     if text is not None:
         plugin.write_text(text)
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="COMPONENTS" if text else "not a file"):
         Registry("fields", {}, "thing").names()
