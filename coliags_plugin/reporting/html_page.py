@@ -34,6 +34,8 @@ _NAME = re.compile(r"[0-9a-f]{20}\.(jpg|png|webp)")
 #: Bytes of a note, and where it is: how many pictures are beside the page.
 _NOTE_ROOM = 500
 _BESIDE = "<!-- pictures beside the page -->"
+#: A setting that a message quotes.
+_QUOTED = re.compile(r"`([^`]+)`")
 #: Where a picture's address will be.
 _PLACEHOLDER = re.compile(r"picture:([0-9a-f]{20})")
 
@@ -128,8 +130,14 @@ def environment(assets: Path) -> Environment:
         lstrip_blocks=True,
     )
     functions = (color_stops, columns_of, enumerate, linear_ticks, sentence, style_classes, tick_label, unit_text)
+    templates.filters["prose"] = prose
     templates.globals |= {"dash": DASH, "axes_of": Axes, **{function.__name__: function for function in functions}}
     return templates
+
+
+def prose(text: str) -> Markup:
+    """Text as HTML, with settings in backticks as code."""
+    return Markup(_QUOTED.sub(r"<code>\1</code>", str(escape(text))))
 
 
 def columns_of(count: int) -> int:

@@ -238,6 +238,12 @@ def test_html_page(tmp_path):
     assert (tmp_path / "again.html").read_text() == text
 
 
+def test_settings_in_backticks_are_code_in_html():
+    blocks = [Paragraph("Set `losses.depth=null` for <a>"), Bullets([Bullet("or `steps=9`")])]
+    text = html_blocks(blocks)
+    assert "Set <code>losses.depth=null</code> for &lt;a&gt;" in text and "or <code>steps=9</code>" in text
+
+
 def test_pictures_without_room_are_written_beside_the_page(tmp_path):
     page = made_page()
     write_html(page, tmp_path / "page.html", limit=len(html_text(page)) + 450)
