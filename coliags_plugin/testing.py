@@ -395,7 +395,7 @@ def _spread_out(settings: Settings, written_for: int) -> list[str]:
 
 
 def _lengths(trainer: Trainer) -> dict[str, int]:
-    """Lengths of the field's groups of one parameter, of its own buffers, and of the strategy's counters."""
+    """Lengths of parameters that are a group alone, of the field's buffers and of the strategy's counters."""
     field = trainer.model.field
     groups = field.parameter_groups().items()
     parts: dict[str, Tensor] = {f"parameter group '{name}'": group[0] for name, group in groups if len(group) == 1}

@@ -105,7 +105,7 @@ def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = No
 
 
 def _benchmark(name: str) -> tuple[str, str | None]:
-    """Benchmark, by name or path, that a name stands for, and the one scene of it; no benchmark for a folder."""
+    """Split a name into its benchmark (empty: the name is a folder) and a scene of it (None: all)."""
     files = shipped()
     if name in files or is_path(name):
         return name, None

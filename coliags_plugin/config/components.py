@@ -66,7 +66,7 @@ def named_component(kind: str, node: Mapping[str, object], asking: str) -> Compo
 
 
 def is_auto(kind: str, name: object) -> bool:
-    """True if a name in a config stands for whichever component is resolved."""
+    """True if a name in a config is a resolver's, such as ``auto``, which chooses the component at run time."""
     return isinstance(name, str) and name in REGISTRIES[kind] and isinstance(REGISTRIES[kind].get(name), Resolver)
 
 

@@ -233,7 +233,7 @@ class Head(nn.Module, ABC, Generic[SettingsT]):
     decoding: Literal["networks", "forward"]
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Refuse a class with a ``forward`` of its own that kernels would never call (TypeError)."""
+        """Raise TypeError for a subclass that overrides ``forward`` without declaring ``decoding``."""
         super().__init_subclass__(**options)
         forward = vars(cls).get("forward")
         if forward is None or getattr(forward, "__isabstractmethod__", False) or "decoding" in vars(cls):

@@ -137,7 +137,7 @@ class PixelMaps:
 
     @property
     def depth_at_least(self) -> Float[Tensor, "H W"] | None:
-        """Depth that the sensor clipped at, mm: the surface lies there or beyond, and ``depth`` is NaN.
+        """Lower bound of the depth of clipped pixels, mm, where ``depth`` is NaN.
 
         NaN elsewhere. [H, W]
         """

@@ -1,4 +1,4 @@
-"""Tasks of worker processes: what a worker is told, how it is run on this machine, and what it prints when it ends.
+"""Tasks for worker processes, the executor that runs them on this machine, and the outcome that a worker prints.
 
 The last line that a worker prints is its :class:`TaskOutcome`; messages go to standard error. When standard input is a
 pipe, the worker stops when it is closed, with its state saved: so it ends with whatever started it, however that ends.

@@ -15,7 +15,7 @@ _SAME_PLACE = 0.01
 
 @dataclass(frozen=True)
 class Truth:
-    """Scene that a run is evaluated against instead of its own.
+    """Scene with true depth, for the evaluation of a run that was trained on another scene of the same video.
 
     Attributes:
         scene: The scene with the true depth: its test sets are what is evaluated, its training frames those that the

@@ -21,9 +21,9 @@ MANIFEST, _FORMAT = "manifest.json", 1
 
 
 def export_atlas(out: Path, folder: Path, overwrite: bool = False, link: bool = False) -> dict[str, Any]:
-    """Write the sub-maps of a video, each in a folder of its own; returns the content of ``manifest.json``.
+    """Export every sub-map of a video into a folder; returns the content of ``manifest.json``.
 
-    Of each sub-map (docs/reconstruct.md 9): ``colmap/`` with the posed images and the model, ``nerfstudio/`` with dense
+    A folder has (docs/reconstruct.md 9): ``colmap/`` with the posed images and the model, ``nerfstudio/`` with dense
     depth where it was estimated, and ``trajectory.txt`` in TUM's format, camera to world, at seconds of the video, or
     frame numbers where its rate is unknown. The manifest has, for each, the similarity from its world to that of the
     first one that it is joined to. With ``link``, images and depth are second names of the files in ``out``, where both

@@ -262,7 +262,7 @@ def _pictures(contents: Contents) -> Iterator[Block]:
 
 
 def _views(contents: Contents) -> list[Section]:
-    """The section of held-out views: of each sub-map as of a scene of its own, the best and the worst of many."""
+    """Section of held-out views beside their renderings by sub-map; of many sub-maps, the best and the worst."""
     from coliags_plugin.comparison.report.sources import read_study
     from coliags_plugin.comparison.report.study import Study
     from coliags_plugin.comparison.report.views import view_section

@@ -320,7 +320,7 @@ class VideoFile:
         return index.times[place:][: len(decoded)].tolist() == decoded
 
     def decoded(self, key: Key | None = None, threads: int = 0) -> Iterator[VideoFrame | None]:
-        """Decode all frames, or those from a key frame on; None stands for what is damaged up to the next key frame.
+        """Decode frames from the start or a key frame on; yields None for a damaged stretch before the next key frame.
 
         A stream may begin between key frames: what cannot be decoded before the first of them is no frame.
         """

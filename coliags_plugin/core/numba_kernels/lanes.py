@@ -125,7 +125,7 @@ def _pack(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
 
 
 def _at(builder: ir.IRBuilder, table: ir.Value, index: ir.Value, form: ir.Type = _LANES) -> ir.Value:
-    """Address of what lies at ``table[index]``."""
+    """Address of the vector at ``table[index]``."""
     return builder.bitcast(builder.gep(table, [index]), form.as_pointer())
 
 
@@ -572,7 +572,7 @@ def load_columns(builder, table, index, like):
 
 @operation(None, TABLE, INDEX, VECTORS)
 def store_all(builder, table, index, values):
-    """A tuple of vectors, one behind the other, to ``table[index]`` and on."""
+    """Store a tuple of vectors contiguously, starting at ``table[index]``."""
     _write_all(builder, values, _successive(builder, _at(builder, table, index), len(values)))
 
 

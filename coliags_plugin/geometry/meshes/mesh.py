@@ -42,7 +42,7 @@ class RayScene:
         return np.where(np.isfinite(parameter), triangle, -1), parameter, answer["primitive_uvs"].numpy()
 
     def blocked(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
-        """True where something lies on a ray before its end, the last thousandth of it left out. [N]"""
+        """True where the mesh occludes a segment; the last thousandth of a segment is ignored. [N]"""
         rays = self._rays(origins, directions)
         return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=0.999).numpy())
 

@@ -186,20 +186,26 @@ def list_by_block(count, stride, blocks, listed, counts):
         counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
-@part
-def copy_to_images(tile, grid, state, images):
-    """Copy the pixels of a tile from its blocks to the images that are not empty."""
-    for channel in range(3):
-        _copy_to_image(CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
-        _copy_to_image(NORMALS + 16 * channel, state, tile, grid, 3, channel, images.normals)
-    for vector, image in (
+@inline
+def _single_channels(images):
+    """Images of one channel, each after its vector in the blocks of a tile."""
+    return (
         (ALPHA, images.alpha),
         (DEPTH, images.depth),
         (INVERSE, images.inverse_depth),
         (MEDIAN, images.median),
         (EXPECTED, images.expected),
         (DISTORTION, images.distortion),
-    ):
+    )
+
+
+@part
+def copy_to_images(tile, grid, state, images):
+    """Copy the pixels of a tile from its blocks to the images that are not empty."""
+    for channel in range(3):
+        _copy_to_image(CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
+        _copy_to_image(NORMALS + 16 * channel, state, tile, grid, 3, channel, images.normals)
+    for vector, image in _single_channels(images):
         _copy_to_image(vector, state, tile, grid, 1, 0, image)
 
 
@@ -220,14 +226,7 @@ def copy_from_images(tile, grid, images, state):
     for channel in range(3):
         _copy_from_image(images.rgb, 3, channel, tile, grid, CHANNELS + 16 * channel, state)
         _copy_from_image(images.normals, 3, channel, tile, grid, NORMALS + 16 * channel, state)
-    for image, vector in (
-        (images.alpha, ALPHA),
-        (images.depth, DEPTH),
-        (images.inverse_depth, INVERSE),
-        (images.median, MEDIAN),
-        (images.expected, EXPECTED),
-        (images.distortion, DISTORTION),
-    ):
+    for vector, image in _single_channels(images):
         _copy_from_image(image, 1, 0, tile, grid, vector, state)
 
 

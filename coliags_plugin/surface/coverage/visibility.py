@@ -216,7 +216,7 @@ def view_hits(
 def _visible_centroids(
     mesh: TriangleMesh, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], max_depth: float
 ) -> RayHits:
-    """Triangles, of some, whose centroids a view sees; the nearest ray of its grid stands for each."""
+    """Triangles whose centroids a view sees, each as a hit of the nearest ray of its grid."""
     offset = mesh.centers[triangles] - view.center
     local = offset @ view.camera_to_world[:3, :3]
     distance = np.linalg.norm(offset, axis=1)
