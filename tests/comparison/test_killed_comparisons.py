@@ -80,12 +80,11 @@ def run_of(folder, method):
     return folders[0] if folders else None
 
 
-def alive(process):
+def is_running(process):
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
         return False
-    return True
 
 
 @pytest.mark.thorough
@@ -120,7 +119,7 @@ def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
     first.kill()
     _, messages = first.communicate()
     assert "SIGKILL" in messages and "trying again" in messages
-    until("end of the workers", lambda: not any(map(alive, workers)))
+    until("end of the workers", lambda: not any(map(is_running, workers)))
 
     options = {"steps": STEPS, "settings": parse_assignments(OFTEN), "jobs": 2, "threads": 1, "device": "cpu"}
     assert not cp.compare(METHODS, wall, folder, **options).failures
@@ -200,13 +199,6 @@ def under_way(folder):
         if holder and 20 < RunFolder(run).logged_step < CLUSTER_STEPS and is_running(holder):
             return holder
     return None
-
-
-def is_running(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def parent_of(process):
