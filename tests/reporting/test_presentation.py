@@ -239,9 +239,11 @@ def test_html_page(tmp_path):
 
 
 def test_settings_in_backticks_are_code_in_html():
-    blocks = [Paragraph("Set `losses.depth=null` for <a>"), Bullets([Bullet("or `steps=9`")])]
+    table = Table("", [Column("name", "Name")], [{"name": "a"}], notes=["run `coliags list`"])
+    blocks = [Paragraph("Set `losses.depth=null` for <a>"), Bullets([Bullet("or `steps=9`")]), table]
     text = html_blocks(blocks)
     assert "Set <code>losses.depth=null</code> for &lt;a&gt;" in text and "or <code>steps=9</code>" in text
+    assert "<code>coliags list</code>" in text
 
 
 def test_pictures_without_room_are_written_beside_the_page(tmp_path):
