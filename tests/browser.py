@@ -109,7 +109,7 @@ class Browser:
 
     def open(self, page: Path | str, width: int, height: int = 900, phone: bool = False, scripts: bool = True) -> None:
         """Open a file or an address at a width in CSS pixels, as a phone with a touch screen or not."""
-        self.events.clear()
+        self._navigate("about:blank")  # Ends the page before, whose sockets may still report errors.
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self._call(
             "Emulation.setDeviceMetricsOverride",
@@ -119,7 +119,11 @@ class Browser:
             mobile=phone,
         )
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
-        self._call("Page.navigate", url=page.resolve().as_uri() if isinstance(page, Path) else page)
+        self._navigate(page.resolve().as_uri() if isinstance(page, Path) else page)
+
+    def _navigate(self, url: str) -> None:
+        self.events.clear()
+        self._call("Page.navigate", url=url)
         self._wait_for("Page.loadEventFired")
 
     def _wait_for(self, method: str, seconds: float = 60.0) -> None:
