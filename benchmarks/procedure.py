@@ -34,8 +34,8 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.scene_files import read_intrinsics
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
-from coliags_plugin.datamanagers.reading.files import read_intrinsics
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh

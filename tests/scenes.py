@@ -13,8 +13,8 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.provenance import Provenance
+from coliags_plugin.core.scene_files import write_camera_json
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.reading.files import write_camera_json
 from coliags_plugin.geometry.poses.c3vd import matrix_lines
 from coliags_plugin.phantom.layouts.built_in import depth_steps
 

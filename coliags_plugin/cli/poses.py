@@ -203,7 +203,7 @@ class PosesConvertCommand:
 
 def _image_names(folder: Path, count: int) -> tuple[str, ...]:
     """Names of a folder's images in natural order, one per pose."""
-    from coliags_plugin.datamanagers.reading.files import IMAGE_SUFFIXES, files_in
+    from coliags_plugin.core.scene_files import IMAGE_SUFFIXES, files_in
     from coliags_plugin.geometry.poses.trajectory import natural_order
 
     if not folder.is_dir():

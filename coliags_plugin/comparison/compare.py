@@ -24,7 +24,7 @@ from coliags_plugin.config.options import CompareOptions
 from coliags_plugin.core.errors import InputError, InterruptedRunError, check_name, check_number
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.datamanagers.scene_settings import Split
+from coliags_plugin.core.splits import Split
 from coliags_plugin.engine.data_formats import data_manager
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.engine.task_queue import Job, JobQueue, make_executor

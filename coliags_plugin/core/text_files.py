@@ -76,6 +76,12 @@ def _opened(path: Path) -> Iterator[TextIOWrapper]:
         yield TextIOWrapper(file, encoding=encoding_of(start))
 
 
+def shortened(line: str) -> str:
+    """A line shortened for messages."""
+    text = line.strip()
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def without_places(text: str, places: Iterable[Path]) -> str:
     """A message in which files and folders, and what they hold, stand without the absolute path that leads to them."""
     parents = {path.parent for place in places for path in (place.absolute(), place.resolve())}

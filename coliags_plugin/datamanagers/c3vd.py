@@ -14,10 +14,10 @@ from typing import Any, Literal
 from pydantic import Field
 from typing_extensions import override
 
+from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH
 from coliags_plugin.datamanagers.recorded import (
     ROTATION,

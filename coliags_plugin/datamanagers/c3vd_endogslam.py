@@ -15,13 +15,14 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
+from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import decode_image
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.datamanagers.reading import files as reading
+from coliags_plugin.core.splits import Split
 from coliags_plugin.datamanagers.reading.depth import C3VD_DEPTH, ScaledDepth
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import (
@@ -32,7 +33,7 @@ from coliags_plugin.datamanagers.recorded import (
     fingerprint,
     poses_of_images,
 )
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.shots import ASPECT_TOLERANCE, Rectification, Shot, make_shots
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import c3vd as c3vd_poses

@@ -15,15 +15,16 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import BaseModel, ConfigDict, Field
 from typing_extensions import override
 
+from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.json_files import read_json, read_number
+from coliags_plugin.core.scene_files import FACTORS, Unit, read_unit
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.core.settings import read_validated
-from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import DepthFormat, InverseDepth, ScaledDepth
 from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.scene_settings import FACTORS, InitialPoints, SceneSettings, Unit, read_unit
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.shots import Rectification, Shot, rectifications
 from coliags_plugin.geometry.lenses.models import Array, MappedLens, PinholeLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses

@@ -14,8 +14,8 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.ply import read_vertices, vertex_colors
+from coliags_plugin.core.scene_files import parallel_map, required_file
 from coliags_plugin.core.scenes import Frame, PointCloud
-from coliags_plugin.datamanagers.reading.files import parallel_map, required_file
 
 log = logging.getLogger(__name__)
 

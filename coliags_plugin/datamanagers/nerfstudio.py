@@ -15,20 +15,21 @@ from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from typing_extensions import override
 
+from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.json_files import read_number
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.scene_files import FACTORS, Unit, printed_unit
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import scaled_depth
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.transforms import PixelCenters, Transforms
 from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.scene_settings import FACTORS, POINTS_FILE, SceneSettings, Unit, printed_unit
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot, rectifications
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z

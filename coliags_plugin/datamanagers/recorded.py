@@ -24,18 +24,20 @@ from coliags_plugin.core.images import sizes_text, tell_of_alpha
 from coliags_plugin.core.jobs import Progress
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.provenance import PointsRecord, Provenance, SplitRecord
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, first_few, numbered, parallel_map
-from coliags_plugin.datamanagers.scene_settings import (
+from coliags_plugin.core.scene_files import (
     FACTORS,
-    POINTS_FILE,
-    SceneSettings,
-    Split,
+    FRAME_SUFFIXES,
     Unit,
-    divide,
+    files_in,
+    first_few,
+    numbered,
+    parallel_map,
     read_unit,
 )
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.splits import Split, divide
+from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, Rectification, Shot, StoredPixels, fitted, rectifications
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses

@@ -15,16 +15,17 @@ import torch
 from pydantic import Field
 from typing_extensions import override
 
+from coliags_plugin.core import scene_files as reading
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json, read_number
+from coliags_plugin.core.scene_files import printed_unit
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.core.text_files import read_text
+from coliags_plugin.core.text_files import read_text, shortened
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading import files as reading
 from coliags_plugin.datamanagers.reading.depth import ScaledDepth
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager, Recording, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings, printed_unit
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.shots import make_shots
 from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.lenses.vicalib import calibration_files, find_calibration
@@ -32,7 +33,6 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.alignment import nearest_in_time
 from coliags_plugin.geometry.poses.colmap import read_pinholes
-from coliags_plugin.geometry.poses.formats import shortened
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order
 
 log = logging.getLogger(__name__)

@@ -13,14 +13,15 @@ from typing_extensions import override
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
+from coliags_plugin.core.scene_files import for_all, inventory, numbered, require_folder
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.splits import Split
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth import ExrDepth
-from coliags_plugin.datamanagers.reading.files import for_all, inventory, numbered, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.transforms import Transforms, camera_of
 from coliags_plugin.datamanagers.recorded import ROTATION, RecordedDataManager, Recording, find_seen_masks, fingerprint
-from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings, Split
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.shots import Shot, make_shots
 
 log = logging.getLogger(__name__)

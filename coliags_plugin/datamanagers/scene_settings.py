@@ -1,103 +1,15 @@
-"""Options shared by all data managers: working size, unit of length, train/test split and initial points."""
+"""Options shared by all data managers: working size, unit of length, split and initial points."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Literal, cast, get_args
+from typing import Annotated, Literal
 
-import numpy as np
-from jaxtyping import Bool
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.scene_files import Unit
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.core.text_files import read_text
-from coliags_plugin.geometry.poses.formats import shortened
-
-Unit = Literal["mm", "cm", "m", "unknown"]
-
-#: Factors to the lengths of a loaded scene: mm, or the files' own where their unit is unknown.
-FACTORS: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "unknown": 1.0}
-#: The file that states the unit, in the scene's folder; without it the unit is that of the dataset's format.
-UNIT_FILE = "unit.txt"
-
-
-def read_unit(folder: Path, otherwise: Unit = "unknown") -> Unit:
-    """The unit of the poses and depth of the scene in a folder; ``otherwise``: that of a folder that states none."""
-    path = folder / UNIT_FILE
-    if not path.is_file():
-        return otherwise
-    word = read_text(path, "the unit of length").strip()
-    if word not in get_args(Unit):
-        raise InputError(f"{path}: '{shortened(word)}'", " or ".join(get_args(Unit)), "Correct or remove the file")
-    return cast(Unit, word)
-
-
-def printed_unit(unit: Unit) -> str:
-    """A unit as it is printed: ``units`` where it is unknown."""
-    return "units" if unit == "unknown" else unit
-
-
-def write_unit(folder: Path, unit: Unit) -> None:
-    """State the unit of a scene's poses and depth."""
-    atomic_write(folder / UNIT_FILE, unit + "\n")
-
-
-Split = Literal["every-8th", "inner-8th", "endogslam", "block", "all-train", "own"]
-
-EVERY = 8
-
-
-def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) -> Bool[np.ndarray, "N"]:
-    """Mask of the test frames among ``count`` frames in video order.
-
-    ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``inner-8th``: 4, 12, 20, ... without the last frame,
-    so that every one is between training frames; ``endogslam``: 7, 15, 23, ... (EndoGSLAM, PR-Endo; docs/data.md 3);
-    ``block``: one contiguous block, given by fractions of the video, so that test views are not between neighbouring
-    training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
-    """
-    index = np.arange(count)
-    if split == "every-8th":
-        return np.asarray(index % EVERY == 0)
-    if split == "inner-8th":
-        return np.asarray((index % EVERY == EVERY // 2) & (index < count - 1))
-    if split == "endogslam":
-        return np.asarray(index % EVERY == EVERY - 1)
-    if split == "block":
-        return np.asarray((index >= round(block[0] * count)) & (index < round(block[1] * count)))
-    return np.zeros(count, bool)
-
-
-def split_options(split: str, block: Sequence[float] = (0.4, 0.6)) -> list[str]:
-    """Options of training that choose a split, none for ``every-8th``; ``block``: that of split ``block``."""
-    chosen = [] if split == "every-8th" else [f"datamanager.split={split}"]
-    return [*chosen, f"datamanager.block=[{block[0]:g}, {block[1]:g}]"] if split == "block" else chosen
-
-
-def divide(
-    split: Split,
-    indices: Sequence[int],
-    own_split: Mapping[str, Sequence[int]] | None = None,
-    block: tuple[float, float] = (0.4, 0.6),
-) -> tuple[list[int], list[int]]:
-    """Training and test indices among the used frames of a video, given in video order.
-
-    ``own_split`` is the dataset's split, ``{"train": ..., "test": ...}``, for split ``own``; the others are as for
-    :func:`held_out`.
-    """
-    if split == "own":
-        if own_split is None:
-            raise ValueError("split 'own' needs the dataset's own split")
-        used = set(indices)
-        train, test = ([index for index in own_split[part] if index in used] for part in ("train", "test"))
-        return train, test
-    is_test = held_out(split, len(indices), block)
-    train = [index for index, is_held in zip(indices, is_test, strict=True) if not is_held]
-    return train, [index for index, is_held in zip(indices, is_test, strict=True) if is_held]
-
+from coliags_plugin.core.splits import Split
 
 POINTS_FILE = "points3D.ply"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

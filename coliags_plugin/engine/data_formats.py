@@ -15,8 +15,8 @@ from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.scene_files import FRAME_SUFFIXES, files_in, inventory
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES, files_in, inventory
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.geometry.lenses.vicalib import calibration_files

@@ -14,9 +14,9 @@ from jaxtyping import Float, Float64
 from pydantic import BaseModel
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scene_files import Unit
 from coliags_plugin.core.settings import invalid_reported
 from coliags_plugin.datamanagers.colmap import AtlasJoin, AtlasRecord, read_atlas
-from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.pipeline.frames import IMAGES, FramesRecord
 from coliags_plugin.pipeline.joins import ModelKey, SegmentJoin
 from coliags_plugin.pipeline.stages import MADE, RECORD_FILE, SHARED, Record, StageRecord

@@ -10,8 +10,7 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, link_or_copy, make_folder, refuse_overlap, write_json
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES
-from coliags_plugin.datamanagers.scene_settings import write_unit
+from coliags_plugin.core.scene_files import FRAME_SUFFIXES, write_unit
 from coliags_plugin.geometry.poses import colmap, tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.pipeline.contents import Contents, SubmapContents, common_frames, read_contents

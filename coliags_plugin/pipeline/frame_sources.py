@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import user_path
 from coliags_plugin.core.images import has_alpha, read_8_bit, write_image
 from coliags_plugin.core.jobs import Progress
-from coliags_plugin.datamanagers.reading.files import FRAME_SUFFIXES
+from coliags_plugin.core.scene_files import FRAME_SUFFIXES
 from coliags_plugin.engine.data_formats import videos_in
 from coliags_plugin.geometry.lenses.vicalib import SUFFIX, find_calibration, read_calibration
 from coliags_plugin.pipeline.frame_selection import looks_interlaced, one_field

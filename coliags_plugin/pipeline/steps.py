@@ -13,8 +13,8 @@ from coliags_plugin.config.method_config import load_method, method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.scene_files import Unit
 from coliags_plugin.datamanagers.colmap import find_models
-from coliags_plugin.datamanagers.scene_settings import Unit
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.pipeline.frame_sources import Span, chosen_frames, frame_source

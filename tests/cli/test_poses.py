@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.datamanagers.scene_settings import read_unit
+from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
 from coliags_plugin.geometry.poses.trajectory import Trajectory

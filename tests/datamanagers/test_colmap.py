@@ -16,9 +16,9 @@ import torch
 from coliags_plugin.checks.data.findings import findings_of
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.scene_files import sidecar_files
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap import find_models, read_model
-from coliags_plugin.datamanagers.reading.files import sidecar_files
 from coliags_plugin.datamanagers.recorded import Recording
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points

@@ -14,10 +14,10 @@ import torch
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import has_alpha, read_8_bit, read_alpha, read_rgb
+from coliags_plugin.core.scene_files import named_file, numbered, short_names
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, load_points, subsampled
 from coliags_plugin.datamanagers.reading.depth import scaled_depth
-from coliags_plugin.datamanagers.reading.files import named_file, numbered, short_names
 from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
 
 # Images

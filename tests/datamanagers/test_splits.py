@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.scene_settings import held_out, read_unit, split_options, write_unit
+from coliags_plugin.core.scene_files import read_unit, write_unit
+from coliags_plugin.core.splits import held_out, split_options
 
 
 @pytest.mark.parametrize(

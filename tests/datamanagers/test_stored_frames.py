@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame, PixelTensors
 from coliags_plugin.datamanagers import shots
 from coliags_plugin.datamanagers.reading.depth import ScaledDepth
-from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.datamanagers.shots import StoredPixels
 from tests.datamanagers.wall_scenes import FRAMES, HEIGHT, WIDTH, manager, names, poses
 

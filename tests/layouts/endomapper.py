@@ -6,7 +6,7 @@ import numpy as np
 
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.datamanagers.scene_settings import write_unit
+from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.geometry.lenses.models import FisheyeLens
 from coliags_plugin.geometry.lenses.vicalib import TYPE
 from coliags_plugin.geometry.poses import tum

@@ -10,8 +10,8 @@ import OpenEXR
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.rotatecolon import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
-from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout

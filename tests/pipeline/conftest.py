@@ -9,8 +9,8 @@ import pytest
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE
-from coliags_plugin.datamanagers.scene_settings import write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.phantom.layouts.built_in import SeenPoints, add_points
 from coliags_plugin.pipeline import reconstruct, steps

@@ -16,7 +16,7 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import not_writable
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.scene_settings import read_unit
+from coliags_plugin.core.scene_files import read_unit
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.export.baking import distillation
 from coliags_plugin.geometry.lenses.models import LENSES

@@ -16,8 +16,8 @@ from typing_extensions import override
 from coliags_plugin.core.arrays import read_array
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.libraries import decoder_messages
+from coliags_plugin.core.scene_files import required_file
 from coliags_plugin.core.text_files import unreadable
-from coliags_plugin.datamanagers.reading.files import required_file
 from coliags_plugin.datamanagers.reading.images import read_gray
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_json, read_number
-from coliags_plugin.datamanagers.reading.files import for_all, named_file, required_file
+from coliags_plugin.core.scene_files import for_all, named_file, required_file
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, OpenCVLens, PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio
 

@@ -24,8 +24,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, final_place, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import JsonObject
-from coliags_plugin.core.text_files import text_lines, unreadable
-from coliags_plugin.geometry.poses.formats import EXPECTED, Format, prefixed_errors, shortened
+from coliags_plugin.core.text_files import shortened, text_lines, unreadable
+from coliags_plugin.geometry.poses.formats import EXPECTED, Format, prefixed_errors
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
 

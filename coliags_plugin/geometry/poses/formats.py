@@ -13,7 +13,7 @@ import numpy as np
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import refuse_existing
-from coliags_plugin.core.text_files import encoding_of, text_lines, unreadable
+from coliags_plugin.core.text_files import encoding_of, shortened, text_lines, unreadable
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
@@ -163,12 +163,6 @@ def prefixed_errors(place: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{place}: {error.seen}", error.expected, error.do) from error
-
-
-def shortened(line: str) -> str:
-    """A line shortened for messages."""
-    text = line.strip()
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _words(line: str) -> list[str]:

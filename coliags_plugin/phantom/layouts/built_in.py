@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.datamanagers.reading.files import write_camera_json
-from coliags_plugin.datamanagers.scene_settings import write_unit
+from coliags_plugin.core.scene_files import write_camera_json, write_unit
 from coliags_plugin.geometry.lenses.models import Lens, OpenCVLens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.c3vd import matrix_lines

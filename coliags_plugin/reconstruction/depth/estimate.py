@@ -14,8 +14,8 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import sizes_text
 from coliags_plugin.core.jobs import Progress
+from coliags_plugin.core.scene_files import parallel_map
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.files import parallel_map
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.priors import (
     FilePrior,

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scene_files import files_in, first_few
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.depth import read_exr_channel, scaled_depth
-from coliags_plugin.datamanagers.reading.files import files_in, first_few
 from coliags_plugin.reconstruction.depth.sweeping import Map, Mask
 from coliags_plugin.reconstruction.structure.matching import Pose
 

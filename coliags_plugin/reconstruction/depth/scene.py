@@ -15,9 +15,10 @@ from jaxtyping import Float, Float32, Int, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.jobs import Progress, with_progress
+from coliags_plugin.core.scene_files import write_unit
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.splits import split_options
 from coliags_plugin.datamanagers.nerfstudio import EstimatedSceneWriter
-from coliags_plugin.datamanagers.scene_settings import split_options, write_unit
 from coliags_plugin.datamanagers.shots import PAPER_SIZE, fitted
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video

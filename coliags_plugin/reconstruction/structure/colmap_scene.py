@@ -13,8 +13,8 @@ from jaxtyping import UInt8
 
 from coliags_plugin.core.files import atomic_folder, link_or_copy, write_json
 from coliags_plugin.core.images import decode_image, read_8_bit, write_image, write_mask
+from coliags_plugin.core.scene_files import Unit, write_unit
 from coliags_plugin.datamanagers.colmap import ATLAS_FILE
-from coliags_plugin.datamanagers.scene_settings import Unit, write_unit
 from coliags_plugin.geometry.poses.colmap import write_reconstruction
 from coliags_plugin.reconstruction.structure.image_files import Masks, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Atlas

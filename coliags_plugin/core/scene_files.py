@@ -1,4 +1,4 @@
-"""Files of a scene: numbered frames, names, those named by others, ``camera.json``, and reading many at once."""
+"""Files of a scene, for readers and writers: images, ``unit.txt``, ``camera.json``, and reading many at once."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from typing import Literal, TypeVar, cast, get_args
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import write_json
+from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.jobs import Progress, with_progress
 from coliags_plugin.core.json_files import image_size, read_json, read_number
+from coliags_plugin.core.text_files import read_text, shortened
 
 log = logging.getLogger(__name__)
 
@@ -234,6 +235,35 @@ def warn_of_unposed(file: Path, others: Sequence[Path]) -> None:
 def first_few(names: Sequence[str]) -> str:
     """The first three names, for messages."""
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+Unit = Literal["mm", "cm", "m", "unknown"]
+
+#: Factors to the lengths of a loaded scene: mm, or the files' own where their unit is unknown.
+FACTORS: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "unknown": 1.0}
+#: The file that states the unit, in the scene's folder; without it the unit is that of the dataset's format.
+UNIT_FILE = "unit.txt"
+
+
+def read_unit(folder: Path, otherwise: Unit = "unknown") -> Unit:
+    """The unit of the poses and depth of the scene in a folder; ``otherwise``: that of a folder that states none."""
+    path = folder / UNIT_FILE
+    if not path.is_file():
+        return otherwise
+    word = read_text(path, "the unit of length").strip()
+    if word not in get_args(Unit):
+        raise InputError(f"{path}: '{shortened(word)}'", " or ".join(get_args(Unit)), "Correct or remove the file")
+    return cast(Unit, word)
+
+
+def printed_unit(unit: Unit) -> str:
+    """A unit as it is printed: ``units`` where it is unknown."""
+    return "units" if unit == "unknown" else unit
+
+
+def write_unit(folder: Path, unit: Unit) -> None:
+    """State the unit of a scene's poses and depth."""
+    atomic_write(folder / UNIT_FILE, unit + "\n")
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
